@@ -1,0 +1,123 @@
+"""Every protocol on one page.  Each verb of the filter is one injected piece; a Hydra group chooses which.
+
+DataModule -> Batch -> method.observe -> [read -> reweigh -> resample -> move] x steps -> estimate -> refine -> Belief
+"""
+
+from typing import Any, Protocol
+
+from torch import Generator, Tensor
+
+from posefilter.types import Batch, Belief, Cloud, ObjectModel, Reading, Step, Trace
+
+Scene = Any  # what a method keeps of an image: nothing, a pyramid, a feature map, proposals
+
+
+class Space(Protocol):
+    """Where particles live."""
+
+    @property
+    def dimensions(self) -> int:
+        """Return the width of a tangent vector."""
+        ...
+
+    def move(self, state: Tensor, tangent: Tensor) -> Tensor:
+        """Displace states.  (*, *S), (*, D) -> (*, *S)."""
+        ...
+
+    def noise_scale(self, sigma: float) -> Tensor:
+        """Return the standard deviation an axis of a move of size sigma.  -> (D,)."""
+        ...
+
+    def mean(self, state: Tensor, weights: Tensor) -> Tensor:
+        """Return the weighted mean of states.  (*, N, *S), (*, N) -> (*, *S)."""
+        ...
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return a distance in the space's unit.  (*, *S) x 2 -> (*)."""
+        ...
+
+
+class Method(Protocol):
+    """A way to turn an image and a particle into a likelihood, a pose and a motion."""
+
+    @property
+    def space(self) -> Space:
+        """Return the space this method's particles live in."""
+        ...
+
+    @property
+    def memory_width(self) -> int:
+        """Return L, the width of a particle's memory (0 for none)."""
+        ...
+
+    def observe(self, batch: Batch) -> Scene:
+        """Look at the images once.  Must not read `batch.mask` or `batch.camera_from_object`."""
+        ...
+
+    def read(self, scene: Scene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+        """Judge every particle of a cloud."""
+        ...
+
+
+class Initialise(Protocol):
+    """Draw the first cloud's states."""
+
+    def __call__(self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator) -> Tensor:
+        """Return states (B, N, *S)."""
+        ...
+
+
+class Propose(Protocol):
+    """Move the children of a resampling."""
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """(B, N, *S), learned motion (B, N, D) -> moved states (B, N, *S)."""
+        ...
+
+
+class Resample(Protocol):
+    """Draw children from a weighted cloud."""
+
+    def __call__(self, log_weights: Tensor, particles: int, generator: Generator) -> tuple[Tensor, Tensor]:
+        """(B, M) normalised -> parents (B, N) int64 and the log weights (B, N) that children start with, normalised."""
+        ...
+
+
+class Schedule(Protocol):
+    """Set the noise level of each step."""
+
+    def __call__(self, steps: int) -> list[float]:
+        """Return sigma for each of the steps."""
+        ...
+
+
+class Estimate(Protocol):
+    """Bet on one pose."""
+
+    def __call__(self, cloud: Cloud, reading: Reading, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return the belief that the last cloud amounts to."""
+        ...
+
+
+class Refine(Protocol):
+    """Polish an estimate."""
+
+    def __call__(self, belief: Belief, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return the belief with its `best` (and `score`) improved."""
+        ...
+
+
+class Label(Protocol):
+    """Say, for each particle, what the truth asks of it."""
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return a target for each particle of each step, (T, B, N) or (T, B, N, D)."""
+        ...
+
+
+class Loss(Protocol):
+    """Judge a run of the filter, or a scored cloud of candidates."""
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return one value an image, (B,)."""
+        ...

@@ -1,0 +1,1 @@
+"""Pure functions on tensors: rotations, rigid transforms, cameras and the spaces that particles live in."""

@@ -1,0 +1,78 @@
+"""Rigid transforms as homogeneous matrices (*, 4, 4).  `a_from_b` maps b into a, so neighbours cancel when multiplied."""
+
+import torch
+from torch import Tensor
+
+from posefilter.geometry.rotation import exp_so3, project_to_so3
+
+
+def make_pose(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Assemble a pose.  (*, 3, 3), (*, 3) [m] -> (*, 4, 4); leading shapes broadcast."""
+    lead = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    top = torch.cat([rotation.expand(*lead, 3, 3), translation.expand(*lead, 3)[..., None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(*lead, 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def rotation_of(pose: Tensor) -> Tensor:
+    """Return the rotation block.  (*, 4, 4) -> (*, 3, 3)."""
+    return pose[..., :3, :3]
+
+
+def translation_of(pose: Tensor) -> Tensor:
+    """Return the translation column.  (*, 4, 4) -> (*, 3) [m]."""
+    return pose[..., :3, 3]
+
+
+def invert(a_from_b: Tensor) -> Tensor:
+    """Return b_from_a.  (*, 4, 4) -> (*, 4, 4)."""
+    Rt = rotation_of(a_from_b).transpose(-1, -2)
+    return make_pose(Rt, -(Rt @ translation_of(a_from_b)[..., None])[..., 0])
+
+
+def transform(a_from_b: Tensor, points_b: Tensor) -> Tensor:
+    """Map points of frame b into frame a.  (*, 4, 4), (*, P, 3) [m] -> (*, P, 3) [m]."""
+    return points_b @ rotation_of(a_from_b).transpose(-1, -2) + translation_of(a_from_b)[..., None, :]
+
+
+def origin_of(pose: Tensor, point: Tensor) -> Tensor:
+    """Return where one object point lies in the camera.  (*, 4, 4), (3,) [m] -> (*, 3) [m]."""
+    return rotation_of(pose) @ point + translation_of(pose)
+
+
+def pose_about(rotation: Tensor, center_camera: Tensor, center_object: Tensor) -> Tensor:
+    """Return the pose that turns by `rotation` and brings `center_object` to `center_camera`.  -> (*, 4, 4)."""
+    return make_pose(rotation, center_camera - rotation @ center_object)
+
+
+def move_about(pose: Tensor, tangent: Tensor, center_object: Tensor) -> Tensor:
+    """Move poses by tangent vectors: turn about the object's centre in its own frame, shift in the camera's axes.
+
+    (*, 4, 4), (*, 6) as [shift [m], turn [rad]], (3,) [m] -> (*, 4, 4). Turning about the centre rather than the frame's
+    origin keeps the two parts independent, wherever a mesh's author put the origin.
+    """
+    rotation = rotation_of(pose) @ exp_so3(tangent[..., 3:])
+    return pose_about(rotation, origin_of(pose, center_object) + tangent[..., :3], center_object)
+
+
+def fit_rigid(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
+    """Return the rigid transform target_from_source of least weighted squares (Kabsch 1976; Umeyama 1991, no scale).
+
+    (*, P, 3), (*, P, 3) [m], (*, P) >= 0 -> (*, 4, 4). Degenerate sets give some rotation that attains the minimum.
+    """
+    w = (weights / weights.sum(-1, keepdim=True).clamp_min(1e-12))[..., None]
+    mean_s = (w * source).sum(-2, keepdim=True)
+    mean_t = (w * target).sum(-2, keepdim=True)
+    cross = ((target - mean_t) * w).transpose(-1, -2) @ (source - mean_s)
+    R = project_to_so3(cross)
+    return make_pose(R, (mean_t - mean_s @ R.transpose(-1, -2))[..., 0, :])
+
+
+def is_rigid(pose: Tensor, tolerance: float = 1e-3) -> bool:
+    """Tell whether every matrix is a proper rigid transform, within `tolerance` per entry."""
+    R = rotation_of(pose)
+    eye = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    orthonormal = bool(((R @ R.transpose(-1, -2) - eye).abs() < tolerance).all())
+    proper = bool((torch.det(R) > 0).all())
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=pose.dtype, device=pose.device)
+    return orthonormal and proper and bool(((pose[..., 3, :] - bottom).abs() < tolerance).all())

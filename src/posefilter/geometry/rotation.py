@@ -1,0 +1,104 @@
+"""Rotations: matrices (*, 3, 3) are the one form the code computes with; every other form is converted here.
+
+Conventions: active rotations, column vectors (x' = R x), radians, quaternions as (x, y, z, w) with unit norm.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_SMALL = 1e-4  # below this angle [rad] the Taylor forms are exact to float32
+
+
+def hat(v: Tensor) -> Tensor:
+    """Return the skew matrix of v, so that hat(v) @ x = v x x.  (*, 3) -> (*, 3, 3)."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
+
+
+def exp_so3(rotvec: Tensor) -> Tensor:
+    """Map a rotation vector to its matrix (Rodrigues), differentiable at zero.  (*, 3) [rad] -> (*, 3, 3)."""
+    square = (rotvec * rotvec).sum(-1)[..., None, None]
+    small = square < _SMALL**2
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    a = torch.where(small, 1 - square / 6, angle.sin() / angle)
+    b = torch.where(small, 0.5 - square / 24, (1 - angle.cos()) / safe)
+    K = hat(rotvec)
+    return torch.eye(3, dtype=rotvec.dtype, device=rotvec.device) + a * K + b * (K @ K)
+
+
+def log_so3(R: Tensor) -> Tensor:
+    """Map a rotation matrix to its rotation vector with angle in [0, pi].  (*, 3, 3) -> (*, 3) [rad]."""
+    quat = quat_xyzw_from_matrix(R)
+    quat = torch.where(quat[..., 3:] < 0, -quat, quat)
+    vector, w = quat[..., :3], quat[..., 3:]
+    square = (vector * vector).sum(-1, keepdim=True)
+    small = square < _SMALL**2
+    sine = torch.where(small, torch.ones_like(square), square).sqrt()
+    return vector * torch.where(small, 2 / w.clamp_min(0.5), 2 * torch.atan2(sine, w) / sine)
+
+
+def matrix_from_quat_xyzw(quat_xyzw: Tensor) -> Tensor:
+    """Convert quaternions (normalised here) to matrices.  (*, 4) -> (*, 3, 3)."""
+    x, y, z, w = F.normalize(quat_xyzw, dim=-1).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def quat_xyzw_from_matrix(R: Tensor) -> Tensor:
+    """Convert matrices to unit quaternions, whichever of the four forms is best conditioned.  (*, 3, 3) -> (*, 4)."""
+    m = R.flatten(-2).unbind(-1)
+    trace = m[0] + m[4] + m[8]
+    choices = torch.stack(
+        [
+            torch.stack([1 + m[0] - m[4] - m[8], m[3] + m[1], m[6] + m[2], m[7] - m[5]], -1),
+            torch.stack([m[3] + m[1], 1 - m[0] + m[4] - m[8], m[7] + m[5], m[2] - m[6]], -1),
+            torch.stack([m[6] + m[2], m[7] + m[5], 1 - m[0] - m[4] + m[8], m[3] - m[1]], -1),
+            torch.stack([m[7] - m[5], m[2] - m[6], m[3] - m[1], 1 + trace], -1),
+        ],
+        dim=-2,
+    )
+    best = torch.stack([m[0], m[4], m[8], trace], -1).argmax(-1)
+    index = best[..., None, None].expand(*best.shape, 1, 4)
+    return F.normalize(choices.gather(-2, index).squeeze(-2), dim=-1)
+
+
+def matrix_from_6d(six: Tensor) -> Tensor:
+    """Orthonormalise two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).  (*, 6) -> (*, 3, 3)."""
+    a, b = six[..., :3], six[..., 3:]
+    x = F.normalize(a, dim=-1)
+    y = F.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def random_rotation(
+    *shape: int, generator: torch.Generator | None = None, device: torch.device | None = None
+) -> Tensor:
+    """Draw rotations uniformly (Haar) from SO(3).  -> (*shape, 3, 3)."""
+    return matrix_from_quat_xyzw(torch.randn(*shape, 4, generator=generator, device=device))
+
+
+def angle_between(a: Tensor, b: Tensor) -> Tensor:
+    """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*) in [0, pi] [rad].
+
+    Through the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which stays exact where the arc cosine does not.
+    """
+    chord = torch.linalg.matrix_norm(a - b)
+    return 2 * torch.asin((chord / (2 * math.sqrt(2))).clamp(max=1.0))
+
+
+def project_to_so3(M: Tensor) -> Tensor:
+    """Return the rotation nearest to M in the Frobenius norm (orthogonal Procrustes).  (*, 3, 3) -> (*, 3, 3)."""
+    U, _, Vh = torch.linalg.svd(M)
+    sign = torch.det(U @ Vh).sign()
+    D = torch.ones_like(M[..., 0])
+    D = torch.cat([D[..., :2], sign[..., None]], dim=-1)
+    return (U * D[..., None, :]) @ Vh

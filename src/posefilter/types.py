@@ -1,0 +1,78 @@
+"""What flows through posefilter.  Plain NamedTuples of tensors: they collate, move and unpack as they are.
+
+Letters: B images, N particles, T steps, L memory width, P points, *S the shape of one state: (2,) a pixel, (4, 4) a pose.
+Units: metres, radians, pixels.  `a_from_b` maps b into a, so neighbours cancel: camera_from_world @ world_from_object.
+"""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class Batch(NamedTuple):
+    """One object of interest in each of B images, in the frame of the object's own mesh file."""
+
+    rgb: Tensor  # (B, 3, H, W) in [0, 1]
+    depth: Tensor  # (B, 1, H, W) z-depth [m], 0 where unknown
+    mask: Tensor  # (B, 1, H, W) bool, the visible part of the object
+    intrinsics: Tensor  # (B, 3, 3) [px]
+    camera_from_object: Tensor  # (B, 4, 4) [m]
+    object_id: Tensor  # (B,) int64, index into the data module's objects
+    frame_id: Tensor  # (B,) int64, index into the split's frames
+    visibility: Tensor  # (B,) visible share of the object's pixels, in [0, 1]; NaN where unknown
+
+
+class ObjectModel(NamedTuple):
+    """What a method may know of the object: a few plain tensors, so that a checkpoint can carry them."""
+
+    name: str
+    points: Tensor  # (P, 3) surface points that ADD is defined on [m], mesh frame
+    center: Tensor  # (3,) centre of the bounding box [m]
+    radius: float  # half the bounding box's diagonal [m]
+    diameter: float  # largest distance between two points [m]
+    symmetries: Tensor  # (S, 4, 4) object_from_object transforms that change nothing, the identity first
+    hull: Tensor  # (V, 3) vertices of a convex hull [m], for outlines
+
+
+class Cloud(NamedTuple):
+    """All that a filter remembers from one step to the next."""
+
+    state: Tensor  # (B, N, *S)
+    memory: Tensor  # (B, N, L), the latent; L = 0 where a method has none
+    log_weights: Tensor  # (B, N), normalised: logsumexp over N is 0
+    ancestors: Tensor  # (B, N) int64, each particle's parent in the previous cloud
+
+
+class Reading(NamedTuple):
+    """What a method makes of each particle at one step."""
+
+    log_likelihood: Tensor  # (B, N), up to a constant an image
+    motion: Tensor  # (B, N, D) learned displacement in the space's tangent; zeros where the filter only diffuses
+    pose: Tensor  # (B, N, 4, 4) camera_from_object that the particle stands for
+    memory: Tensor  # (B, N, L)
+
+
+class Step(NamedTuple):
+    """Where in its run the filter stands."""
+
+    index: int  # 0 for the first cloud
+    steps: int  # how many clouds there will be
+    sigma: float  # noise level of this step, in the space's unit ([m] or [px]); falls where the filter anneals
+
+
+class Belief(NamedTuple):
+    """The filter's last word: weighted poses, and the one pose that it would bet on."""
+
+    poses: Tensor  # (B, N, 4, 4) camera_from_object
+    log_weights: Tensor  # (B, N), normalised
+    best: Tensor  # (B, 4, 4) the estimate
+    score: Tensor  # (B,) confidence in the estimate, comparable between images of one method
+
+
+class Trace(NamedTuple):
+    """Every step of one run: the clouds, what was read of them, and the belief at the end."""
+
+    clouds: tuple[Cloud, ...]
+    readings: tuple[Reading, ...]
+    steps: tuple[Step, ...]
+    belief: Belief
