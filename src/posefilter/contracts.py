@@ -24,8 +24,8 @@ class Space(Protocol):
         """Displace states.  (*, *S), (*, D) -> (*, *S)."""
         ...
 
-    def noise_scale(self, sigma: float) -> Tensor:
-        """Return the standard deviation an axis of a move of size sigma.  -> (D,)."""
+    def noise_scale(self, sigma: Tensor) -> Tensor:
+        """Return the standard deviation an axis of a move of size sigma.  (*) -> (*, D)."""
         ...
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:

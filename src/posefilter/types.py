@@ -55,9 +55,9 @@ class Reading(NamedTuple):
 class Step(NamedTuple):
     """Where in its run the filter stands."""
 
-    index: int  # 0 for the first cloud
+    number: int  # 0 for the first cloud
     steps: int  # how many clouds there will be
-    sigma: float  # noise level of this step, in the space's unit ([m] or [px]); falls where the filter anneals
+    sigma: Tensor  # () or (B,) noise level, in the space's unit ([m] or [px]); falls where the filter anneals
 
 
 class Belief(NamedTuple):

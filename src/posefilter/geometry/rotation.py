@@ -79,9 +79,7 @@ def matrix_from_6d(six: Tensor) -> Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 
-def random_rotation(
-    *shape: int, generator: torch.Generator | None = None, device: torch.device | None = None
-) -> Tensor:
+def random_rotation(*shape: int, generator: torch.Generator | None = None, device: torch.device | None = None) -> Tensor:
     """Draw rotations uniformly (Haar) from SO(3).  -> (*shape, 3, 3)."""
     return matrix_from_quat_xyzw(torch.randn(*shape, 4, generator=generator, device=device))
 

@@ -19,9 +19,9 @@ class PixelSpace:
         """Shift pixels.  (*, 2), (*, 2) [px] -> (*, 2)."""
         return state + tangent
 
-    def noise_scale(self, sigma: float) -> Tensor:
-        """Return the spread an axis of a move whose size is sigma.  -> (2,) [px]."""
-        return torch.full((2,), sigma)
+    def noise_scale(self, sigma: Tensor) -> Tensor:
+        """Return the spread an axis of a move whose size is sigma.  (*) -> (*, 2) [px]."""
+        return sigma[..., None].expand(*sigma.shape, 2)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
         """Return the weighted mean.  (*, N, 2), (*, N) -> (*, 2)."""
@@ -48,10 +48,10 @@ class PoseSpace:
         """Move poses about the object's centre.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""
         return move_about(state, tangent, state.new_tensor(self.center))
 
-    def noise_scale(self, sigma: float) -> Tensor:
-        """Return the spread an axis of a move whose size is sigma [m].  -> (6,) as [m, m, m, rad, rad, rad]."""
-        turn = min(sigma / self.radius, self.max_turn)
-        return torch.tensor([sigma] * 3 + [turn] * 3)
+    def noise_scale(self, sigma: Tensor) -> Tensor:
+        """Return the spread an axis of a move whose size is sigma [m].  (*) -> (*, 6) as [m, m, m, rad, rad, rad]."""
+        turn = (sigma / self.radius).clamp(max=self.max_turn)
+        return torch.stack([sigma] * 3 + [turn] * 3, dim=-1)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
         """Return the weighted mean: of the centres, and the chordal mean of the rotations.  (*, N, 4, 4) -> (*, 4, 4)."""
