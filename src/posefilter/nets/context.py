@@ -1,0 +1,165 @@
+"""Global context: what a particle may know of the image beyond its own glimpse, sampled where the particle stands.
+
+Every context maps an image once to feature maps (a `ContextMap`), and is then looked up at each particle at each step.
+"""
+
+from typing import NamedTuple, Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from posefilter.geometry.camera import pixel_grid, rays
+from posefilter.nets.glimpse import sample, window
+from posefilter.nets.layers import ResBlock, conv_norm
+from posefilter.nets.proposals import masked_mean_pool, normals_from_depth
+
+
+class ContextMap(NamedTuple):
+    """Feature maps of one batch of images."""
+
+    levels: tuple[Tensor, ...]  # each (B, F, h, w)
+    strides: tuple[int, ...]  # pixels a cell of each
+    relevance: Tensor | None  # (B, h, w) logit of `this cell shows the object`, at strides[0]; None where not told
+
+
+class Context(Protocol):
+    """An encoder of the whole image."""
+
+    width: int  # features a particle gets
+
+    def __call__(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> ContextMap."""
+        ...
+
+    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
+        """Return each particle's features.  (B, N, 2) [px] -> (B, N, width)."""
+        ...
+
+
+class NoContext(nn.Module):
+    """The paper's choice: a particle knows its own patch, and nothing else."""
+
+    width = 0
+
+    def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """Return an empty map."""
+        return ContextMap((), (), None)
+
+    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
+        """(B, N, 2) -> (B, N, 0)."""
+        return pixels[..., :0]
+
+
+class Pyramid(nn.Module):
+    """Colour and depth at halving resolutions, a 3 x 3 glimpse of each: a fovea without a single learned weight."""
+
+    def __init__(self, levels: int = 5) -> None:
+        super().__init__()
+        self.strides = tuple(2 ** (i + 1) for i in range(levels))
+        self.width = levels * 9 * 5
+
+    def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """Return one map a level, of 5 channels: colour, depth, share of known depth."""
+        levels = []
+        for stride in self.strides:
+            z, known = masked_mean_pool(depth, stride)
+            levels.append(torch.cat([F.avg_pool2d(rgb, stride) * 2 - 1, z, known], dim=1))
+        return ContextMap(tuple(levels), self.strides, None)
+
+    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
+        """(B, N, 2) [px] -> (B, N, width)."""
+        found = []
+        for level, stride in zip(seen.levels, seen.strides, strict=True):
+            places = pixels[:, :, None] + window(3, pixels.device) * stride
+            found.append(sample(level, places.flatten(1, 2), stride).unflatten(1, places.shape[1:3]).flatten(2))
+        return torch.cat(found, dim=-1)
+
+
+class _Encoder(nn.Module):
+    """One feature map, and the relevance that a 1 x 1 convolution reads off it."""
+
+    def __init__(self, width: int, stride: int) -> None:
+        super().__init__()
+        self.width = width
+        self.stride = stride
+        self.relevance = nn.Conv2d(width, 1, 1)
+
+    def _map(self, features: Tensor) -> ContextMap:
+        features = features.float()
+        return ContextMap((features,), (self.stride,), self.relevance(features)[:, 0])
+
+    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
+        """(B, N, 2) [px] -> (B, N, width); beyond the frame, what lies at its edge."""
+        return sample(seen.levels[0], pixels, self.stride, padding="border")
+
+
+def geometry(depth: Tensor, K: Tensor) -> Tensor:
+    """Return what depth tells, at half resolution: normals, depth about 1 m, share known, ray.  (B, 1, H, W) -> (B, 7, ...)."""
+    B, _, H, W = depth.shape
+    z, share = masked_mean_pool(depth, 2)
+    grid = pixel_grid(H, W, 2, device=depth.device).reshape(1, -1, 2).expand(B, -1, -1)
+    view = rays(grid, K)[..., :2].transpose(1, 2).unflatten(2, z.shape[-2:])
+    near = (z - 1.0).clamp(-1.0, 1.5) * (share > 0)
+    return torch.cat([normals_from_depth(depth, K), near, share, view], dim=1)
+
+
+def _grow(x: Tensor, like: Tensor) -> Tensor:
+    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+
+
+class ConvEncoder(_Encoder):
+    """A small U-Net from nothing: strides 4 to 32 and back to 4, about half a million parameters.
+
+    widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets. Runs in bfloat16 where
+    autocast does (float32 in, float32 out), which halves its time on CPUs that have it.
+    """
+
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 48, 64, 96), width: int = 64) -> None:
+        super().__init__(width, stride=4)
+        a, b, c, d = widths
+        self.colour = conv_norm(3, 24, stride=2)
+        self.enter = conv_norm(24 + 7, a, stride=2)
+        self.down4 = ResBlock(a)
+        self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
+        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c))
+        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d))
+        self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
+        self.to8, self.up8 = nn.Conv2d(c, b, 1), ResBlock(b)
+        self.to4, self.skip4, self.up4 = nn.Conv2d(b, width, 1), nn.Conv2d(a, width, 1), ResBlock(width)
+
+    def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """Return one map of stride 4."""
+        shape = geometry(depth, K)
+        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32):
+            x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
+            x4 = self.down4(self.enter(torch.cat([x, shape[..., : x.shape[-2], : x.shape[-1]]], dim=1)))
+            x8 = self.down8(x4)
+            x16 = self.down16(x8)
+            x32 = self.down32(x16)
+            y16 = self.up16(x16 + _grow(self.to16(x32), x16))
+            y8 = self.up8(x8 + _grow(self.to8(y16), x8))
+            y4 = self.up4(self.skip4(x4) + _grow(self.to4(y8), x4))
+        return self._map(y4)
+
+
+class ResNetContext(_Encoder):
+    """A ResNet trunk (its weights from a file, an address, or chance) with a light top-down path to stride 4.
+
+    trunk: gives maps of strides 4, 8, 16 and 32 for colour in [0, 1] and 7 geometry channels at half resolution.
+    """
+
+    def __init__(self, trunk: nn.Module, width: int = 64) -> None:
+        super().__init__(width, stride=4)
+        self.trunk = trunk
+        channels: tuple[int, ...] = trunk.channels  # type: ignore[assignment]
+        self.lateral = nn.ModuleList(nn.Conv2d(c, width, 1) for c in channels)
+        self.smooth = ResBlock(width)
+
+    def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
+        """Return one map of stride 4."""
+        maps = self.trunk(rgb, geometry(depth, K))
+        top = self.lateral[-1](maps[-1])
+        for lateral, low in zip(reversed(self.lateral[:-1]), reversed(maps[:-1]), strict=True):
+            top = lateral(low) + _grow(top, low)
+        return self._map(self.smooth(top))

@@ -1,0 +1,115 @@
+"""The networks that read one particle: multi-layer perceptrons over a latent, or a small convolution net over a patch."""
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from posefilter.errors import UserError
+
+
+class Said(NamedTuple):
+    """What a particle's network says, before any of it is bounded or given a unit."""
+
+    memory: Tensor  # (B, N, L)
+    logit: Tensor  # (B, N) of the likelihood
+    motion: Tensor  # (B, N, 2)
+    pose: Tensor  # (B, N, D), D = 0 where the network tells no pose
+
+
+class ParticleNet(Protocol):
+    """Reads each particle's patch, whatever else is known of its place, and its memory."""
+
+    memory_width: int
+
+    def __call__(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said."""
+        ...
+
+
+class ParticleNorm(nn.Module):
+    """Normalise features over every particle of every image of the batch ("batch"), or each particle by itself ("layer").
+
+    Batch statistics mix images, particles and steps, whose distributions differ; layer statistics do not.
+    """
+
+    def __init__(self, kind: str, width: int) -> None:
+        super().__init__()
+        if kind not in ("batch", "layer"):
+            raise UserError(f"normalisation={kind!r} is unknown: choose batch or layer")
+        self.inner: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(*, width) -> (*, width)."""
+        return self.inner(x.reshape(-1, x.shape[-1])).reshape(x.shape)
+
+
+def mlp(inputs: int, outputs: int, width: int, layers: int, normalisation: str) -> nn.Sequential:
+    """Return `layers` linear layers, each but the last followed by a normalisation and a ReLU."""
+    parts: list[nn.Module] = []
+    for _ in range(layers - 1):
+        parts += [nn.Linear(inputs, width), ParticleNorm(normalisation, width), nn.ReLU(inplace=True)]
+        inputs = width
+    return nn.Sequential(*parts, nn.Linear(inputs, outputs))
+
+
+class LatentNet(nn.Module):
+    """The paper's figure 3: what is seen and the latent give the next latent; it gives pose and likelihood; all three the motion."""
+
+    def __init__(
+        self,
+        inputs: int,
+        memory_width: int = 256,
+        pose_width: int = 7,
+        width: int = 512,
+        layers: int = 4,
+        normalisation: str = "batch",
+    ) -> None:
+        super().__init__()
+        self.memory_width = memory_width
+        self.latent = mlp(inputs + memory_width, memory_width, width, layers, normalisation)
+        self.pose = mlp(memory_width, pose_width, width, layers, normalisation)
+        self.likelihood = mlp(memory_width, 1, width, layers, normalisation)
+        self.motion = mlp(pose_width + 1 + memory_width, 2, width, layers, normalisation)
+
+    def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; C k^2 + E must be `inputs`."""
+        latent = self.latent(torch.cat([patch.flatten(2), extra, memory], dim=-1))
+        pose, logit = self.pose(latent), self.likelihood(latent)
+        motion = self.motion(torch.cat([pose, logit, latent], dim=-1))
+        return Said(latent, logit[..., 0], motion, pose)
+
+
+class PatchNet(nn.Module):
+    """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, shared by all particles, then offset and likelihood.
+
+    With `memory_width` 4 the particle also tells, as its memory, how far the box's four sides lie from it. `hidden` > 0
+    puts one more layer before the outputs, for the context that then joins the patch's features.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        channels: int = 4,
+        extra: int = 0,
+        width: int = 32,
+        hidden: int = 0,
+        memory_width: int = 0,
+        normalisation: str = "batch",
+    ) -> None:
+        super().__init__()
+        self.memory_width = memory_width
+        blocks: list[nn.Module] = []
+        for inputs in (channels, width, width):
+            norm = nn.BatchNorm2d(width) if normalisation == "batch" else nn.GroupNorm(1, width)
+            blocks += [nn.Conv2d(inputs, width, 3, padding=1), norm, nn.ReLU(inplace=True)]
+        self.convolve = nn.Sequential(*blocks)
+        features = width * size * size + extra
+        outputs = 3 + memory_width
+        self.tell = mlp(features, outputs, hidden, 3, normalisation) if hidden else nn.Linear(features, outputs)
+
+    def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; the memory is written anew, not read."""
+        seen = self.convolve(patch.flatten(0, 1)).flatten(1).unflatten(0, patch.shape[:2])
+        out = self.tell(torch.cat([seen, extra], dim=-1))
+        return Said(out[..., 3:], out[..., 0], out[..., 1:3], out[..., :0])

@@ -1,0 +1,105 @@
+"""ResNet-18 and -34 (He et al. 2016) with torchvision's parameter names, so that its weight files load as they are."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from posefilter.errors import UserError
+
+DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's colours, that published weights expect
+
+
+class BasicBlock(nn.Module):
+    """Two 3 x 3 convolutions and a skip."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(outputs)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(outputs)
+        self.downsample: nn.Module | None = None
+        if stride != 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs, H, W) -> (B, outputs, H / stride, W / stride)."""
+        y = self.bn2(self.conv2(torch.relu(self.bn1(self.conv1(x)))))
+        return torch.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+
+class ResNet(nn.Module):
+    """The trunk of a ResNet, with a second, new stem through which geometry joins at stride 2.
+
+    kind: resnet18 or resnet34; weights: None (chance), a file, or an address that torch.hub can fetch. frozen: the trunk's
+    own weights and statistics stay as loaded, only the geometry stem learns. The classifier (`fc`) of a file is not used.
+    """
+
+    channels = (64, 128, 256, 512)
+
+    def __init__(self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False) -> None:
+        super().__init__()
+        if kind not in DEPTHS:
+            raise UserError(f"context.trunk.kind={kind!r} is unknown: choose {' or '.join(DEPTHS)}")
+        self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.geometry = nn.Conv2d(7, 64, 7, padding=3)
+        nn.init.zeros_(self.geometry.weight)  # a loaded trunk starts as it was trained
+        nn.init.zeros_(self.geometry.bias)
+        inputs = 64
+        for i, (outputs, depth) in enumerate(zip(self.channels, DEPTHS[kind], strict=True), start=1):
+            blocks = [BasicBlock(inputs, outputs, 1 if i == 1 else 2)]
+            blocks += [BasicBlock(outputs, outputs, 1) for _ in range(depth - 1)]
+            setattr(self, f"layer{i}", nn.Sequential(*blocks))
+            inputs = outputs
+        self.register_buffer("mean", torch.tensor(MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(STD).view(3, 1, 1), persistent=False)
+        self.frozen = frozen
+        if weights is not None:
+            load_trunk(self, weights)
+        if frozen:
+            for name, parameter in self.named_parameters():
+                parameter.requires_grad = name.startswith("geometry.")
+
+    def train(self, mode: bool = True) -> "ResNet":
+        """Set training mode; a frozen trunk keeps its loaded batch statistics."""
+        super().train(mode)
+        if self.frozen:
+            for part in self.modules():
+                if isinstance(part, nn.BatchNorm2d):
+                    part.eval()
+        return self
+
+    def forward(self, rgb: Tensor, geometry: Tensor) -> list[Tensor]:
+        """(B, 3, H, W) in [0, 1], (B, 7, H // 2, W // 2) -> maps of strides 4, 8, 16, 32."""
+        x = self.conv1((rgb - self.mean) / self.std)
+        x = torch.relu(self.bn1(x + self.geometry(geometry)[..., : x.shape[-2], : x.shape[-1]]))
+        x = torch.max_pool2d(x, 3, stride=2, padding=1)
+        maps = []
+        for i in range(1, 5):
+            x = getattr(self, f"layer{i}")(x)
+            maps.append(x)
+        return maps
+
+
+def load_trunk(trunk: ResNet, weights: str) -> None:
+    """Load a torchvision ResNet's state dict, from a file or an address; every trunk weight must be there and fit."""
+    if weights.startswith(("http://", "https://")):
+        try:
+            state = torch.hub.load_state_dict_from_url(weights, map_location="cpu", weights_only=True)
+        except OSError as error:
+            raise UserError(f"context.trunk.weights={weights}: cannot be fetched ({error})") from error
+    else:
+        if not Path(weights).is_file():
+            raise UserError(f"context.trunk.weights={weights}: no such file (a path, an http address, or null for none)")
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+    own = {name for name in trunk.state_dict() if not name.startswith("geometry.")}
+    missing = sorted(own - state.keys())
+    strange = sorted(name for name in state.keys() - own if not name.startswith("fc."))
+    if missing or strange:
+        name = (missing or strange)[0]
+        what = "lacks" if missing else "has the unexpected"
+        raise UserError(f"context.trunk.weights={weights}: {what} {name}; is it another network than trunk.kind says?")
+    trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})
