@@ -1,0 +1,50 @@
+"""Meshes that the project draws itself: the same every time, no files.  Sizes follow YCB's objects of the same kind."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from posefilter.data import builtin_carton
+from posefilter.data.builtin_shapes import Rect, box, weld
+from posefilter.data.mesh import Mesh
+
+TEXTURE = 512  # [px] width and height of every texture
+
+
+def names() -> list[str]:
+    """Return the names of the builtin meshes, sorted."""
+    return sorted(_BUILDERS)
+
+
+def build(name: str) -> Mesh:
+    """Draw a builtin mesh.  Raises KeyError for unknown names."""
+    return _BUILDERS[name]()
+
+
+def boxed(name: str, size: tuple[float, float, float], prints: dict[str, np.ndarray]) -> Mesh:
+    """Make a printed box from its six faces' pictures."""
+    w, d, h = size
+    # Front and back side by side, the two narrow sides stacked beside them, lid and base below.
+    across = round(TEXTURE * w / (2 * w + d))
+    tall = round(TEXTURE * h / (h + d))
+    cells = {
+        "front": (0, 0, across, tall),
+        "back": (across, 0, 2 * across, tall),
+        "left": (2 * across, 0, TEXTURE, TEXTURE // 2),
+        "right": (2 * across, TEXTURE // 2, TEXTURE, TEXTURE),
+        "top": (0, tall, across, TEXTURE),
+        "bottom": (across, tall, 2 * across, TEXTURE),
+    }
+    texture = np.zeros((TEXTURE, TEXTURE, 3), dtype=np.uint8)
+    slots: dict[str, Rect] = {}
+    for face, (x0, y0, x1, y1) in cells.items():
+        texture[y0:y1, x0:x1] = cv2.resize(prints[face], (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+        # Half a texel in from the cell's edge, so that bilinear reading never mixes neighbours in.
+        slots[face] = ((x0 + 0.5) / TEXTURE, 1 - (y1 - 0.5) / TEXTURE, (x1 - 0.5) / TEXTURE, 1 - (y0 + 0.5) / TEXTURE)
+    return weld(name, box(size, slots), texture)
+
+
+_BUILDERS: dict[str, Callable[[], Mesh]] = {
+    "carton": lambda: boxed("carton", builtin_carton.SIZE, builtin_carton.faces()),
+}
