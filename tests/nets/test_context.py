@@ -1,5 +1,6 @@
 """Contexts: shapes are the least of it; what is looked up must be what lies there."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,7 @@ def test_no_context_is_empty() -> None:
 
 
 @pytest.mark.parametrize("make", [ConvEncoder, lambda: ResNetContext(ResNet("resnet18"))], ids=["unet", "resnet18"])
-def test_encoder_learns_where_the_red_square_is(make) -> None:  # noqa: ANN001
+def test_encoder_learns_where_the_red_square_is(make: Callable[[], nn.Module]) -> None:
     torch.manual_seed(0)
     encoder = make().train()
     optimizer = torch.optim.AdamW(encoder.parameters(), 2e-3)
@@ -97,7 +98,7 @@ def test_resnet_weight_mistakes_end_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no such file"):
         ResNet("resnet18", weights=str(tmp_path / "none.pth"))
     torch.save({k: v for k, v in ResNet("resnet34").state_dict().items() if "geometry" not in k}, tmp_path / "34.pth")
-    with pytest.raises(UserError, match="layer1.2"):
+    with pytest.raises(UserError, match=r"layer1\.2"):
         ResNet("resnet18", weights=str(tmp_path / "34.pth"))
     with pytest.raises(UserError, match="resnet18 or resnet34"):
         ResNet("resnet50")

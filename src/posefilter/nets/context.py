@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.geometry.camera import pixel_grid, rays
-from posefilter.nets.glimpse import sample, window
+from posefilter.geometry.lookup import sample, window
 from posefilter.nets.layers import ResBlock, conv_norm
 from posefilter.nets.proposals import masked_mean_pool, normals_from_depth
 
@@ -95,7 +95,7 @@ class _Encoder(nn.Module):
 
 
 def geometry(depth: Tensor, K: Tensor) -> Tensor:
-    """Return what depth tells, at half resolution: normals, depth about 1 m, share known, ray.  (B, 1, H, W) -> (B, 7, ...)."""
+    """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H, W) -> (B, 7, ...)."""
     B, _, H, W = depth.shape
     z, share = masked_mean_pool(depth, 2)
     grid = pixel_grid(H, W, 2, device=depth.device).reshape(1, -1, 2).expand(B, -1, -1)

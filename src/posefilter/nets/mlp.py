@@ -54,7 +54,7 @@ def mlp(inputs: int, outputs: int, width: int, layers: int, normalisation: str) 
 
 
 class LatentNet(nn.Module):
-    """The paper's figure 3: what is seen and the latent give the next latent; it gives pose and likelihood; all three the motion."""
+    """The paper's figure 3: sight and latent give the next latent; it gives pose and likelihood; all three the motion."""
 
     def __init__(
         self,

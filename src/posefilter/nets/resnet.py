@@ -38,6 +38,8 @@ class ResNet(nn.Module):
     """
 
     channels = (64, 128, 256, 512)
+    mean: Tensor
+    std: Tensor
 
     def __init__(self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False) -> None:
         super().__init__()
@@ -47,7 +49,7 @@ class ResNet(nn.Module):
         self.bn1 = nn.BatchNorm2d(64)
         self.geometry = nn.Conv2d(7, 64, 7, padding=3)
         nn.init.zeros_(self.geometry.weight)  # a loaded trunk starts as it was trained
-        nn.init.zeros_(self.geometry.bias)
+        nn.init.zeros_(self.geometry.bias)  # type: ignore[arg-type]
         inputs = 64
         for i, (outputs, depth) in enumerate(zip(self.channels, DEPTHS[kind], strict=True), start=1):
             blocks = [BasicBlock(inputs, outputs, 1 if i == 1 else 2)]

@@ -1,0 +1,1 @@
+"""Labels: what the truth asks of each particle at each step."""

@@ -1,0 +1,1 @@
+"""Losses: each judges a run of the filter, one value an image."""

@@ -1,0 +1,96 @@
+"""Losses on the particles' poses: how far they put the object's points from where they belong."""
+
+import torch
+from torch import Tensor
+
+from posefilter.contracts import Label
+from posefilter.errors import UserError
+from posefilter.geometry.deviation import deviation, nearest_deviation, thin
+from posefilter.geometry.lookup import nearest_pixel, pick
+from posefilter.geometry.pose import invert, transform
+from posefilter.losses.likelihood import log_not
+from posefilter.types import Batch, ObjectModel, Reading, Trace
+
+
+class Add:
+    """ADD of the last step's poses (the paper, eq. 1), over every particle or weighted by likelihood.  [m]
+
+    weighting: mean (every particle alike) or likelihood (the cloud's normalised likelihoods, which learn from it too);
+    points: an even selection of the model's.
+    """
+
+    distance = staticmethod(deviation)
+
+    def __init__(self, weighting: str = "mean", points: int = 256) -> None:
+        if weighting not in ("mean", "likelihood"):
+            raise UserError(f"loss.weighting={weighting!r} is unknown: choose mean or likelihood")
+        self.weighting = weighting
+        self.points = points
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return (B,) [m]."""
+        reading: Reading = trace.readings[-1]
+        points = thin(model.points, self.points).to(batch.rgb)
+        off = self.distance(reading.pose, batch.camera_from_object, points)
+        if self.weighting == "mean":
+            return off.mean(1)
+        return (torch.softmax(reading.log_likelihood, dim=1) * off).sum(1)
+
+
+class AddS(Add):
+    """ADD-S of the last step's poses: each estimated point to the nearest true one (the paper, eq. 2).  [m]"""
+
+    distance = staticmethod(nearest_deviation)
+
+
+class Confidence:
+    """Pose error weighted by the particle's own confidence c: e c - w log c on the object (DenseFusion, Wang et al. 2019).
+
+    e is ADD over the diameter, and c the likelihood. DenseFusion is given the object's pixels; a particle off the object
+    has no pose to tell, so there its c is pushed down by -w log(1 - c), a quarter of the particles' weight in all.
+    """
+
+    def __init__(self, label: Label, weight: float = 0.1, points: int = 64) -> None:
+        self.label = label
+        self.weight = weight
+        self.points = points
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return (B,)."""
+        points = thin(model.points, self.points).to(batch.rgb)
+        on = self.label(trace, batch, model) > 0
+        total = batch.rgb.new_zeros(len(batch.rgb))
+        for reading, inside in zip(trace.readings, on, strict=True):
+            off = deviation(reading.pose, batch.camera_from_object, points) / model.diameter
+            log_c = reading.log_likelihood
+            fit = off * log_c.exp() - self.weight * log_c
+            fit = (fit * inside).sum(1) / inside.sum(1).clamp_min(1)
+            reject = -self.weight * log_not(log_c)
+            total = total + fit + 0.25 * (reject * ~inside).sum(1) / (~inside).sum(1).clamp_min(1)
+        return total / len(trace.readings)
+
+
+class OwnPoint:
+    """Where a particle's pose puts its own measured 3-D point on the object, against where it belongs; over the radius.
+
+    A particle on the object sees one point of the surface: its object coordinates are what it can know best, and many
+    particles' coordinates fix a pose. Counts particles whose pixel is on the mask and has depth.
+    """
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return (B,)."""
+        total = batch.rgb.new_zeros(len(batch.rgb))
+        seen = torch.cat([batch.depth, batch.mask.to(batch.depth)], dim=1)
+        focal = batch.intrinsics[:, None, [0, 1], [0, 1]]
+        center = batch.intrinsics[:, None, :2, 2]
+        for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
+            place = nearest_pixel(cloud.state)
+            z, on = pick(seen, place).unbind(-1)
+            ray = torch.cat([(cloud.state.detach() - center) / focal, torch.ones_like(z[..., None])], dim=-1)
+            point = (ray * z[..., None])[:, :, None]
+            guess = transform(invert(reading.pose), point)[:, :, 0]
+            true = transform(invert(batch.camera_from_object), point[:, :, 0])
+            counts = (on > 0) & (z > 0) & ((true - model.center.to(true)).norm(dim=-1) < 1.2 * model.radius)
+            off = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
+            total = total + (off * counts).sum(1) / counts.sum(1).clamp_min(1)
+        return total / len(trace.readings)
