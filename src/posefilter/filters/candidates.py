@@ -1,0 +1,125 @@
+"""Candidate poses that a likelihood learns from by contrast, and the persistent particles that find its faults.
+
+A likelihood trained on the truth and its neighbours alone scores absurd poses high, since it never saw them. So candidates
+come from everywhere, and some from the likelihood's own filter: particles that live on from visit to visit of a frame,
+advancing one step of an annealed filter each time (persistent chains, Tieleman 2008).
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Generator, Tensor, nn
+
+from posefilter.contracts import Space
+from posefilter.geometry.camera import rays
+from posefilter.geometry.pose import invert, origin_of, pose_about, rotation_of
+from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.types import Batch, ObjectModel
+
+
+def from_depth(batch: Batch, model: ObjectModel, count: int, generator: Generator, prior: Tensor | None = None) -> Tensor:
+    """Draw poses at random measured points: uniform rotations, centres a little behind the surface.  -> (B, count, 4, 4).
+
+    prior: (B, 1, H, W) >= 0, how likely the object is at each pixel; uniform where None. Images with no depth at all draw
+    from all pixels at 1 m.
+    """
+    B, _, H, W = batch.depth.shape
+    depth = batch.depth.flatten(1)
+    depth = torch.where((depth > 0).any(1, keepdim=True), depth, torch.ones_like(depth))
+    weight = (depth > 0).float()
+    if prior is not None:
+        weight = weight * (prior.flatten(1) + 1e-6)
+    pick = torch.multinomial(weight, count, replacement=True, generator=generator)
+    pixel = torch.stack([pick % W, pick // W], dim=-1).float()
+    ray = rays(pixel, batch.intrinsics)
+    behind = model.radius * torch.empty(B, count, 1, device=depth.device).uniform_(0.1, 0.9, generator=generator)
+    center = ray * depth.gather(1, pick)[..., None] + ray / ray.norm(dim=-1, keepdim=True) * behind
+    R = random_rotation(B, count, generator=generator, device=depth.device)
+    return pose_about(R, center, model.center.to(depth.device))
+
+
+def half_turns(poses: Tensor, center: Tensor, generator: Generator) -> Tensor:
+    """Turn each pose by pi about a random object axis through its centre.  (B, N, 4, 4) -> (B, N, 4, 4)."""
+    axis = torch.randint(0, 3, poses.shape[:-2], generator=generator, device=poses.device)
+    turn = exp_so3(math.pi * torch.eye(3, device=poses.device)[axis])
+    return pose_about(rotation_of(poses) @ turn, origin_of(poses, center), center)
+
+
+def jiggle(poses: Tensor, sigma: Tensor, space: Space, generator: Generator, turn: float = 1.0) -> Tensor:
+    """Perturb poses by Gaussian moves of size sigma.  (B, N, 4, 4), (B, N) [m] -> (B, N, 4, 4); `turn` scales the turns."""
+    scale = space.noise_scale(sigma)
+    scale = torch.cat([scale[..., :3], scale[..., 3:] * turn], dim=-1)
+    return space.move(poses, scale * torch.randn(scale.shape, generator=generator, device=poses.device))
+
+
+def around_truth(
+    batch: Batch, model: ObjectModel, space: Space, each: int, sigma: Sequence[float], generator: Generator
+) -> Tensor:
+    """Draw the candidates that need the truth: it itself first, then `each` of every kind.  -> (B, 1 + 4.5 each, 4, 4).
+
+    Kinds: perturbed at every scale; from depth on the object; from depth anywhere; right place with a random rotation (half
+    as many); half turns, slightly perturbed.
+    """
+    B = len(batch.rgb)
+    device = batch.rgb.device
+    truth = batch.camera_from_object[:, None]
+    center = model.center.to(device)
+    low, high = math.log(sigma[0]), math.log(sigma[1])
+    size = torch.exp(torch.empty(B, each, device=device).uniform_(low, high, generator=generator))
+    same = truth.expand(B, each, 4, 4)
+    near = jiggle(same, size * 0.6, space, generator)
+    on = from_depth(batch, model, each, generator, batch.mask.float() + 0.02)
+    anywhere = from_depth(batch, model, each, generator)
+    few = each // 2
+    placed = jiggle(truth.expand(B, few, 4, 4), size[:, :few] * 0.5, space, generator, turn=0.0)
+    turned = pose_about(random_rotation(B, few, generator=generator, device=device), origin_of(placed, center), center)
+    flipped = jiggle(half_turns(same, center, generator), size * 0.3, space, generator)
+    return torch.cat([truth, near, on, anywhere, turned, flipped], dim=1)
+
+
+class PersistentParticles(nn.Module):
+    """A few particles a training frame, kept between visits; a frame's noise level falls with each of them.
+
+    They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera was rolled or zoomed by
+    augmentation finds them where they were. Kept out of checkpoints' state dict: a resumed run starts them anew.
+    """
+
+    def __init__(
+        self, particles: int = 16, levels: int = 12, sigma: tuple[float, float] = (0.004, 0.25), step: float = 0.4
+    ) -> None:
+        super().__init__()
+        self.particles, self.levels, self.step = particles, levels, step
+        self.low, self.high = math.log(sigma[0]), math.log(sigma[1])
+        self._poses: dict[int, Tensor] = {}
+        self._level: dict[int, int] = {}
+
+    def recall(self, batch: Batch, model: ObjectModel, generator: Generator) -> tuple[Tensor, Tensor]:
+        """Return each frame's particles (B, M, 4, 4) and its noise level (B,) [m]; new frames start from depth, broad."""
+        fresh = from_depth(batch, model, self.particles, generator)
+        rows = []
+        for row, frame in enumerate(batch.frame_id.tolist()):
+            kept = self._poses.get(frame)
+            rows.append(fresh[row] if kept is None else batch.camera_from_object[row] @ kept.to(fresh.device))
+        level = torch.tensor([self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device)
+        share = level / (self.levels - 1)
+        return torch.stack(rows), torch.exp(self.high + (self.low - self.high) * share)
+
+    @torch.no_grad()
+    def advance(
+        self, batch: Batch, poses: Tensor, scores: Tensor, sigma: Tensor, used: Tensor, space: Space, generator: Generator
+    ) -> None:
+        """Take one filter step where `used` (B,): resample by the scores at sigma, perturb, lower the noise level."""
+        parents = torch.multinomial(torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator)
+        children = poses.gather(1, parents[..., None, None].expand(-1, -1, 4, 4))
+        size = (self.step * sigma)[:, None].expand(-1, self.particles)
+        relative = invert(batch.camera_from_object)[:, None] @ jiggle(children, size, space, generator)
+        for row, frame in enumerate(batch.frame_id.tolist()):
+            if not bool(used[row]):
+                continue
+            level = self._level.get(frame, 0) + 1
+            if level < self.levels:
+                self._level[frame], self._poses[frame] = level, relative[row].cpu()
+            else:
+                self._level.pop(frame, None)
+                self._poses.pop(frame, None)

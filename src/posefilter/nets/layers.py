@@ -1,0 +1,46 @@
+"""Small layers that several networks share."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+
+def fourier(x: Tensor, octaves: int) -> Tensor:
+    """Append sines and cosines of `octaves` doubling frequencies, the first of period 2.  (*, D) -> (*, D (1 + 2 octaves))."""
+    angles = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))
+    return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], dim=-1)
+
+
+class ResnetFC(nn.Module):
+    """x + fc(relu(fc(relu(x)))), the last layer starting at zero (Occupancy Networks, Mescheder et al. 2019)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.inner = nn.Linear(width, width)
+        self.outer = nn.Linear(width, width)
+        nn.init.zeros_(self.outer.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(*, width) -> (*, width)."""
+        return x + self.outer(torch.relu(self.inner(torch.relu(x))))
+
+
+def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    """Return a 3 x 3 convolution, group norm and ReLU; group norm, since batches are small and images differ."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.GroupNorm(8, outputs), nn.ReLU(inplace=True)
+    )
+
+
+class ResBlock(nn.Module):
+    """Two 3 x 3 convolutions with group norm and a skip."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = conv_norm(width, width)
+        self.second = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.GroupNorm(8, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, width, H, W) -> (B, width, H, W)."""
+        return torch.relu(x + self.second(self.first(x)))

@@ -1,0 +1,119 @@
+"""The likelihood of a pose: a network judges single image points as the hypothesis would have them, and their mean decides.
+
+Each pose looks at pixels drawn around its projected origin, lifts them by their depth and carries them into its object
+frame. A point is judged by where it lies there, its colour, the viewing ray in that frame (so that a surface seen *through*
+the hypothesis differs from one that hides it) and the noise level: one network holds a family of likelihoods, broad to sharp.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor, nn
+
+from posefilter.geometry.camera import project, rays
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.nets.layers import ResnetFC, fourier
+
+
+class Pixels(NamedTuple):
+    """An image laid out for gathering."""
+
+    values: Tensor  # (B, H * W, 4) red, green, blue in [0, 1], z-depth [m] (0 unknown)
+    size: tuple[int, int]  # H, W
+    intrinsics: Tensor  # (B, 3, 3) [px]
+
+
+class Points(NamedTuple):
+    """The image points that each pose looks at, in that pose's object frame, relative to the object's centre."""
+
+    position: Tensor  # (B, N, P, 3) [m]; where depth is unknown, the ray's point nearest to the centre
+    color: Tensor  # (B, N, P, 3) in [0, 1]
+    ray: Tensor  # (B, N, P, 3) unit viewing ray
+    known: Tensor  # (B, N, P) bool: depth is known
+    inside: Tensor  # (B, N, P) bool: the pixel lies in the frame
+
+
+def lay_out(rgb: Tensor, depth: Tensor, K: Tensor) -> Pixels:
+    """Lay images out for gathering.  (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) -> Pixels."""
+    return Pixels(torch.cat([rgb, depth], dim=1).flatten(2).transpose(1, 2).contiguous(), rgb.shape[-2:], K)  # type: ignore[arg-type]
+
+
+def look(image: Pixels, poses: Tensor, center: Tensor, radius: float, noise: Tensor, spread: float = 0.6) -> Points:
+    """Gather the pixels that each pose looks at, and carry them into its object frame.
+
+    poses (B, N, 4, 4); noise (B, 1 or N, P, 2) standard normal: pixels are the projected centre + spread x projected radius
+    x noise, rounded. The same noise for every pose of an image makes their scores comparable (common random numbers).
+    """
+    H, W = image.size
+    K = image.intrinsics
+    middle = origin_of(poses, center)
+    reach = spread * radius * K[:, None, 0, 0] / middle[..., 2].clamp_min(0.1)
+    pixels = (project(middle, K)[..., None, :] + reach[..., None, None] * noise).round()
+    inside = (pixels[..., 0] >= 0) & (pixels[..., 0] < W) & (pixels[..., 1] >= 0) & (pixels[..., 1] < H)
+    u, v = pixels[..., 0].clamp(0, W - 1), pixels[..., 1].clamp(0, H - 1)
+    index = (v.long() * W + u.long()).flatten(1)
+    values = image.values.gather(1, index[..., None].expand(-1, -1, 4)).unflatten(1, inside.shape[1:])
+    color, z = values[..., :3], values[..., 3:]
+    ray = rays(torch.stack([u, v], dim=-1).flatten(1, 2), K).unflatten(1, inside.shape[1:])
+    R = rotation_of(poses)
+    origin = -middle[..., None, :]
+    along = (ray * middle[..., None, :]).sum(-1, keepdim=True) / (ray * ray).sum(-1, keepdim=True)
+    known = z > 0
+    position = (ray * torch.where(known, z, along) + origin) @ R
+    return Points(position, color, F.normalize(ray, dim=-1) @ R, known[..., 0], inside)
+
+
+class PoseLikelihood(nn.Module):
+    """log p(image | pose) at a noise level, up to a constant an image: `scale` x the mean judgement of its points.
+
+    width, blocks: of the residual MLP; octaves: of the position's Fourier features; sigma: the range of noise levels [m].
+    """
+
+    def __init__(
+        self,
+        width: int = 96,
+        blocks: int = 3,
+        octaves: int = 5,
+        scale: float = 20.0,
+        sigma: tuple[float, float] = (0.003, 0.25),
+    ) -> None:
+        super().__init__()
+        self.octaves, self.scale, self.sigma = octaves, scale, (float(sigma[0]), float(sigma[1]))
+        self.enter = nn.Linear(3 * (2 * octaves + 1) + 7, width)
+        self.modulate = nn.Sequential(nn.Linear(9, width), nn.ReLU(), nn.Linear(width, 2 * width))
+        self.blocks = nn.ModuleList([ResnetFC(width) for _ in range(blocks)])
+        self.leave = nn.Linear(width, 1)
+        self.outside = nn.Sequential(nn.Linear(9, 16), nn.ReLU(), nn.Linear(16, 1))
+
+    def level(self, sigma: Tensor) -> Tensor:
+        """Describe noise levels to the network.  (*) [m] -> (*, 9), from -1 at the sharpest to 1 at the broadest."""
+        low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
+        at = (2 * (sigma.clamp_min(1e-6).log() - low) / (high - low) - 1)[..., None]
+        return torch.cat([at, fourier(at / 4, 4)[..., 1:]], dim=-1)
+
+    def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
+        """Judge points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
+        p = points.position / radius
+        far = p.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        p = p / far * torch.where(far > 2, 3 - 2 / far, far)  # contracted beyond two radii, as in mip-NeRF 360 (eq. 10)
+        known = points.known[..., None].to(p.dtype)
+        x = self.enter(torch.cat([fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known], dim=-1))
+        gain, bias = self.modulate(level)[:, None, None].chunk(2, dim=-1)
+        x = torch.addcmul(x + bias, x, gain)
+        for block in self.blocks:
+            x = block(x)
+        return self.leave(torch.relu(x))[..., 0]
+
+    def forward(
+        self, image: Pixels, poses: Tensor, sigma: Tensor, center: Tensor, radius: float, pixels: int, generator: Generator
+    ) -> Tensor:
+        """Score poses at noise levels.  poses (B, N, 4, 4), sigma (B,) or () [m] -> (B, N)."""
+        B = poses.shape[0]
+        noise = torch.randn(B, 1, pixels, 2, generator=generator, device=poses.device)
+        points = look(image, poses, center, radius, noise)
+        level = self.level(sigma.expand(B))
+        judged = torch.where(points.inside, self.judge(points, level, radius), self.outside(level)[:, None])
+        too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])  # [m]: nothing is seen closer than that
+        return self.scale * judged.mean(-1) - 200 * too_near
