@@ -1,13 +1,15 @@
 """Meshes that the project draws itself: the same every time, no files.  Sizes follow YCB's objects of the same kind."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from posefilter.data import builtin_carton
+from posefilter.data import builtin_boxes, builtin_carton, builtin_round
 from posefilter.data.builtin_shapes import Rect, box, weld
 from posefilter.data.mesh import Mesh
+from posefilter.data.symmetries import symmetry_group, turn_about
 
 TEXTURE = 512  # [px] width and height of every texture
 
@@ -45,6 +47,31 @@ def boxed(name: str, size: tuple[float, float, float], prints: dict[str, np.ndar
     return weld(name, box(size, slots), texture)
 
 
+def _brick() -> Mesh:
+    """Make the foam brick, which half turns about its three axes leave as it is."""
+    mesh = boxed("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
+    center = mesh.bounds.mean(0)
+    return replace(mesh, symmetries=np.stack([np.eye(4), *(turn_about(axis, np.pi, center) for axis in np.eye(3))]))
+
+
+def _bowl() -> Mesh:
+    """Make the bowl, which every turn about z leaves as it is."""
+    return replace(builtin_round.bowl(), symmetries=symmetry_group(continuous=[(np.array([0, 0, 1.0]), np.zeros(3))]))
+
+
 _BUILDERS: dict[str, Callable[[], Mesh]] = {
+    "banana": builtin_round.banana,
+    "bleach_bottle": builtin_round.bleach_bottle,
+    "bowl": _bowl,
+    "brick": _brick,
     "carton": lambda: boxed("carton", builtin_carton.SIZE, builtin_carton.faces()),
+    "coffee_can": builtin_round.coffee_can,
+    "gelatin_carton": lambda: boxed("gelatin_carton", builtin_boxes.GELATIN_SIZE, builtin_boxes.gelatin_faces()),
+    "marker": builtin_round.marker,
+    "mug": builtin_round.mug,
+    "mustard_bottle": builtin_round.mustard_bottle,
+    "pitcher": builtin_round.pitcher,
+    "soup_can": builtin_round.soup_can,
+    "sugar_carton": lambda: boxed("sugar_carton", builtin_boxes.SUGAR_SIZE, builtin_boxes.sugar_faces()),
+    "tuna_can": builtin_round.tuna_can,
 }

@@ -33,6 +33,11 @@ def weld(name: str, soup: Soup, texture: np.ndarray, symmetries: np.ndarray | No
     return mesh if symmetries is None else Mesh(name, vertices, faces, uv, texture, None, normals, symmetries)
 
 
+def moved(soup: Soup, linear: np.ndarray, shift: np.ndarray) -> Soup:
+    """Map every corner by x -> linear @ x + shift; `linear` must not mirror.  (3, 3), (3,) [m]."""
+    return Soup(soup.corners @ linear.T + shift, soup.uv)
+
+
 def grid(points: np.ndarray, uv: np.ndarray) -> Soup:
     """Triangulate a grid of points.  (R, C, 3), (R, C, 2); outside is where columns x rows points."""
     faces = grid_faces(*points.shape[:2])
