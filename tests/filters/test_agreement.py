@@ -1,0 +1,40 @@
+"""The agreed pose against a truth that most particles know, each a little wrong."""
+
+import torch
+
+from posefilter.filters.agreement import Agreement
+from posefilter.geometry.pose import make_pose
+from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
+from posefilter.types import Cloud, Reading
+
+
+class Points:
+    def __init__(self, point: torch.Tensor) -> None:
+        self.point = point
+
+    def own_points(self, scene: None, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.point, torch.ones_like(self.point[..., 0], dtype=torch.bool)
+
+
+def test_agreement_beats_the_best_particle_and_shrugs_off_a_third_of_outliers() -> None:
+    g = torch.Generator().manual_seed(0)
+    B, N = 6, 120
+    R, t = random_rotation(B, generator=g), torch.rand(B, 3, generator=g) * 0.2 + torch.tensor([0.0, 0.0, 0.8])
+    thing = torch.rand(B, N, 3, generator=g) * 0.2 - 0.1
+    point = thing @ R.transpose(-1, -2) + t[:, None]
+    told = thing + 0.01 * torch.randn(B, N, 3, generator=g)
+    wrong = torch.rand(B, N, generator=g) < 0.33
+    told = torch.where(wrong[..., None], torch.rand(B, N, 3, generator=g) * 0.2 - 0.1, told)
+    Rs = R[:, None] @ exp_so3(0.15 * torch.randn(B, N, 3, generator=g))
+    pose = make_pose(Rs, point - (Rs @ told[..., None])[..., 0])
+    log_p = torch.full((B, N), -0.1)
+    empty = torch.zeros(B, N, 0)
+    cloud = Cloud(torch.zeros(B, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(B, N))
+    reading = Reading(log_p, torch.zeros(B, N, 2), pose, empty)
+    belief = Agreement(scale_m=0.015)(cloud, reading, None, Points(point), g)  # type: ignore[arg-type]
+    assert angle_between(belief.best[:, :3, :3], R).max() < 0.05
+    assert (belief.best[:, :3, 3] - t).norm(dim=-1).max() < 0.006
+    single = angle_between(pose[:, :, :3, :3], R[:, None]).median()
+    assert angle_between(belief.best[:, :3, :3], R).median() < single / 4
+    torch.testing.assert_close(belief.log_weights.logsumexp(1), torch.zeros(B), atol=1e-5, rtol=0)
+    assert ((belief.score > 0.3) & (belief.score < 0.8)).all()  # about two thirds agree

@@ -1,0 +1,51 @@
+"""What plain outputs mean."""
+
+import torch
+
+from posefilter.geometry.pose import invert, is_rigid, transform
+from posefilter.geometry.rotation import matrix_from_quat_xyzw
+from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointSixD, Unbounded, fill_depth
+
+
+def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
+    g = torch.Generator().manual_seed(0)
+    state = torch.rand(4, 100, 2, generator=g) * torch.tensor([99.0, 49.0])
+    raw = torch.randn(4, 100, 2, generator=g) * 5
+    goal = state + Bounded(0.3)(raw, state, 100, 50)
+    assert goal.min() >= 0
+    assert (goal <= torch.tensor([99.0, 49.0])).all()
+    assert (goal - state).abs().max() <= 30 + 1e-4
+    out = state + Unbounded()(raw, state, 100, 50)
+    assert (out < 0).any()
+    assert (out > 100).any()
+
+
+def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> None:
+    g = torch.Generator().manual_seed(1)
+    center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
+    raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
+    pose = OwnPointSixD(center, radius)(raw, point)
+    assert is_rigid(pose)
+    back = transform(invert(pose), point[:, :, None])[:, :, 0]
+    torch.testing.assert_close(back, center + radius * raw[..., 6:], atol=1e-5, rtol=0)
+    moved = OwnPointSixD(center, radius)(raw, point + torch.tensor([0.0, 0.0, 0.3]))  # the same outputs, farther away
+    torch.testing.assert_close(moved[..., :3, 3] - pose[..., :3, 3], torch.tensor([0.0, 0.0, 0.3]).expand(2, 6, 3))
+
+
+def test_absolute_pose_is_its_seven_outputs() -> None:
+    raw = torch.tensor([[[0.0, 0.0, 2.0, 0.0, 0.1, 0.2, 0.9]]])
+    pose = AbsoluteQuaternion()(raw, torch.rand(1, 1, 3))
+    torch.testing.assert_close(pose[0, 0, :3, 3], torch.tensor([0.1, 0.2, 0.9]))
+    torch.testing.assert_close(pose[0, 0, :3, :3], matrix_from_quat_xyzw(torch.tensor([0.0, 0.0, 1.0, 0.0])))
+    assert NoPose()(raw[..., :0], torch.rand(1, 1, 3)).shape == (1, 1, 4, 4)
+
+
+def test_depth_is_filled_from_near_by_then_from_the_median() -> None:
+    depth = torch.full((2, 1, 30, 30), 2.0)
+    depth[0, 0, :, :15] = 1.0
+    depth[0, 0, 4, 4] = 0.0
+    depth[1] = 0.0
+    filled = fill_depth(depth)
+    torch.testing.assert_close(filled[0, 0, 4, 4], torch.tensor(1.0))
+    assert torch.equal(filled[0, 0, 5], depth[0, 0, 5])
+    assert (filled[1] == 1.0).all()
