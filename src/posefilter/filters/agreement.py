@@ -32,7 +32,7 @@ class Agreement:
         self.rounds = rounds
 
     def __call__(self, cloud: Cloud, reading: Reading, scene: Scene, method: Method, generator: Generator) -> Belief:
-        """Return the belief whose `best` is the agreed pose and whose score is the share that agrees x the best likelihood."""
+        """Return the belief whose `best` is the agreed pose, its score the share that agrees x the best likelihood."""
         point, known = method.own_points(scene, cloud.state)  # type: ignore[attr-defined]
         thing = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
         weight = reading.log_likelihood.exp() * known + 1e-9
@@ -41,9 +41,10 @@ class Agreement:
         explained = weight[:, None] * self._fit(guess, thing[:, None], point[:, None], 2 * self.scale_m)
         best = guess.gather(1, explained.sum(-1).argmax(1)[:, None, None, None].expand(-1, -1, 4, 4))[:, 0]
         for i in range(self.rounds):
-            scale = self.scale_m * 2 ** (1 - 2 * i / max(self.rounds - 1, 1))
+            scale = self.scale_m * 2 ** (2 - 2 * i / max(self.rounds - 1, 1))
             best = fit_rigid(thing, point, weight * self._fit(best, thing, point, scale))
-        agreed = (weight * self._fit(best, thing, point, self.scale_m)).sum(1) / weight.sum(1)
+        near = self._fit(best, thing, point, self.scale_m) > 0.04  # within two scales
+        agreed = (weight * near).sum(1) / weight.sum(1)
         log_weights = torch.log_softmax(reading.log_likelihood, dim=1)
         return Belief(reading.pose, log_weights, best, agreed * reading.log_likelihood.exp().max(1).values)
 
