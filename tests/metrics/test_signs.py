@@ -1,0 +1,53 @@
+"""Signs of failure on clouds whose failure is known."""
+
+import math
+
+import pytest
+import torch
+
+from posefilter.metrics.signs import auroc, explained, heading, near_edge, off_frame, on_object, pairwise_cosine
+
+
+def test_pairwise_cosine_equals_the_double_loop() -> None:
+    g = torch.Generator().manual_seed(0)
+    motion = torch.randn(2, 9, 2, generator=g)
+    motion[0, 3] = 0
+    for b, keep in ((0, [0, 1, 2, 4, 5, 6, 7, 8]), (1, list(range(9)))):
+        unit = torch.nn.functional.normalize(motion[b, keep], dim=-1)
+        pairs = [unit[i] @ unit[j] for i in range(len(keep)) for j in range(len(keep)) if i != j]
+        assert pairwise_cosine(motion)[b].item() == pytest.approx(torch.stack(pairs).mean().item(), abs=1e-5)
+    assert pairwise_cosine(torch.ones(1, 5, 2))[0].item() == pytest.approx(1.0)
+    assert math.isnan(pairwise_cosine(torch.zeros(1, 5, 2))[0].item())
+
+
+def test_explained_is_one_for_the_truth_nought_for_the_mean_and_negative_for_drift() -> None:
+    true = torch.randn(200, 2, generator=torch.Generator().manual_seed(0))
+    assert explained(true, true) == 1
+    assert explained(true.mean(0).expand(200, 2), true).item() == pytest.approx(0.0, abs=1e-5)
+    assert explained(true + 3, true) < -1
+
+
+def test_heading_ignores_particles_that_are_there() -> None:
+    true = torch.tensor([[10.0, 0.0], [0.0, 10.0], [0.0, 0.0]])
+    assert heading(torch.tensor([[1.0, 0.0], [1.0, 0.0], [-9.0, 1.0]]), true).item() == pytest.approx(0.5)
+
+
+def test_auroc_equals_counting_pairs() -> None:
+    g = torch.Generator().manual_seed(0)
+    score = torch.randint(0, 8, (60,), generator=g).float()
+    positive = torch.rand(60, generator=g) < score / 10
+    pairs = [float(a > b) + 0.5 * float(a == b) for a in score[positive] for b in score[~positive]]
+    assert auroc(score, positive).item() == pytest.approx(sum(pairs) / len(pairs), abs=1e-6)
+    assert math.isnan(auroc(score, torch.zeros(60, dtype=torch.bool)).item())
+
+
+def test_shares_of_places() -> None:
+    mask = torch.zeros(1, 1, 100, 200, dtype=torch.bool)
+    mask[0, 0, 40:60, 80:120] = True
+    state = torch.tensor([[[100.0, 50.0], [122.0, 50.0], [2.0, 2.0], [100.0, 99.0], [-5.0, 50.0]]])
+    assert on_object(state, mask).item() == pytest.approx(0.2)
+    assert on_object(state, mask, margin_px=3).item() == pytest.approx(0.4)
+    assert off_frame(state, 200, 100).item() == pytest.approx(0.2)
+    edge, corner = near_edge(state, 200, 100)
+    assert edge.item() == pytest.approx(0.6)
+    assert corner.item() == pytest.approx(0.2)
