@@ -1,0 +1,36 @@
+"""Contrast: the true pose must outscore the others of the same image, as far as the noise level can tell them apart."""
+
+import torch
+from torch import Tensor
+
+from posefilter.geometry.pose import transform
+from posefilter.types import Batch, ObjectModel, Trace
+
+
+def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int = 64) -> Tensor:
+    """Return the mean distance of corresponding points, least over the object's symmetries.
+
+    (B, N, 4, 4), (B, 4, 4) -> (B, N) [m]. ADD (Hinterstoisser et al. 2012) on a thinned set of points; for symmetric
+    objects MSSD's way of taking the minimum over equivalent truths (Hodan et al. 2020) with ADD's mean.
+    """
+    thin = model.points[:: max(1, len(model.points) // points)].to(poses.device)
+    there = transform(poses, thin)
+    best = torch.full(poses.shape[:2], torch.inf, device=poses.device)
+    for symmetry in model.symmetries.to(poses.device):
+        same = transform(truth @ symmetry, thin)[:, None]
+        best = torch.minimum(best, (there - same).norm(dim=-1).mean(-1))
+    return best
+
+
+class Contrast:
+    """KL(target || softmax(score)) over one image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
+
+    With it exp(score) learns to be the posterior smoothed by sigma, the noise level that the candidates were read at.
+    """
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return the divergence an image, (B,) >= 0."""
+        poses, scores, sigma = trace.readings[-1].pose, trace.readings[-1].log_likelihood, trace.steps[-1].sigma
+        distance = pose_distance(poses, batch.camera_from_object, model)
+        target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)
+        return (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)
