@@ -24,7 +24,7 @@ def from_depth(batch: Batch, model: ObjectModel, count: int, generator: Generato
     prior: (B, 1, H, W) >= 0, how likely the object is at each pixel; uniform where None. Images with no depth at all draw
     from all pixels at 1 m.
     """
-    B, _, H, W = batch.depth.shape
+    B, _, _, W = batch.depth.shape
     depth = batch.depth.flatten(1)
     depth = torch.where((depth > 0).any(1, keepdim=True), depth, torch.ones_like(depth))
     weight = (depth > 0).float()

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 def fourier(x: Tensor, octaves: int) -> Tensor:
-    """Append sines and cosines of `octaves` doubling frequencies, the first of period 2.  (*, D) -> (*, D (1 + 2 octaves))."""
+    """Append sines and cosines of doubling frequencies, the first of period 2.  (*, D) -> (*, D (1 + 2 octaves))."""
     angles = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], dim=-1)
 

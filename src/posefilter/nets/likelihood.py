@@ -2,7 +2,7 @@
 
 Each pose looks at pixels drawn around its projected origin, lifts them by their depth and carries them into its object
 frame. A point is judged by where it lies there, its colour, the viewing ray in that frame (so that a surface seen *through*
-the hypothesis differs from one that hides it) and the noise level: one network holds a family of likelihoods, broad to sharp.
+the hypothesis differs from one that hides it) and the noise level: one network holds a family, broad to sharp.
 """
 
 import math

@@ -162,7 +162,7 @@ def draw_poses(
     A seed cell is drawn by p(object) / scale, `votes` more by the same weight within 2 radii of it; their weighted Kabsch
     fit is one pose. Images in which no depth is known raise ValueError: nothing can be said of them.
     """
-    B, h, w = said.logit.shape
+    B = len(said.logit)
     weight = (torch.sigmoid(said.logit) + 1e-4) / (said.log_scale.exp() + 0.05) * cells.valid
     weight = weight.flatten(1)
     if not bool((weight.sum(1) > 0).all()):
