@@ -65,7 +65,7 @@ def off_frame(state: Tensor, width: int, height: int) -> Tensor:
 
 
 def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tuple[Tensor, Tensor]:
-    """Return the shares within `share` of the frame's sides of an edge, and of a corner; off the frame counts as on its edge.
+    """Return the shares within `share` of the frame of an edge, and of a corner; off the frame counts as on its edge.
 
     (B, N, 2) [px] -> (B,), (B,).
     """
