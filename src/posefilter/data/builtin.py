@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from posefilter.data import builtin_boxes, builtin_carton, builtin_round
+from posefilter.data import builtin_boxes, builtin_carton, builtin_round, builtin_vessels
 from posefilter.data.builtin_shapes import Rect, box, weld
 from posefilter.data.mesh import Mesh
 from posefilter.data.symmetries import symmetry_group, turn_about
@@ -56,21 +56,21 @@ def _brick() -> Mesh:
 
 def _bowl() -> Mesh:
     """Make the bowl, which every turn about z leaves as it is."""
-    return replace(builtin_round.bowl(), symmetries=symmetry_group(continuous=[(np.array([0, 0, 1.0]), np.zeros(3))]))
+    return replace(builtin_vessels.bowl(), symmetries=symmetry_group(continuous=[(np.array([0, 0, 1.0]), np.zeros(3))]))
 
 
 _BUILDERS: dict[str, Callable[[], Mesh]] = {
-    "banana": builtin_round.banana,
+    "banana": builtin_vessels.banana,
     "bleach_bottle": builtin_round.bleach_bottle,
     "bowl": _bowl,
     "brick": _brick,
     "carton": lambda: boxed("carton", builtin_carton.SIZE, builtin_carton.faces()),
     "coffee_can": builtin_round.coffee_can,
     "gelatin_carton": lambda: boxed("gelatin_carton", builtin_boxes.GELATIN_SIZE, builtin_boxes.gelatin_faces()),
-    "marker": builtin_round.marker,
-    "mug": builtin_round.mug,
+    "marker": builtin_vessels.marker,
+    "mug": builtin_vessels.mug,
     "mustard_bottle": builtin_round.mustard_bottle,
-    "pitcher": builtin_round.pitcher,
+    "pitcher": builtin_vessels.pitcher,
     "soup_can": builtin_round.soup_can,
     "sugar_carton": lambda: boxed("sugar_carton", builtin_boxes.SUGAR_SIZE, builtin_boxes.sugar_faces()),
     "tuna_can": builtin_round.tuna_can,

@@ -83,7 +83,7 @@ def brick_faces() -> dict[str, np.ndarray]:
         foam = Canvas(w, h, (152, 44, 40)).image.astype(np.float32)
         noise = rng.standard_normal(foam.shape[:2]).astype(np.float32)
         fine, coarse = cv2.GaussianBlur(noise, (0, 0), 1.2), cv2.GaussianBlur(noise, (0, 0), 5)
-        foam += (14 * fine / fine.std() + 5 * coarse / coarse.std())[..., None]
+        foam += (8 * fine / fine.std() + 5 * coarse / coarse.std())[..., None]
         out[face] = np.clip(foam, 0, 255).astype(np.uint8)
     return out
 

@@ -51,7 +51,8 @@ def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
     except UserError:
         raise
     except Exception as error:  # the file decides what breaks: parsers raise anything from KeyError to struct.error
-        raise UserError(f"{path}: not a readable mesh ({type(error).__name__}: {str(error).splitlines()[0:1]})") from error
+        reason = next(iter(str(error).splitlines()), "")
+        raise UserError(f"{path}: not a readable mesh; is it cut short? ({type(error).__name__}: {reason})") from error
     return _finish(raw, path, name, scale)
 
 
@@ -157,7 +158,7 @@ def _read_obj(path: Path) -> _Raw:
     colors = _rectangle(numbers["v"], 6)[:, 3:] if numbers["v"] and len(numbers["v"][0]) >= 6 else None
     known = [library.get(name, _PLAIN) for name in materials] or list(library.values())[:1] or [_PLAIN]
     faces = index[..., 0]
-    if len(faces) and faces.max() >= len(vertices):
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
     return _Raw(
         vertices,

@@ -74,9 +74,7 @@ class MeshStore:
             for info in (folder / "symmetries.json", folder / "models_info.json"):
                 if info.is_file():
                     return read_symmetries(info, name, self.scale, self.symmetry_steps)
-        if name in ycb.SYMMETRIES:
-            return symmetry_group(*ycb.SYMMETRIES[name], steps=self.symmetry_steps)
-        return None
+        return ycb.symmetries(name, self.symmetry_steps)
 
 
 def _find_meshes(root: Path) -> dict[str, Path]:
