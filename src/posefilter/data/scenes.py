@@ -118,26 +118,41 @@ def draw_layout(
 ) -> Layout | None:
     """Draw one frame, or None where this draw does not work out (the caller draws again)."""
     view = _View(K, height, width)
-    occluded = rng.random() < settings.occluded_share
+    occluded = bool(rng.random() < settings.occluded_share)
     least = 1 - settings.occlusion
     wanted = rng.uniform(min(max(0.28, least), 0.6), 0.6) if occluded else rng.uniform(max(0.6, least), 1.0)
     tabletop = bool(rng.random() < settings.tabletop_share)
-    start = _start_on_table(scene, settings, view, occluded, rng) if tabletop else _start_afloat(scene, settings, view, rng)
-    if start is None:
-        return None
-    target, camera_from_table = start
-    if not view.holds(target, settings.largest_truncation):
-        return None
-    placed = [target]
-    for solid in _draw_solids(scene, settings, rng):
-        in_front = occluded and view.visible(placed) > wanted + 0.06
-        one = _place(solid, placed, view, camera_from_table, wanted, in_front, rng)
-        if one is not None:
-            placed.append(one)
+    for _ in range(8 if occluded else 1):  # not every corner of a table has room in front of the target
+        placed, camera_from_table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
+        if placed and (not occluded or view.visible(placed) < wanted + 0.1):
+            break
     if len(placed) <= min(settings.distractors[0], 1):
         return None
     up = camera_from_table[:3, 2] if tabletop else np.array([0.0, -0.8, -0.6])
-    return Layout(tuple(placed), _surroundings(scene, target, camera_from_table, tabletop, rng), _draw_lights(up, settings, rng), tabletop)
+    planes = _surroundings(scene, placed[0], camera_from_table, tabletop, rng)
+    return Layout(tuple(placed), planes, _draw_lights(up, settings, rng), tabletop)
+
+
+def _draw_objects(
+    scene: SceneSet, settings: SceneSettings, view: "_View", tabletop: bool, occluded: bool, wanted: float, rng: np.random.Generator
+) -> tuple[list[Placed], np.ndarray]:
+    """Place the target and what stands round it, none where the target leaves the frame.  -> objects, camera_from_table."""
+    if tabletop:
+        target, frame = _start_on_table(scene, settings, view, occluded, rng)
+    else:
+        target, frame = _start_afloat(scene, settings, view, rng)
+    if not view.holds(target, settings.largest_truncation):
+        return [], frame
+    placed = [target]
+    solids = _draw_solids(scene, settings, rng)
+    if occluded:  # whatever can hide most is tried in front first
+        solids.sort(key=lambda solid: -_face(solid))
+    for solid in solids:
+        in_front = occluded and view.visible(placed) > wanted + 0.06
+        one = _place(solid, placed, view, frame, wanted, in_front, rng)
+        if one is not None:
+            placed.append(one)
+    return placed, frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,22 +179,27 @@ class _View:
         """Return an object's outline, coarsely."""
         return outline_mask(one.hull, self.K, self.height, self.width, _STRIDE)
 
-    def visible(self, placed: list[Placed]) -> float:
-        """Return the share of the first object's outline in the frame that no nearer one covers."""
+    def free(self, placed: list[Placed]) -> tuple[np.ndarray, int]:
+        """Return the coarse mask of the first object that no nearer one covers, and how large it would be alone."""
         whole = self.mask(placed[0])
-        hidden = np.zeros_like(whole)
+        free = whole.copy()
         for one in placed[1:]:
             if one.center[2] < placed[0].center[2]:
-                hidden |= self.mask(one)
-        return float((whole & ~hidden).sum() / max(int(whole.sum()), 1))
+                free &= ~self.mask(one)
+        return free, max(int(whole.sum()), 1)
+
+    def visible(self, placed: list[Placed]) -> float:
+        """Return the share of the first object's outline in the frame that no nearer one covers."""
+        free, whole = self.free(placed)
+        return float(free.sum() / whole)
 
 
 def _start_on_table(
     scene: SceneSet, settings: SceneSettings, view: _View, occluded: bool, rng: np.random.Generator
-) -> tuple[Placed, np.ndarray] | None:
+) -> tuple[Placed, np.ndarray]:
     """Put the target on a table before the camera.  -> the target and camera_from_table, whose origin lies under it."""
     low, high = settings.elevation_deg
-    elevation = np.deg2rad(rng.uniform(low, min(high, max(60.0, low)) if occluded else high))
+    elevation = np.deg2rad(rng.uniform(low, min(high, max(45.0, low)) if occluded else high))
     roll = Rotation.from_euler("z", rng.normal(0, 6), degrees=True).as_matrix()
     up = roll @ np.array([0, -np.cos(elevation), -np.sin(elevation)])
     right = roll @ np.array([1.0, 0, 0])
@@ -195,7 +215,7 @@ def _start_on_table(
 
 def _start_afloat(
     scene: SceneSet, settings: SceneSettings, view: _View, rng: np.random.Generator
-) -> tuple[Placed, np.ndarray] | None:
+) -> tuple[Placed, np.ndarray]:
     """Put the target anywhere in the view, turned anyhow."""
     rotation = Rotation.random(rng=rng).as_matrix()
     center = view.ray(rng.uniform(0.12, 0.88), rng.uniform(0.12, 0.88)) * rng.uniform(*settings.distance)
@@ -215,22 +235,36 @@ def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Genera
     return out
 
 
+def _apart(a: Placed, b: Placed) -> bool:
+    """Tell whether two objects stand apart, by their spheres or else by their hulls."""
+    far = np.linalg.norm(a.center - b.center) > a.solid.radius + b.solid.radius + 0.001
+    return bool(far) or separated(a.hull, b.hull, 0.001)
+
+
+def _face(solid: Solid) -> float:
+    """Return the second largest side of a solid's box [m]: how much it hides at best."""
+    low, high = solid.mesh.bounds
+    return float(np.sort(high - low)[1])
+
+
 def _place(
     solid: Solid, placed: list[Placed], view: _View, frame: np.ndarray, wanted: float, in_front: bool, rng: np.random.Generator
 ) -> Placed | None:
     """Find a free place for a distractor: right in front of the target if asked, else anywhere that hides not too much of it."""
     tabletop = not np.array_equal(frame, np.eye(4))
     best, best_error = None, np.inf
-    for _ in range(16):
+    free, whole = view.free(placed)
+    for _ in range(48 if in_front else 16):
         draw = _draw_on_table if tabletop else _draw_afloat
         one = draw(solid, placed[0], frame, in_front, rng)
-        if one.hull[:, 2].min() < _NEAREST or not all(separated(one.hull, other.hull, 0.001) for other in placed):
+        if one.hull[:, 2].min() < _NEAREST or not all(_apart(one, other) for other in placed):
             continue
-        share = view.visible([*placed, one])
+        nearer = one.center[2] < placed[0].center[2]
+        share = float((free & ~view.mask(one)).sum() / whole) if nearer else free.sum() / whole
         if share < wanted - 0.08:
             continue
-        error = share - wanted
-        if not in_front or error < 0.05:
+        error = abs(share - wanted)
+        if not in_front or error < 0.04:
             return one
         if error < best_error:
             best, best_error = one, error
@@ -245,7 +279,7 @@ def _draw_on_table(solid: Solid, target: Placed, frame: np.ndarray, in_front: bo
         towards = -(frame[:3, :2].T @ frame[:3, 3])
         towards /= np.linalg.norm(towards) + 1e-9
         across = np.array([-towards[1], towards[0]])
-        spot = towards * reach * rng.uniform(0.25, 1.3) + across * reach * rng.uniform(-0.7, 0.7)
+        spot = towards * reach * rng.uniform(0.25, 1.4) + across * reach * rng.uniform(-0.6, 0.6)
     else:
         spot = rng.uniform(-1, 1, 2) * (rng.uniform(0.15, 0.4) + 0.5 * reach)
     return _stand(solid, rest, spot, frame)
