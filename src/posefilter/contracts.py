@@ -1,13 +1,14 @@
 """Every protocol on one page.  Each verb of the filter is one injected piece; a Hydra group chooses which.
 
 DataModule -> Batch -> method.observe -> [read -> reweigh -> resample -> move] x steps -> estimate -> refine -> Belief
+The order on this page is the order in which filters/loop.py calls them.
 """
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Generator, Tensor
 
-from posefilter.types import Batch, Belief, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, Belief, Children, Cloud, ObjectModel, Reading, Step, Trace
 
 Scene = Any  # what a method keeps of an image: nothing, a pyramid, a feature map, proposals
 
@@ -59,27 +60,31 @@ class Method(Protocol):
         ...
 
 
-class Initialise(Protocol):
-    """Draw the first cloud's states."""
+@runtime_checkable
+class ScoresPoses(Protocol):
+    """A method that can score any poses: refinement asks for it."""
 
-    def __call__(self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator) -> Tensor:
-        """Return states (B, N, *S)."""
+    def score_poses(self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+        """Score (B, N, 4, 4) at noise level sigma, from `pixels` image points each -> (B, N), differentiable in poses."""
         ...
 
 
-class Propose(Protocol):
-    """Move the children of a resampling."""
+@runtime_checkable
+class ProposesPoses(Protocol):
+    """A method that can draw likely poses from an image: the start `from proposals` asks for it."""
 
-    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
-        """(B, N, *S), learned motion (B, N, D) -> moved states (B, N, *S)."""
+    def propose(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+        """Return (B, particles, 4, 4) camera_from_object."""
         ...
 
 
-class Resample(Protocol):
-    """Draw children from a weighted cloud."""
+@runtime_checkable
+class HasRelevance(Protocol):
+    """A scene that tells where in its images to look: the start `from relevance` asks for it."""
 
-    def __call__(self, log_weights: Tensor, particles: int, generator: Generator) -> tuple[Tensor, Tensor]:
-        """(B, M) normalised -> parents (B, N) int64 and the log weights (B, N) that children start with, normalised."""
+    @property
+    def relevance(self) -> Tensor:
+        """Return how much each cell matters, (B, 1, h, w) >= 0, cells evenly over the image."""
         ...
 
 
@@ -88,6 +93,42 @@ class Schedule(Protocol):
 
     def __call__(self, steps: int) -> list[float]:
         """Return sigma for each of the steps."""
+        ...
+
+
+class Initialise(Protocol):
+    """Draw the first cloud's states."""
+
+    def __call__(self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator) -> Tensor:
+        """Return states (B, N, *S)."""
+        ...
+
+
+class Reweigh(Protocol):
+    """Turn likelihoods into weights."""
+
+    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+        """Return log weights (B, N), to be normalised by the caller; their log sum is the step's log evidence.
+
+        log_weights (B, N), normalised: what the particles start the step with; log_likelihood (B, N): read at this step;
+        inherited (B, N): each one's parent's log_likelihood, read at the step before (zeros at the first).
+        """
+        ...
+
+
+class Resample(Protocol):
+    """Draw children from a weighted cloud."""
+
+    def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
+        """Return parents **and** the weights that children start with, so that none can be forgotten."""
+        ...
+
+
+class Propose(Protocol):
+    """Move the children of a resampling."""
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """(B, N, *S), learned motion (B, N, D) -> moved states (B, N, *S)."""
         ...
 
 

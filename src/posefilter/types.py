@@ -43,6 +43,14 @@ class Cloud(NamedTuple):
     ancestors: Tensor  # (B, N) int64, each particle's parent in the previous cloud
 
 
+class Children(NamedTuple):
+    """What a resampling made of a weighted cloud of M: N children, each of one parent, or a mix of several."""
+
+    parents: Tensor  # (B, N) int64, each child's (main) parent
+    log_weights: Tensor  # (B, N) that the children start with, normalised
+    shares: Tensor | None = None  # (B, N, M) how much of each parent a child is, rows sum to 1; None: all of its one parent
+
+
 class Reading(NamedTuple):
     """What a method makes of each particle at one step."""
 
@@ -76,3 +84,4 @@ class Trace(NamedTuple):
     readings: tuple[Reading, ...]
     steps: tuple[Step, ...]
     belief: Belief
+    log_evidence: Tensor | None = None  # (B, T) log of the mean weight at each step; None where no filter made the trace

@@ -1,0 +1,1 @@
+"""The particle filter and the pieces that are injected into it."""

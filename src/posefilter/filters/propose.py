@@ -1,0 +1,71 @@
+"""Moving the children of a resampling.  `state` (B, N, *S), `motion` (B, N, D) -> moved states (B, N, *S)."""
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.contracts import Propose, Space
+from posefilter.errors import UserError
+from posefilter.types import Step
+
+
+class Still:
+    """Leave every particle where it is."""
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """Return the states as they are."""
+        return state
+
+
+class Gaussian:
+    """Diffuse by `factor` x the step's noise level; the space says what that is in each of its axes."""
+
+    def __init__(self, factor: float = 0.4) -> None:
+        self.factor = factor
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """Return perturbed states."""
+        B, N = state.shape[:2]
+        scale = space.noise_scale((step.sigma * self.factor).expand(B))[:, None]
+        noise = torch.randn(B, N, space.dimensions, generator=generator, device=state.device, dtype=state.dtype)
+        return space.move(state, scale * noise)
+
+
+class LearnedMotion:
+    """Go where the method's network says."""
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """Return displaced states, differentiable in the motion."""
+        return space.move(state, motion)
+
+
+class HalfTurns:
+    """Turn a share of the poses by pi about a random axis of the object through its centre, so that flips are found."""
+
+    def __init__(self, share: float = 0.1) -> None:
+        self.share = share
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """Return the states, some turned."""
+        if space.dimensions != 6:
+            raise UserError("propose: half turns need particles that are poses; leave them out for a method on pixels")
+        B, N = state.shape[:2]
+        axis = torch.randint(3, (B, N), generator=generator, device=state.device)
+        chosen = torch.rand(B, N, generator=generator, device=state.device) < self.share
+        turn = math.pi * torch.eye(3, dtype=state.dtype, device=state.device)[axis] * chosen[..., None]
+        return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
+
+
+class Chain:
+    """Apply several proposals one after the other."""
+
+    def __init__(self, pieces: Iterable[Propose]) -> None:
+        self.pieces = list(pieces)
+
+    def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
+        """Return the states that the last piece leaves."""
+        for piece in self.pieces:
+            state = piece(state, motion, step, space, generator)
+        return state

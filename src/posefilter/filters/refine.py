@@ -1,0 +1,113 @@
+"""Polishing an estimate: scoring the best few particles with more care, and climbing the score's gradient."""
+
+from collections.abc import Iterable
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.contracts import Method, Refine, Scene, ScoresPoses
+from posefilter.errors import UserError
+from posefilter.types import Belief
+
+
+class NoRefine:
+    """Leave the estimate as it is."""
+
+    def __call__(self, belief: Belief, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return the belief."""
+        return belief
+
+
+class Chain:
+    """Apply several refinements one after the other."""
+
+    def __init__(self, pieces: Iterable[Refine]) -> None:
+        self.pieces = list(pieces)
+
+    def __call__(self, belief: Belief, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return what the last piece makes of it."""
+        for piece in self.pieces:
+            belief = piece(belief, scene, method, generator)
+        return belief
+
+
+def scorer(method: Method) -> ScoresPoses:
+    """Return the method as one that scores poses; raise UserError if it cannot."""
+    if not isinstance(method, ScoresPoses):
+        raise UserError(f"refine: {type(method).__name__} cannot score poses on their own; choose refine=none")
+    return method
+
+
+def candidates(belief: Belief, count: int) -> Tensor:
+    """Return the estimate, and the `count` particles of most weight.  -> (B, 1 + count, 4, 4)."""
+    top = belief.log_weights.topk(min(count, belief.log_weights.shape[1]), dim=1).indices
+    rows = torch.arange(len(top), device=top.device)[:, None]
+    return torch.cat([belief.best[:, None], belief.poses[rows, top]], dim=1)
+
+
+def bet_on_highest(belief: Belief, poses: Tensor, scores: Tensor) -> Belief:
+    """Return the belief with the highest-scored pose as its estimate.  (B, C, 4, 4), (B, C)."""
+    score, index = scores.max(1)
+    return belief._replace(best=poses[torch.arange(len(index), device=index.device), index], score=score)
+
+
+class Rescore:
+    """Score the estimate and the `top` heaviest particles at `sigma` with many pixels, and bet on the best of them."""
+
+    def __init__(self, top: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
+        self.top, self.pixels, self.sigma = top, pixels, sigma
+
+    def __call__(self, belief: Belief, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return the belief with a better-founded estimate."""
+        poses = candidates(belief, self.top)
+        with torch.no_grad():
+            scores = scorer(method).score_poses(scene, poses, self.sigma, generator, self.pixels)
+        return bet_on_highest(belief, poses, scores)
+
+
+class Gradient:
+    """Climb the score by Adam on the pose's tangent, from the estimate and the heaviest other particles.
+
+    starts: poses that climb side by side; lr: the first steps' length on the object's surface [m], falling linearly to 0;
+    sigma: noise level of the score climbed [m]; pixels: drawn anew at each step; final_pixels: for the last comparison, at
+    `final_sigma`, in which the unrefined estimate takes part, so that it is only left for something that scores higher.
+    """
+
+    def __init__(
+        self,
+        steps: int = 50,
+        lr: float = 2e-3,
+        sigma: float = 0.006,
+        pixels: int = 256,
+        starts: int = 1,
+        final_pixels: int = 1024,
+        final_sigma: float = 0.004,
+    ) -> None:
+        self.steps, self.lr, self.sigma, self.pixels, self.starts = steps, lr, sigma, pixels, starts
+        self.final_pixels, self.final_sigma = final_pixels, final_sigma
+
+    def __call__(self, belief: Belief, scene: Scene, method: Method, generator: Generator) -> Belief:
+        """Return the belief with a refined estimate, without gradient."""
+        judge = scorer(method)
+        if torch.is_inference_mode_enabled():
+            raise UserError("refine: climbing the score needs gradients; set trainer.inference_mode=false")
+        start = candidates(belief, self.starts - 1).detach()
+        found = self.climb(start, scene, method, judge, generator)
+        poses = torch.cat([start[:, :1], found], dim=1)
+        with torch.no_grad():
+            scores = judge.score_poses(scene, poses, self.final_sigma, generator, self.final_pixels)
+        return bet_on_highest(belief, poses, scores)
+
+    def climb(self, start: Tensor, scene: Scene, method: Method, judge: ScoresPoses, generator: Generator) -> Tensor:
+        """Return where each pose climbs to.  (B, C, 4, 4) -> (B, C, 4, 4)."""
+        unit = method.space.noise_scale(start.new_tensor(self.lr)) / self.lr  # a turn counts as the shift at the radius
+        with torch.enable_grad():
+            x = torch.zeros(*start.shape[:2], method.space.dimensions, device=start.device, requires_grad=True)
+            adam = torch.optim.Adam([x], self.lr)
+            for step in range(self.steps):
+                adam.param_groups[0]["lr"] = self.lr * (1 - step / self.steps)
+                poses = method.space.move(start, x * unit)
+                score = judge.score_poses(scene, poses, self.sigma, generator, self.pixels)
+                (x.grad,) = torch.autograd.grad(-score.sum(), x)  # of x alone: the network's own gradients stay untouched
+                adam.step()
+        return method.space.move(start, x.detach() * unit)
