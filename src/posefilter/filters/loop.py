@@ -15,6 +15,7 @@ from torch import Generator, Tensor, nn
 
 from posefilter.contracts import Estimate, Initialise, Method, Propose, Refine, Resample, Reweigh, Schedule, Space
 from posefilter.errors import UserError
+from posefilter.filters.guided import bound
 from posefilter.types import Batch, Children, Cloud, Reading, Step, Trace
 
 
@@ -59,12 +60,13 @@ class ParticleFilter(nn.Module):
         cloud = first_cloud(state, method.memory_width)
         inherited = torch.zeros_like(cloud.log_weights)
         timetable = self.timetable(state)
+        resample = bound(self.resample, scene, batch)
         clouds: list[Cloud] = []
         readings: list[Reading] = []
         evidence: list[Tensor] = []
         for step in timetable:
             if readings:
-                children = self.resample(cloud, self.particles, method.space, generator)
+                children = resample(cloud, self.particles, method.space, generator)
                 state = inherit(cloud.state, children, method.space)
                 motion = inherit(readings[-1].motion, children)
                 state = self.propose(state, motion, step, method.space, generator)
