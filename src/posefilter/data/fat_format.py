@@ -1,8 +1,9 @@
 """The Falling Things format on disk: its constants, and how to write it.
 
-A folder holds `_object_settings.json`, `_camera_settings.json` and, a frame and camera, `NNNNNN.left.{jpg,json,depth.png,seg.png}`.
-Lengths in the JSON files are centimetres, depth images are 0.1 mm a unit. Poses are of an *aligned* object frame: y down, centred on
-the bounding box; each folder's `fixed_model_transform` F says how the mesh gets there: p_aligned_cm = [x y z 1] @ F, row vectors.
+A folder holds `_object_settings.json`, `_camera_settings.json` and for each frame and camera `NNNNNN.left.jpg`, `.json`,
+`.depth.png` and `.seg.png`. Lengths in the JSON files are centimetres, depth images are 0.1 mm a unit. Poses are of an
+*aligned* object frame: y down, centred on the bounding box. How the mesh gets there, each folder's `fixed_model_transform` F
+says, for row vectors: p_aligned_cm = [x y z 1] @ F.
 """
 
 import json
@@ -28,7 +29,8 @@ CAMERA_SETTINGS = "_camera_settings.json"
 CUBOID_SIGNS = np.array(
     [[1, -1, 1], [-1, -1, 1], [-1, 1, 1], [1, 1, 1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1], [1, 1, -1]], dtype=np.float64
 )  # the order of a cuboid's corners, in the aligned frame
-_ALIGNED_FROM_UPRIGHT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # z up -> y down, as FAT's cracker box has it
+# z up -> y down, as FAT's cracker box has it
+_ALIGNED_FROM_UPRIGHT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)

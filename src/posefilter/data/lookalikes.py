@@ -1,4 +1,4 @@
-"""Distractors that are easily taken for the target: its shape in another print, its print on another shape, boxes of its colour."""
+"""Distractors easily taken for the target: its shape in another print, its print on another shape, boxes of its colour."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -47,11 +47,13 @@ def box(name: str, sides: np.ndarray, faces: Sequence[np.ndarray]) -> Mesh:
         middle = np.eye(3)[axis] * sign
         corners += [(middle + x * a + y * b) * sides / 2 for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         column, row = k % 3, k // 3
-        spots = np.array([[column + x, row + y] for x, y in ((0.02, 0.02), (0.98, 0.02), (0.98, 0.98), (0.02, 0.98))]) / [3, 2]
+        cell = ((0.02, 0.02), (0.98, 0.02), (0.98, 0.98), (0.02, 0.98))
+        spots = np.array([[column + x, row + y] for x, y in cell]) / [3, 2]
         for i in ((0, 1, 2), (0, 2, 3)):
             triangles.append([4 * k + j for j in i])
             uv.append(spots[list(i)])
-    atlas = np.concatenate([np.concatenate(list(faces[3:6]), 1), np.concatenate(list(faces[0:3]), 1)], 0)  # row 0 is the bottom
+    rows = [np.concatenate(list(faces[3 * row : 3 * row + 3]), axis=1) for row in (1, 0)]  # the atlas's row 0 is its bottom
+    atlas = np.concatenate(rows, axis=0)
     vertices, index = np.array(corners), np.array(triangles)
     return Mesh(name, vertices, index, np.array(uv, np.float32), atlas, None, creased_normals(vertices, index))
 

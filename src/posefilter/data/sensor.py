@@ -1,7 +1,8 @@
 """Model what a camera makes of a perfect picture: colour as a cheap colour camera gives it, depth as structured light does.
 
-The depth's defects follow a Kinect-like sensor: disparity in fixed steps (so errors grow with z squared), correlated noise, a slowly
-varying offset, ragged edges, one-sided shadows where the projector does not reach, holes on dark and shining surfaces, a largest range.
+The depth's defects follow a Kinect-like sensor: disparity in fixed steps (so errors grow with z squared), correlated noise,
+a slowly varying offset, ragged edges, shadows on one side where the projector does not reach, holes on dark and shining
+surfaces, a largest range.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from posefilter.data.textures import noise_field
+from posefilter.data.textures import blurred_noise, noise_field
 from posefilter.errors import UserError
 
 
@@ -53,22 +54,25 @@ def sense_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     grey = out.mean(-1, keepdims=True)
     out = grey + (out - grey) * np.float32(rng.uniform(0.6, 1.4))
     out = np.clip(out, 0, 1.05) ** np.float32(rng.uniform(0.75, 1.35))
-    out = cv2.GaussianBlur(out, (0, 0), 0.3 + rng.uniform(0, 1.1) * width / 640)
+    out = _blur(out, 0.3 + rng.uniform(0, 1.1) * width / 640)
     if rng.random() < 0.25:
-        out = cv2.filter2D(out, -1, _motion_kernel(rng, int(rng.integers(3, max(4, 9 * width // 640)))))
+        kernel = _motion_kernel(rng, int(rng.integers(3, max(4, 9 * width // 640))))
+        out = np.asarray(cv2.filter2D(out, -1, kernel), np.float32)
     out = out + _color_noise(rng, height, width)
     if rng.random() < 0.6:
-        out = out + np.float32(rng.uniform(0.3, 1.5)) * (out - cv2.GaussianBlur(out, (0, 0), rng.uniform(0.8, 1.6)))
+        out = out + np.float32(rng.uniform(0.3, 1.5)) * (out - _blur(out, rng.uniform(0.8, 1.6)))
     return np.clip(out, 0, 1)
 
 
 def sense_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the depth as a structured-light camera measures it.  (H, W) [m], photo in [0, 1] -> (H, W) float32 [m], 0 = no reading."""
+    """Return the depth as a structured-light camera measures it.
+
+    (H, W) [m], 0 = nothing; photo (H, W, 3) in [0, 1] -> (H, W) float32 [m], 0 = no reading.
+    """
     height, width = depth.shape
     out = _ragged(depth, rng)
     valid = out > 0
-    fine = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), rng.uniform(0.8, 3) * width / 640)
-    fine /= max(float(fine.std()), 1e-6)
+    fine = blurred_noise(rng, height, width, rng.uniform(0.8, 3) * width / 640)
     slow = cv2.resize(rng.standard_normal((5, 6), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
     out = out * np.float32(1 + rng.normal(0, 0.0025))
     out = out + out * out * (fine * np.float32(rng.uniform(0.0004, 0.0022)) + slow * np.float32(0.0012))
@@ -84,6 +88,11 @@ def sense_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) 
     return out
 
 
+def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Smooth a picture over sigma [px]."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32)
+
+
 def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Darken or lighten the picture slowly across its face, as a near lamp or a lens does."""
     coarse = 1 + rng.uniform(0, 0.25) * rng.uniform(-1, 1, (3, 4)).astype(np.float32)
@@ -92,10 +101,10 @@ def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
     """Return the trace of a moving camera: a line of `length` pixels in a random direction."""
-    kernel = np.zeros((length, length), np.float32)
-    kernel[length // 2] = 1
+    line = np.zeros((length, length), np.float32)
+    line[length // 2] = 1
     turn = cv2.getRotationMatrix2D((length / 2 - 0.5, length / 2 - 0.5), rng.uniform(0, 180), 1)
-    kernel = cv2.warpAffine(kernel, turn, (length, length))
+    kernel = cv2.warpAffine(line, turn, (length, length))
     return kernel / max(float(kernel.sum()), 1e-6)
 
 
@@ -112,8 +121,8 @@ def _ragged(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     scale = width / 640
     grid = np.empty((2, height, width), np.float32)
     for axis in range(2):
-        jitter = cv2.GaussianBlur(rng.standard_normal((height, width), dtype=np.float32), (0, 0), 1.5)
-        grid[axis] = jitter * np.float32(rng.uniform(1, 7) * scale) + np.float32(rng.normal(0, scale))
+        jitter = blurred_noise(rng, height, width, 1.5)
+        grid[axis] = jitter * np.float32(rng.uniform(0.2, 1.35) * scale) + np.float32(rng.normal(0, scale))
     grid[0] += np.arange(width, dtype=np.float32)
     grid[1] += np.arange(height, dtype=np.float32)[:, None]
     return cv2.remap(depth, grid[0], grid[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
@@ -129,7 +138,8 @@ def _edge_loss(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     kernel = np.zeros((2 * high + 1, 2 * wide + 1), np.uint8)
     kernel[:, wide if rng.random() < 0.5 else 0 :] = 1
     band = cv2.dilate(jump.astype(np.uint8), kernel) > 0
-    rag = cv2.resize(rng.standard_normal((height // 8, width // 8), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+    coarse = rng.standard_normal((height // 8, width // 8), dtype=np.float32)
+    rag = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     return band & (rag > rng.uniform(-2, 0.8))
 
 

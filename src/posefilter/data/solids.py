@@ -78,7 +78,7 @@ _DIRECTIONS = fibonacci_sphere(160)
 def separated(a: np.ndarray, b: np.ndarray, gap: float = 0.0) -> bool:
     """Tell whether some plane keeps two point sets apart by `gap` [m].  (P, 3), (Q, 3).
 
-    Directions tried: 160 spread ones and the line of centres. A no may be wrong for bodies that nearly touch; a yes never is.
+    Directions tried: 160 spread ones and the line of centres. A no may be wrong for bodies that nearly touch, a yes is not.
     """
     between = b.mean(0) - a.mean(0)
     d = np.concatenate([_DIRECTIONS, [between / (np.linalg.norm(between) + 1e-12)]])

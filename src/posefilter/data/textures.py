@@ -1,4 +1,4 @@
-"""Draw textures: what tables, floors, walls and unknown boxes are covered with.  All (n, n, 3) uint8 RGB, all from a numpy Generator."""
+"""Draw textures: what tables, floors, walls and unknown boxes are covered with.  All drawn from a numpy Generator."""
 
 from collections.abc import Sequence
 
@@ -16,6 +16,13 @@ def noise_field(rng: np.random.Generator, size: int, octaves: Sequence[int] = (4
         field += cv2.resize(coarse, (size, size), interpolation=cv2.INTER_CUBIC) * np.float32(rng.uniform(0.1, 1))
     field -= field.min()
     return field / max(float(field.max()), 1e-6)
+
+
+def blurred_noise(rng: np.random.Generator, height: int, width: int, sigma: float) -> np.ndarray:
+    """Return noise of unit spread, smooth over sigma [px].  -> (height, width) float32."""
+    raw = rng.standard_normal((height, width), dtype=np.float32)
+    smooth: np.ndarray = cv2.GaussianBlur(raw, (0, 0), sigma)
+    return smooth / np.float32(max(float(smooth.std()), 1e-6))
 
 
 def random_color(rng: np.random.Generator) -> Color:
@@ -69,8 +76,7 @@ def carpet(rng: np.random.Generator, size: int) -> np.ndarray:
     """Draw pile: a colour with strong fine speckle."""
     speckle = rng.standard_normal((size, size), dtype=np.float32)
     if rng.random() < 0.5:
-        speckle = cv2.GaussianBlur(speckle, (0, 0), rng.uniform(0.5, 2))
-    speckle /= max(float(speckle.std()), 1e-6)
+        speckle = blurred_noise(rng, size, size, rng.uniform(0.5, 2))
     return random_color(rng) * rng.uniform(0.4, 1) * (1 + rng.uniform(0.1, 0.5) * speckle[..., None])
 
 
@@ -117,7 +123,7 @@ _KINDS = (plain, checker, marble, wood, carpet, stripes, label)
 def random_texture(
     rng: np.random.Generator, size: int = 256, photos: Sequence[np.ndarray] = (), weights: Sequence[float] | None = None
 ) -> np.ndarray:
-    """Draw a texture of a random kind, sometimes a cutting of one of the photos in permuted colours.  -> (size, size, 3) uint8.
+    """Draw a texture of a random kind, or cut it out of a photo.  -> (size, size, 3) uint8 RGB.
 
     weights: of plain, checker, marble, wood, carpet, stripes, label; equal if not given.
     """
