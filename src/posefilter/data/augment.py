@@ -71,6 +71,35 @@ class RollAndZoom:
 
 
 @dataclasses.dataclass(frozen=True)
+class Window:
+    """Cut a window of the image: most show the object, at any place in them; the rest are drawn from anywhere.
+
+    A network that reads whole images learns as well from windows, and several times as fast.
+    size: (height, width) [px], multiples of 32; anywhere: share drawn without regard to the object.
+    """
+
+    size: tuple[int, int] = (160, 192)
+    anywhere: float = 0.1
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample as a camera with a smaller chip sees it."""
+        height, width = sample.mask.shape
+        h, w = min(self.size[0], height), min(self.size[1], width)
+        top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
+        rows, cols = np.nonzero(sample.mask)
+        if len(rows) and rng.random() >= self.anywhere:
+            at = rng.integers(len(rows))
+            top = int(np.clip(rows[at] - rng.integers(h // 8, h - h // 8), 0, height - h))
+            left = int(np.clip(cols[at] - rng.integers(w // 8, w - w // 8), 0, width - w))
+        cut = np.s_[top : top + h, left : left + w]
+        K = sample.intrinsics.copy()
+        K[:2, 2] -= (left, top)
+        return dataclasses.replace(
+            sample, rgb=sample.rgb[cut].copy(), depth=sample.depth[cut].copy(), mask=sample.mask[cut].copy(), intrinsics=K
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class PasteOccluder:
     """Put a curved patch, cut from another image, in front of the object.
 
@@ -102,7 +131,7 @@ class PasteOccluder:
             return sample
         distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
         surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
-        other = jitter_color(draw(rng).rgb, rng, 1.0)
+        other = jitter_color(draw(rng).rgb, rng, 1.0)  # drawn samples have the size of whole images, as this one
         return dataclasses.replace(
             sample,
             rgb=np.where(patch[..., None], other, sample.rgb),

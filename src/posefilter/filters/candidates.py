@@ -11,32 +11,16 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor, nn
 
-from posefilter.contracts import Space
-from posefilter.geometry.camera import rays
+from posefilter.filters.initialise import draw_from_depth
 from posefilter.geometry.pose import invert, origin_of, pose_about, rotation_of
 from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import Batch, ObjectModel
 
 
-def from_depth(batch: Batch, model: ObjectModel, count: int, generator: Generator, prior: Tensor | None = None) -> Tensor:
-    """Draw poses at random measured points: uniform rotations, centres a little behind the surface.  -> (B, count, 4, 4).
-
-    prior: (B, 1, H, W) >= 0, how likely the object is at each pixel; uniform where None. Images with no depth at all draw
-    from all pixels at 1 m.
-    """
-    B, _, _, W = batch.depth.shape
-    depth = batch.depth.flatten(1)
-    depth = torch.where((depth > 0).any(1, keepdim=True), depth, torch.ones_like(depth))
-    weight = (depth > 0).float()
-    if prior is not None:
-        weight = weight * (prior.flatten(1) + 1e-6)
-    pick = torch.multinomial(weight, count, replacement=True, generator=generator)
-    pixel = torch.stack([pick % W, pick // W], dim=-1).float()
-    ray = rays(pixel, batch.intrinsics)
-    behind = model.radius * torch.empty(B, count, 1, device=depth.device).uniform_(0.1, 0.9, generator=generator)
-    center = ray * depth.gather(1, pick)[..., None] + ray / ray.norm(dim=-1, keepdim=True) * behind
-    R = random_rotation(B, count, generator=generator, device=depth.device)
-    return pose_about(R, center, model.center.to(depth.device))
+def from_depth(batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None) -> Tensor:
+    """Draw poses at measured points of a batch; see `draw_from_depth`.  -> (B, count, 4, 4)."""
+    return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
 
 
 def half_turns(poses: Tensor, center: Tensor, generator: Generator) -> Tensor:
@@ -46,7 +30,7 @@ def half_turns(poses: Tensor, center: Tensor, generator: Generator) -> Tensor:
     return pose_about(rotation_of(poses) @ turn, origin_of(poses, center), center)
 
 
-def jiggle(poses: Tensor, sigma: Tensor, space: Space, generator: Generator, turn: float = 1.0) -> Tensor:
+def jiggle(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0) -> Tensor:
     """Perturb poses by Gaussian moves of size sigma.  (B, N, 4, 4), (B, N) [m] -> (B, N, 4, 4); `turn` scales the turns."""
     scale = space.noise_scale(sigma)
     scale = torch.cat([scale[..., :3], scale[..., 3:] * turn], dim=-1)
@@ -54,7 +38,7 @@ def jiggle(poses: Tensor, sigma: Tensor, space: Space, generator: Generator, tur
 
 
 def around_truth(
-    batch: Batch, model: ObjectModel, space: Space, each: int, sigma: Sequence[float], generator: Generator
+    batch: Batch, model: ObjectModel, space: PoseSpace, each: int, sigma: Sequence[float], generator: Generator
 ) -> Tensor:
     """Draw the candidates that need the truth: it itself first, then `each` of every kind.  -> (B, 1 + 4.5 each, 4, 4).
 
@@ -69,8 +53,8 @@ def around_truth(
     size = torch.exp(torch.empty(B, each, device=device).uniform_(low, high, generator=generator))
     same = truth.expand(B, each, 4, 4)
     near = jiggle(same, size * 0.6, space, generator)
-    on = from_depth(batch, model, each, generator, batch.mask.float() + 0.02)
-    anywhere = from_depth(batch, model, each, generator)
+    on = from_depth(batch, space, each, generator, batch.mask.float() + 0.02)
+    anywhere = from_depth(batch, space, each, generator)
     few = each // 2
     placed = jiggle(truth.expand(B, few, 4, 4), size[:, :few] * 0.5, space, generator, turn=0.0)
     turned = pose_about(random_rotation(B, few, generator=generator, device=device), origin_of(placed, center), center)
@@ -94,9 +78,9 @@ class PersistentParticles(nn.Module):
         self._poses: dict[int, Tensor] = {}
         self._level: dict[int, int] = {}
 
-    def recall(self, batch: Batch, model: ObjectModel, generator: Generator) -> tuple[Tensor, Tensor]:
+    def recall(self, batch: Batch, space: PoseSpace, generator: Generator) -> tuple[Tensor, Tensor]:
         """Return each frame's particles (B, M, 4, 4) and its noise level (B,) [m]; new frames start from depth, broad."""
-        fresh = from_depth(batch, model, self.particles, generator)
+        fresh = from_depth(batch, space, self.particles, generator)
         rows = []
         for row, frame in enumerate(batch.frame_id.tolist()):
             kept = self._poses.get(frame)
@@ -107,7 +91,14 @@ class PersistentParticles(nn.Module):
 
     @torch.no_grad()
     def advance(
-        self, batch: Batch, poses: Tensor, scores: Tensor, sigma: Tensor, used: Tensor, space: Space, generator: Generator
+        self,
+        batch: Batch,
+        poses: Tensor,
+        scores: Tensor,
+        sigma: Tensor,
+        used: Tensor,
+        space: PoseSpace,
+        generator: Generator,
     ) -> None:
         """Take one filter step where `used` (B,): resample by the scores at sigma, perturb, lower the noise level."""
         parents = torch.multinomial(torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator)

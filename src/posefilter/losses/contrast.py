@@ -25,7 +25,8 @@ def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int 
 class Contrast:
     """KL(target || softmax(score)) over one image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
 
-    With it exp(score) learns to be the posterior smoothed by sigma, the noise level that the candidates were read at.
+    With it exp(score) learns to be the posterior smoothed by sigma, the noise level that the candidates were read at. Images
+    in which the object is not seen teach nothing and count zero.
     """
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
@@ -33,4 +34,5 @@ class Contrast:
         poses, scores, sigma = trace.readings[-1].pose, trace.readings[-1].log_likelihood, trace.steps[-1].sigma
         distance = pose_distance(poses, batch.camera_from_object, model)
         target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)
-        return (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)
+        divergence = (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)
+        return divergence * batch.mask.flatten(1).any(1)

@@ -27,19 +27,22 @@ class ResnetFC(nn.Module):
 
 
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """Return a 3 x 3 convolution, group norm and ReLU; group norm, since batches are small and images differ."""
+    """Return a 3 x 3 convolution, batch norm and ReLU.
+
+    Batch norm, since its statistics do not depend on an image's extent: the network trains on windows and reads whole images.
+    """
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.GroupNorm(8, outputs), nn.ReLU(inplace=True)
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
     )
 
 
 class ResBlock(nn.Module):
-    """Two 3 x 3 convolutions with group norm and a skip."""
+    """Two 3 x 3 convolutions with batch norm and a skip."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = conv_norm(width, width)
-        self.second = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.GroupNorm(8, width))
+        self.second = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width))
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, width, H, W) -> (B, width, H, W)."""

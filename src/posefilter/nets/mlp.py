@@ -3,6 +3,7 @@
 from typing import NamedTuple, Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
@@ -112,4 +113,4 @@ class PatchNet(nn.Module):
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; the memory is written anew, not read."""
         seen = self.convolve(patch.flatten(0, 1)).flatten(1).unflatten(0, patch.shape[:2])
         out = self.tell(torch.cat([seen, extra], dim=-1))
-        return Said(out[..., 3:], out[..., 0], out[..., 1:3], out[..., :0])
+        return Said(F.softplus(out[..., 3:] - 2), out[..., 0], out[..., 1:3], out[..., :0])

@@ -14,7 +14,7 @@ from posefilter.geometry.camera import back_project, pixel_grid, rays
 from posefilter.geometry.pose import fit_rigid
 from posefilter.nets.layers import ResBlock, conv_norm
 
-STRIDE = 4  # pixels a cell
+STRIDE = 8  # pixels a cell
 
 
 class Coordinates(NamedTuple):
@@ -63,10 +63,10 @@ def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
 class ObjectCoordinateNet(nn.Module):
     """A U-Net with residual blocks: colour at full resolution, geometry (normals, depth, rays) at half of it.
 
-    widths: channels at strides 4, 8, 16 and 32. Sides must be multiples of 4; other strides are met by interpolation.
+    widths: channels at strides 4, 8, 16 and 32. Sides must be multiples of 8; other strides are met by interpolation.
     """
 
-    def __init__(self, widths: tuple[int, int, int, int] = (48, 80, 112, 144), head: int = 64) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 80, 128, 160)) -> None:
         super().__init__()
         a, b, c, d = widths
         self.colour = conv_norm(3, 24, stride=2)
@@ -74,25 +74,21 @@ class ObjectCoordinateNet(nn.Module):
         self.down4 = ResBlock(a)
         self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
         self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
-        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d))
+        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
         self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
-        self.to8, self.up8 = nn.Conv2d(c, b, 1), ResBlock(b)
-        self.to4, self.skip4, self.up4 = nn.Conv2d(b, head, 1), nn.Conv2d(a, head, 1), ResBlock(head)
-        self.out = nn.Conv2d(head, 5, 1)
+        self.to8, self.up8 = nn.Conv2d(c, b, 1), nn.Sequential(ResBlock(b), ResBlock(b))
+        self.out = nn.Conv2d(b, 5, 1)
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
-        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 4 x W / 4."""
+        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8."""
         geometry = self._geometry(depth, K)
         with torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32):
             x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
-            x4 = self.down4(self.enter(torch.cat([x, geometry], dim=1)))
-            x8 = self.down8(x4)
+            x8 = self.down8(self.down4(self.enter(torch.cat([x, geometry], dim=1))))
             x16 = self.down16(x8)
             x32 = self.down32(x16)
             y16 = self.up16(x16 + self._grow(self.to16(x32), x16))
-            y8 = self.up8(x8 + self._grow(self.to8(y16), x8))
-            y4 = self.up4(self.skip4(x4) + self._grow(self.to4(y8), x4))
-            y = self.out(y4).float()
+            y = self.out(self.up8(x8 + self._grow(self.to8(y16), x8))).float()
         return Coordinates(y[:, 0], y[:, 1:4].permute(0, 2, 3, 1), y[:, 4].clamp(-5.0, 1.0))
 
     @staticmethod

@@ -1,0 +1,113 @@
+"""The paper's fifth method: particles are poses, and a learned likelihood judges each by the image points it explains."""
+
+from typing import Any, NamedTuple
+
+import torch
+from posefilter.models.base import PoseEstimator
+from torch import Generator, Tensor, nn
+
+from posefilter.errors import UserError
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.lessons import Lesson
+from posefilter.nets.likelihood import Pixels, lay_out
+from posefilter.nets.proposals import Cells, Coordinates, ObjectCoordinateNet, coordinate_loss, draw_poses, measure_cells
+from posefilter.types import Batch, Cloud, Reading, Step
+
+
+class PoseScene(NamedTuple):
+    """What is kept of an image: its pixels, and what the proposal network makes of it (None without one)."""
+
+    image: Pixels
+    said: Coordinates | None
+    cells: Cells | None
+
+    @property
+    def relevance(self) -> Tensor:
+        """Return where the object is likely to be, (B, 1, h, w)."""
+        if self.said is None:
+            raise UserError("initialise=from_relevance needs the proposal network; choose proposals=dense")
+        return torch.sigmoid(self.said.logit)[:, None]
+
+
+class PosePF(PoseEstimator):
+    """A particle filter over SE(3) with a learned likelihood.
+
+    likelihood: scores poses (nets/likelihood.py, or the paper's); proposals: the dense network that the filter starts from,
+    or None; lesson: what the likelihood is trained on; pixels: image points a pose reads at each filter step; lesson_pixels:
+    the same in training; proposal_weight: of the proposal network's loss.
+    """
+
+    legal_losses = ("contrast", "regression")
+
+    def __init__(
+        self,
+        likelihood: nn.Module,
+        lesson: Lesson,
+        proposals: ObjectCoordinateNet | None = None,
+        pixels: int = 64,
+        lesson_pixels: int = 48,
+        proposal_weight: float = 1.0,
+        **base: Any,
+    ) -> None:
+        super().__init__(**base)
+        self.likelihood, self.proposals, self.lesson = likelihood, proposals, lesson
+        self.pixels, self.lesson_pixels, self.proposal_weight = pixels, lesson_pixels, proposal_weight
+
+    @property
+    def space(self) -> PoseSpace:
+        """Return SE(3) about the object's centre."""
+        x, y, z = self.model.center.tolist()
+        return PoseSpace((x, y, z), self.model.radius)
+
+    @property
+    def memory_width(self) -> int:
+        """Return 0: these particles remember nothing."""
+        return 0
+
+    def observe(self, batch: Batch) -> PoseScene:
+        """Lay the image out, and run the proposal network once."""
+        image = lay_out(batch.rgb, batch.depth, batch.intrinsics)
+        if self.proposals is None:
+            return PoseScene(image, None, None)
+        said = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
+        return PoseScene(image, said, measure_cells(batch.depth, batch.intrinsics))
+
+    def read(self, scene: PoseScene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+        """Score every particle at the step's noise level."""
+        count = self.lesson_pixels if self.training else self.pixels
+        score = self._score(scene, cloud.state, step.sigma, generator, count)
+        still = cloud.state.new_zeros(*cloud.state.shape[:2], self.space.dimensions)
+        return Reading(score, still, cloud.state, cloud.memory)
+
+    def score_poses(self, scene: PoseScene, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+        """Score any poses (B, N, 4, 4) at a noise level [m].  -> (B, N)."""
+        return self._score(scene, poses, poses.new_tensor(sigma), generator, pixels)
+
+    def propose(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
+        """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
+        if scene.said is None or scene.cells is None:
+            raise UserError("initialise=from_proposals needs the proposal network; choose proposals=dense")
+        said = Coordinates(*(x.detach() for x in scene.said))
+        return draw_poses(said, scene.cells, self._center(), self.model.radius, particles, generator)
+
+    def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
+        """Return the likelihood's loss and the proposal network's, one value an image each, from one look at the images."""
+        scene = self.observe(batch)
+        trace = self.lesson(self, scene, batch, generator)
+        losses = {"likelihood": self.loss(trace, batch, self.model)}
+        if scene.said is not None and scene.cells is not None:
+            fit, error = coordinate_loss(
+                scene.said, scene.cells, batch.mask, batch.camera_from_object, self._center(), self.model.radius
+            )
+            losses["proposals"] = self.proposal_weight * fit
+            self.watch("coordinate_error_mm", 1000 * error.mean())
+        return losses
+
+    def _center(self) -> Tensor:
+        return self.model.center.to(self.device)
+
+    def _score(self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int) -> Tensor:
+        # bfloat16 halves a training step; at inference differences of a few millimetres need full precision
+        with torch.autocast(poses.device.type, torch.bfloat16, enabled=self.training):
+            score = self.likelihood(scene.image, poses, sigma, self._center(), self.model.radius, pixels, generator)
+        return score.float()
