@@ -29,7 +29,7 @@ class ResnetFC(nn.Module):
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     """Return a 3 x 3 convolution, batch norm and ReLU.
 
-    Batch norm, since its statistics do not depend on an image's extent: the network trains on windows and reads whole images.
+    Batch norm, since its statistics do not hang on an image's extent: it trains on windows and reads whole images.
     """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
