@@ -1,0 +1,40 @@
+"""Losses beside the chosen one, and how their weights change as training proceeds."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from posefilter.contracts import Loss
+from posefilter.errors import UserError
+
+
+class Auxiliary(NamedTuple):
+    """A loss that is added to the chosen one."""
+
+    loss: Loss
+    weight: float = 1.0
+
+
+class Stage(NamedTuple):
+    """A part of training, and the factor on each loss by name (1 where it is not named) while it lasts."""
+
+    until: float  # share of the training's steps at which it ends
+    factors: Mapping[str, float]
+
+
+def check_stages(stages: Sequence[Stage], names: Sequence[str]) -> None:
+    """Raise UserError unless the stages follow one another up to 1 and name existing losses."""
+    ends = [stage.until for stage in stages]
+    if stages and (sorted(set(ends)) != ends or ends[-1] != 1):
+        raise UserError(f"model.stages end at {ends}: the ends must rise, and the last be 1")
+    for stage in stages:
+        for name in stage.factors:
+            if name not in names:
+                raise UserError(f"model.stages names the loss {name!r}: there are {', '.join(names)}")
+
+
+def factors_at(stages: Sequence[Stage], progress: float) -> Mapping[str, float]:
+    """Return the factors in force at `progress` in [0, 1]; none without stages."""
+    for stage in stages:
+        if progress < stage.until:
+            return stage.factors
+    return stages[-1].factors if stages else {}
