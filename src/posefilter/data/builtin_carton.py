@@ -30,7 +30,7 @@ def faces() -> dict[str, np.ndarray]:
 def _front() -> np.ndarray:
     page = Canvas(164, 213, RED)
     page.fade((0, 0, 164, 213), (218, 34, 36), (150, 8, 26))
-    page.burst(112, 128, 84, 66, (236, 92, 30), 24).burst(112, 128, 66, 54, YELLOW, 24)
+    page.burst(106, 140, 70, 56, (232, 80, 30), 24).burst(106, 140, 54, 44, YELLOW, 24)
     page.polygon([(0, 16), (164, 4), (164, 56), (0, 68)], NAVY)
     page.polygon([(0, 19), (164, 7), (164, 9), (0, 21)], YELLOW).polygon([(0, 63), (164, 51), (164, 53), (0, 65)], YELLOW)
     page.text(BRAND, (10, 14, 154, 60), WHITE, 0.17)
@@ -85,7 +85,7 @@ def _left() -> np.ndarray:
 
 def _right() -> np.ndarray:
     page = Canvas(72, 213, ORANGE)
-    page.fade((0, 0, 72, 213), (252, 190, 40), (236, 112, 20))
+    page.fade((0, 0, 72, 213), (255, 214, 56), (246, 166, 24))
     page.rect((0, 150, 72, 156), NAVY)
     page.text(BRAND, (10, 8, 62, 146), NAVY, 0.16, turned=True)
     page.cracker(24, 180, 32, 15).cracker(52, 194, 26, -22)

@@ -61,7 +61,7 @@ def mug() -> Mesh:
 
 def bowl() -> Mesh:
     """Draw a bowl with rings only, so that every turn about z is a symmetry; as large as YCB's."""
-    t = np.linspace(0, 1, 7)
+    t = np.linspace(0, 1, 9)
     r = 0.042 + (0.0795 - 0.042) * np.sin(t * np.pi / 2) ** 0.9
     outside: Profile = [*zip(r.tolist(), (0.0535 * t**1.15).tolist(), strict=True), (0.0807, 0.0542)]
     page = Canvas(500, 80, (188, 22, 34))
@@ -69,7 +69,7 @@ def bowl() -> Mesh:
     inside = Canvas(50, 50, CREAM).rect((0, 10, 50, 14), BLUE).rect((0, 18, 50, 20), BLUE).rect((0, 0, 50, 3), (188, 22, 34))
     floor = Canvas(50, 50, CREAM).ellipse(25, 25, 17, 17, BLUE).ellipse(25, 25, 14, 14, CREAM).ellipse(25, 25, 5, 5, BLUE)
     base = Canvas(50, 50, (120, 16, 26)).ellipse(25, 25, 20, 20, (150, 20, 30))
-    return weld("bowl", _vessel(outside, 0.003, 0.004, 72), texture(page, floor, base, inside))
+    return weld("bowl", _vessel(outside, 0.003, 0.004, 36), texture(page, floor, base, inside))
 
 
 def pitcher() -> Mesh:

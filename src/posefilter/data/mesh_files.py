@@ -63,15 +63,17 @@ def _finish(raw: _Raw, path: Path, name: str, scale: float) -> Mesh:
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
     if not np.isfinite(raw.vertices).all():
         raise UserError(f"{path}: vertices that are not finite numbers")
-    vertices = raw.vertices.astype(np.float64) * scale
-    normals = creased_normals(vertices, raw.faces)
+    used, faces = np.unique(raw.faces, return_inverse=True)  # stray vertices would spoil bounds, hull and diameter
+    faces = faces.reshape(-1, 3).astype(np.int64)
+    vertices = raw.vertices[used].astype(np.float64) * scale
+    normals = creased_normals(vertices, faces)
     if raw.corner_normals is not None:
         length = np.linalg.norm(raw.corner_normals, axis=-1, keepdims=True)
         given = raw.corner_normals / np.maximum(length, 1e-12)
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
     uv, texture = _one_texture(raw)
     colors = None if raw.corner_colors is None else raw.corner_colors.astype(np.float32)
-    return Mesh(name, vertices, raw.faces.astype(np.int64), uv, texture, colors, normals)
+    return Mesh(name, vertices, faces, uv, texture, colors, normals)
 
 
 def _one_texture(raw: _Raw) -> tuple[np.ndarray | None, np.ndarray]:
@@ -194,6 +196,8 @@ def _gather(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
 
 def _read_other(path: Path) -> _Raw:
     """Read PLY and GLB with trimesh; the parts of a scene become one mesh."""
+    if path.suffix.lower() == ".ply":
+        _check_ply_texture(path)
     loaded = trimesh.load(path, process=False)
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
@@ -212,6 +216,14 @@ def _read_other(path: Path) -> _Raw:
         np.concatenate([np.full(len(r.faces), i) for i, r in enumerate(raws)]),
         [r.materials[0] for r in raws],
     )
+
+
+def _check_ply_texture(path: Path) -> None:
+    """Raise UserError where the texture that a PLY's header names cannot be read: trimesh would go on without it."""
+    header = path.read_bytes()[:4096].partition(b"end_header")[0].decode(errors="replace")
+    for line in header.splitlines():
+        if line.lower().startswith("comment texturefile "):
+            _read_image(path.parent / line.split(maxsplit=2)[2].strip(), path)
 
 
 def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> _Raw:

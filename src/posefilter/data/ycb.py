@@ -119,7 +119,7 @@ def ycbvideo_from_original(name: str) -> np.ndarray:
 
 
 def symmetries(name: str, steps: int = 36) -> np.ndarray | None:
-    """Return a class's declared symmetries in the original frame, None where none is known.  -> (S, 4, 4), identity first."""
+    """Return a class's declared symmetries in the original frame, None where none is.  -> (S, 4, 4), the identity first."""
     if name in _HALF_TURNS:
         axis, point = (np.array(v) for v in _HALF_TURNS[name])
         return symmetry_group(discrete=[turn_about(axis / np.linalg.norm(axis), np.pi, point)])
