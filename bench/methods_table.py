@@ -4,7 +4,7 @@
 
 Folders are searched for metrics.json (default: outputs/runs and outputs/sweeps). Runs that differ only in their seed become
 one row: mean, and half the range between the best and the worst seed. Tables replace what stands between
-`<!-- table: NAME -->` and `<!-- end -->`, NAME being a run's experiment or sweep, or `none`; a name without runs is left alone.
+`<!-- table: NAME -->` and `<!-- end -->`, NAME being a run's experiment or sweep, or `none`; a name without runs stays.
 """
 
 import argparse
