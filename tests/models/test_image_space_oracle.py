@@ -1,0 +1,77 @@
+"""The filter itself is not what fails: told the truth about where to go, its particles reach the object."""
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.filters.estimate import Best
+from posefilter.filters.initialise import UniformPixels
+from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.propose import LearnedMotion
+from posefilter.filters.refine import NoRefine
+from posefilter.filters.resample import Never, Systematic
+from posefilter.filters.reweigh import Annealed
+from posefilter.filters.schedule import Constant
+from posefilter.geometry.lookup import nearest_true
+from posefilter.geometry.spaces import PixelSpace
+from posefilter.metrics.signs import explained, on_object, pairwise_cosine
+from posefilter.nets.heads import Bounded, Unbounded
+from posefilter.types import Batch, Cloud, Reading, Step
+
+H, W = 60, 80
+
+
+class Told:
+    """Knows the mask, and moves each particle by `answer` times what it should."""
+
+    space = PixelSpace()
+    memory_width = 0
+
+    def __init__(self, mask: Tensor, head: torch.nn.Module, answer: str) -> None:
+        self.mask, self.head, self.answer = mask, head, answer
+
+    def observe(self, batch: Batch) -> None:
+        return None
+
+    def read(self, scene: None, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+        way = nearest_true(self.mask, cloud.state) - cloud.state
+        if self.answer == "mean":
+            way = way.mean((0, 1)).expand_as(way)
+        raw = way / (W / 2) if isinstance(self.head, Unbounded) else torch.atanh((way / (0.25 * W)).clamp(-0.999, 0.999))
+        motion = self.head(raw, cloud.state, W, H)
+        flat = torch.zeros_like(cloud.log_weights)
+        pose = torch.eye(4).expand(*flat.shape, 4, 4)
+        return Reading(flat, motion, pose, cloud.memory)
+
+
+def scenes() -> Batch:
+    mask = torch.zeros(3, 1, H, W, dtype=torch.bool)
+    mask[0, 0, 5:15, 60:75] = True
+    mask[1, 0, 40:59, 0:12] = True
+    mask[2, 0, 25:40, 30:50] = True
+    zeros = torch.zeros(3, dtype=torch.int64)
+    rgb, depth = torch.zeros(3, 3, H, W), torch.ones(3, 1, H, W)
+    return Batch(rgb, depth, mask, torch.eye(3).expand(3, 3, 3), torch.eye(4).expand(3, 4, 4), zeros, zeros, torch.ones(3))
+
+
+@pytest.mark.parametrize("resample", [Never(), Systematic()], ids=["never", "systematic"])
+@pytest.mark.parametrize("head", [Unbounded(), Bounded(0.25)], ids=["unbounded", "bounded"])
+def test_told_the_truth_every_particle_reaches_the_object(head: torch.nn.Module, resample: Never) -> None:
+    batch = scenes()
+    pieces = (UniformPixels(), Constant(0.0), Annealed(), resample, LearnedMotion(), Best(), NoRefine())
+    pixel_filter = ParticleFilter(100, 8, *pieces)
+    trace = pixel_filter(batch, Told(batch.mask, head, "truth"), Generator().manual_seed(0))
+    assert on_object(trace.clouds[0].state, batch.mask).max() < 0.3
+    assert on_object(trace.clouds[-1].state, batch.mask).min() == 1.0
+
+
+def test_told_only_the_mean_they_drift_together_and_miss() -> None:
+    """What a network that sees nothing of use can learn at best: the signs tell it from the truth."""
+    batch = scenes()
+    pieces = (UniformPixels(), Constant(0.0), Annealed(), Never(), LearnedMotion(), Best(), NoRefine())
+    trace = ParticleFilter(100, 8, *pieces)(batch, Told(batch.mask, Unbounded(), "mean"), Generator().manual_seed(0))
+    first = trace.clouds[0].state
+    true = (nearest_true(batch.mask, first) - first).flatten(0, 1)
+    assert pairwise_cosine(trace.readings[0].motion).min() > 0.99
+    assert explained(trace.readings[0].motion.flatten(0, 1), true).abs() < 0.01
+    assert on_object(trace.clouds[-1].state, batch.mask).mean() < 0.5
