@@ -56,9 +56,11 @@ def test_empty_and_ambiguous_folders_are_named(tmp_path: Path) -> None:
     for root, word in ((tmp_path / "no", "no such folder"), (tmp_path, "no meshes here")):
         with pytest.raises(UserError, match=word):
             MeshStore(root)
-    _box(tmp_path / "two" / "a.obj")
+    _box(tmp_path / "two" / "a.ply")
+    _box(tmp_path / "two" / "a.obj", (0.1, 0.1, 0.11))
+    assert np.ptp(MeshStore(tmp_path).load("two").vertices[:, 2]) == pytest.approx(0.11)  # one mesh in two formats
     _box(tmp_path / "two" / "b.obj")
-    with pytest.raises(UserError, match="two: 2 meshes"):
+    with pytest.raises(UserError, match="two: 3 meshes"):
         MeshStore(tmp_path)
 
 

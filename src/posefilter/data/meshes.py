@@ -98,9 +98,9 @@ def _mesh_in(folder: Path) -> Path | None:
         if path.is_file():
             return path
     others = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
-    if len(others) > 1:
+    if len({p.stem for p in others}) > 1:
         raise UserError(f"{folder}: {len(others)} meshes and none named textured.*: cannot tell which one is meant")
-    return others[0] if others else None
+    return min(others, key=lambda p: SUFFIXES.index(p.suffix.lower()), default=None)  # one mesh in several formats
 
 
 def _check_unit(mesh: Mesh, path: Path) -> None:
