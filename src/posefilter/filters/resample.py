@@ -69,7 +69,9 @@ class Systematic(Fair):
 class Soft:
     """Draw from a mixture of the weights (share alpha) and the uniform, and weigh the children by what that distorts.
 
-    Their weights w / q carry the gradient back to the parents' (Karkus et al. 2018). alpha: 1 is fair, 0 ignores weights.
+    Their weights w / q carry the gradient back to the parents' (Karkus et al. 2018). Here q is held fixed in it: then the
+    gradient of a weighted mean is right in expectation, even at alpha = 1 (Scibior and Wood 2021); else it is not.
+    alpha: 1 is fair, 0 ignores weights.
     """
 
     def __init__(self, alpha: float = 0.5) -> None:
@@ -81,7 +83,7 @@ class Soft:
     def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
         """Return children whose weights are normalised."""
         log_w = cloud.log_weights
-        mixed = self.alpha * log_w.exp() + (1 - self.alpha) / log_w.shape[1]
+        mixed = self.alpha * log_w.detach().exp() + (1 - self.alpha) / log_w.shape[1]
         log_q = mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
         parents = self.scheme(cloud._replace(log_weights=log_q), particles, space, generator).parents
         return Children(parents, torch.log_softmax((log_w - log_q).gather(1, parents), dim=1))

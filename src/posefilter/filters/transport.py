@@ -61,7 +61,8 @@ class OptimalTransport:
 class Ensemble(OptimalTransport):
     """Make each child the mean of its row of the plan: no draw at all, so gradients flow (Corenflos et al. 2021).
 
-    The weighted mean is kept exactly; the spread shrinks with epsilon. On poses the mean is that of the space (chordal).
+    The weighted mean is kept exactly (on poses, that of the space); the spread shrinks, with epsilon and since light
+    particles in the tails are merged, so the filter lags a little behind what it follows.
     """
 
     def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
