@@ -18,13 +18,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from posefilter.data import fat_format as fat
 from posefilter.data.meshes import MeshStore
-from posefilter.data.painter import Job, Painter
+from posefilter.data.painter import Job, Painter, make_renderer
 from posefilter.data.scenes import SceneSettings
 from posefilter.data.sensor import sensor_model
+from posefilter.data.settle import load_mujoco
 from posefilter.errors import UserError
 
 GENERATOR = "_generator.json"
-VERSION = 3  # of the scenes that a seed gives: raise it when they change
+VERSION = 4  # of the scenes that a seed gives: raise it when they change
 FRAMES_PER_TASK = 5
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
@@ -58,11 +59,12 @@ def generate(
     sensor: str = "kinect",
     camera: str | Sequence[float] = "ycb_video",
     occlusion: float = 0.75,
-    occluded_share: float = 0.35,
+    occluded_share: float = 0.4,
     distractors: tuple[int, int] = (2, 8),
     tabletop_share: float = 0.65,
     frames_per_scene: int = 50,
     settle: bool = False,
+    renderer: str = "embree",
     progress: bool = True,
 ) -> Summary:
     """Render `frames` frames of `object` into a FAT dataset at `out`, or go on with one that was begun.
@@ -78,11 +80,12 @@ def generate(
         occlusion=float(occlusion),
         occluded_share=float(occluded_share),
         tabletop_share=float(tabletop_share),
+        settle=bool(settle),
     )
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
     rows = tuple(tuple(float(x) for x in row) for row in K)
-    job = Job(object, str(meshes), int(seed), width, height, rows, stereo, sensor, int(frames_per_scene), settle, scenes)
+    job = Job(object, str(meshes), int(seed), width, height, rows, stereo, sensor, int(frames_per_scene), renderer, scenes)
     _check(job, frames, workers)
     store = MeshStore(meshes)
     if object not in store.names():
@@ -133,6 +136,9 @@ def _check(job: Job, frames: int, workers: int) -> None:
         if wrong:
             raise UserError(message)
     sensor_model(job.sensor)
+    make_renderer(job.renderer)
+    if job.scenes.settle:
+        load_mujoco()
 
 
 def _claim(out: Path, job: Job, frames: int) -> None:

@@ -12,7 +12,7 @@ from posefilter.data.meshes import MeshStore
 from posefilter.data.render import EmbreeRenderer
 from posefilter.data.scenes import Layout, Library, SceneSet, SceneSettings, draw_layout, draw_set, shift_camera
 from posefilter.data.sensor import sense, sensor_model
-from posefilter.data.surfaces import Rendered
+from posefilter.data.surfaces import Rendered, Renderer
 from posefilter.errors import UserError
 
 ATTEMPTS = 400
@@ -31,7 +31,7 @@ class Job:
     stereo: bool
     sensor: str
     frames_per_scene: int
-    settle: bool
+    renderer: str
     scenes: SceneSettings
 
     def folder(self, frame: int) -> str:
@@ -49,6 +49,17 @@ class Job:
         return [stem.with_name(f"{stem.name}.{eye}.{ending}") for eye, _ in reversed(self.eyes()) for ending in endings]
 
 
+def make_renderer(name: str) -> Renderer:
+    """Return a renderer by its name.  Raises UserError for an unknown one, and where one cannot run here."""
+    if name == "embree":
+        return EmbreeRenderer()
+    if name == "moderngl":
+        from posefilter.data.render_gl import GLRenderer
+
+        return GLRenderer()
+    raise UserError(f"renderer={name}: unknown; choose from embree, moderngl")
+
+
 class Painter:
     """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
 
@@ -56,7 +67,7 @@ class Painter:
         self.job, self.out = job, out
         self.K = np.array(job.K)
         self.library = Library(MeshStore(job.meshes))
-        self.renderer = EmbreeRenderer()
+        self.renderer = make_renderer(job.renderer)
         self.sensor = sensor_model(job.sensor)
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
 

@@ -11,6 +11,7 @@ from posefilter.data.solids import Solid, outline_mask, separated
 _STRIDE = 8  # [px] of the masks that foresee who hides whom
 _NEAREST = 0.2  # [m] no object comes nearer to the camera
 _GAP = 0.001  # [m] between objects
+_RIM = 0.03  # [m] how far inside the table's edge the centres of objects stay
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +72,45 @@ class View:
         return float(free.sum() / whole)
 
 
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table top, and the spot of it that the target stands on."""
+
+    camera_from_spot: np.ndarray  # (4, 4) [m], z up, the origin under the target
+    camera_from_top: np.ndarray  # (4, 4) [m], z up, the origin in the middle, axes along the sides
+    half_extent: tuple[float, float]  # [m]
+
+    def carries(self, one: Placed) -> bool:
+        """Tell whether an object's centre is over the table."""
+        x, y, _ = self.camera_from_top[:3, :3].T @ (one.center - self.camera_from_top[:3, 3])
+        return bool(abs(x) < self.half_extent[0] - _RIM and abs(y) < self.half_extent[1] - _RIM)
+
+
+def set_table(camera_from_spot: np.ndarray, half_extent: tuple[float, float], rng: np.random.Generator) -> Table:
+    """Lay a table under a spot, turned by up to 45 degrees, the spot not too near to its edge."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
+    room = np.maximum(0.75 * np.array(half_extent) - 0.1, 0.05)
+    turn[:2, 3] = turn[:2, :2] @ (rng.uniform(-1, 1, 2) * room)
+    return Table(camera_from_spot, camera_from_spot @ turn, half_extent)
+
+
 def stand_target(
     solid: Solid, view: View, distance: float, elevation_deg: float, rng: np.random.Generator
 ) -> tuple[Placed, np.ndarray]:
-    """Put the target on a table, the camera so far from it and so high.  -> it, and camera_from_table (origin under it)."""
+    """Put the target on a table, the camera so far from it and so high.  -> it, and camera_from_spot under it."""
     elevation = np.deg2rad(elevation_deg)
     roll = Rotation.from_euler("z", rng.normal(0, 6), degrees=True).as_matrix()
     up = roll @ np.array([0, -np.cos(elevation), -np.sin(elevation)])
     right = roll @ np.array([1.0, 0, 0])
-    camera_from_table = np.eye(4)
-    camera_from_table[:3, :3] = np.stack([right, np.cross(up, right), up], 1)
+    camera_from_spot = np.eye(4)
+    camera_from_spot[:3, :3] = np.stack([right, np.cross(up, right), up], 1)
     rest = _draw_rest(solid, rng, 0.5)
     bottom = (solid.hull @ rest.T).min(0)[2]
     middle = float((rest @ solid.center)[2] - bottom)
     center = view.ray(rng.uniform(0.15, 0.85), rng.uniform(0.18, 0.85)) * distance
-    camera_from_table[:3, 3] = center - up * middle
-    return _stand(solid, rest, np.zeros(2), camera_from_table), camera_from_table
+    camera_from_spot[:3, 3] = center - up * middle
+    return _stand(solid, rest, np.zeros(2), camera_from_spot), camera_from_spot
 
 
 def hang_target(solid: Solid, view: View, distance: float, rng: np.random.Generator) -> Placed:
@@ -96,7 +120,7 @@ def hang_target(solid: Solid, view: View, distance: float, rng: np.random.Genera
     return _hang(solid, rotation, center)
 
 
-def _apart(a: Placed, b: Placed) -> bool:
+def apart(a: Placed, b: Placed) -> bool:
     """Tell whether two objects stand apart, by their spheres or else by their hulls."""
     far = np.linalg.norm(a.center - b.center) > a.solid.radius + b.solid.radius + _GAP
     return bool(far) or separated(a.hull, b.hull, _GAP)
@@ -112,7 +136,7 @@ def place(
     solid: Solid,
     placed: list[Placed],
     view: View,
-    camera_from_table: np.ndarray | None,
+    table: Table | None,
     wanted: float,
     in_front: bool,
     rng: np.random.Generator,
@@ -125,11 +149,13 @@ def place(
     best, best_error = None, np.inf
     free, whole = view.free(placed)
     for _ in range(48 if in_front else 16):
-        if camera_from_table is None:
+        if table is None:
             one = _draw_afloat(solid, placed[0], in_front, rng)
         else:
-            one = _draw_on_table(solid, placed[0], camera_from_table, in_front, rng)
-        if one.hull[:, 2].min() < _NEAREST or not all(_apart(one, other) for other in placed):
+            one = _draw_on_table(solid, placed[0], table.camera_from_spot, in_front, rng)
+            if not table.carries(one):
+                continue
+        if one.hull[:, 2].min() < _NEAREST or not all(apart(one, other) for other in placed):
             continue
         nearer = one.center[2] < placed[0].center[2]
         share = float((free & ~view.mask(one)).sum() / whole) if nearer else free.sum() / whole
@@ -178,13 +204,13 @@ def _draw_rest(solid: Solid, rng: np.random.Generator, upright: float) -> np.nda
     return Rotation.from_euler("z", rng.uniform(0, 360), degrees=True).as_matrix() @ rest
 
 
-def _stand(solid: Solid, rest: np.ndarray, spot: np.ndarray, camera_from_table: np.ndarray) -> Placed:
+def _stand(solid: Solid, rest: np.ndarray, spot: np.ndarray, camera_from_spot: np.ndarray) -> Placed:
     """Return a solid in a resting rotation with its centre over a spot of the table."""
     center = rest @ solid.center
     table_from_object = np.eye(4)
     table_from_object[:3, :3] = rest
     table_from_object[:3, 3] = [spot[0] - center[0], spot[1] - center[1], -(solid.hull @ rest.T)[:, 2].min()]
-    return Placed(solid, camera_from_table @ table_from_object)
+    return Placed(solid, camera_from_spot @ table_from_object)
 
 
 def _hang(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.data.lookalikes import make_lookalike
 from posefilter.data.meshes import MeshStore
-from posefilter.data.placing import Placed, View, face, hang_target, place, stand_target
+from posefilter.data.placing import Placed, Table, View, face, hang_target, place, set_table, stand_target
+from posefilter.data.settle import settle
 from posefilter.data.solids import Solid, make_solid
 from posefilter.data.surfaces import Instance, Lights, Plane
 from posefilter.data.textures import random_color, random_texture
@@ -27,7 +28,7 @@ class SceneSettings:
 
     distractors: tuple[int, int] = (2, 8)  # least and most beside the target
     occlusion: float = 0.75  # largest share of the target that may be hidden
-    occluded_share: float = 0.35  # share of frames in which something is put right in front of the target
+    occluded_share: float = 0.4  # share of frames in which something is put right in front of the target
     tabletop_share: float = 0.65
     lookalike_share: float = 0.25  # chance that a distractor is a look-alike
     lookalikes: int = 4  # different ones a scene set
@@ -36,6 +37,7 @@ class SceneSettings:
     elevation_deg: tuple[float, float] = (10.0, 85.0)
     largest_truncation: float = 0.4  # share of the target's outline that may leave the frame
     shadow_share: float = 0.7
+    settle: bool = False  # let the objects on a table fall and come to rest (mujoco)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,13 +106,14 @@ def draw_layout(
     wanted = rng.uniform(min(max(0.28, least), 0.6), 0.6) if occluded else rng.uniform(max(0.6, least), 1.0)
     tabletop = bool(rng.random() < settings.tabletop_share)
     for _ in range(8 if occluded else 1):  # not every corner of a table has room in front of the target
-        placed, camera_from_table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
-        if placed and (not occluded or view.visible(placed) < wanted + 0.1):
+        placed, table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
+        enough = len(placed) > settings.distractors[0]
+        if enough and (not occluded or view.visible(placed) < wanted + 0.1):
             break
-    if len(placed) <= min(settings.distractors[0], 1):
+    if not enough:
         return None
-    up = np.array([0.0, -0.8, -0.6]) if camera_from_table is None else camera_from_table[:3, 2]
-    planes = _surroundings(scene, placed[0], camera_from_table, rng)
+    up = np.array([0.0, -0.8, -0.6]) if table is None else table.camera_from_top[:3, 2]
+    planes = _surroundings(scene, placed[0], table, rng)
     return Layout(tuple(placed), planes, _draw_lights(up, settings, rng), tabletop)
 
 
@@ -122,29 +125,34 @@ def _draw_objects(
     occluded: bool,
     wanted: float,
     rng: np.random.Generator,
-) -> tuple[list[Placed], np.ndarray | None]:
-    """Place the target and what stands round it, none where the target leaves the frame.  -> objects, camera_from_table."""
+) -> tuple[list[Placed], Table | None]:
+    """Place the target and what stands round it, none where the target leaves the frame.  -> objects, their table if any."""
     distance = rng.uniform(*settings.distance)
-    frame = None
+    table = None
     if tabletop:
         low, high = settings.elevation_deg
         # from above nothing hides what stands behind it
         elevation = rng.uniform(low, min(high, max(_OCCLUDED_ELEVATION, low)) if occluded else high)
-        target, frame = stand_target(scene.target, view, distance, elevation, rng)
+        target, camera_from_spot = stand_target(scene.target, view, distance, elevation, rng)
+        table = set_table(camera_from_spot, scene.table_half_extent, rng)
     else:
         target = hang_target(scene.target, view, distance, rng)
     if not view.holds(target, settings.largest_truncation):
-        return [], frame
+        return [], table
     placed = [target]
     solids = _draw_solids(scene, settings, rng)
     if occluded:  # whatever can hide most is tried in front first
         solids.sort(key=lambda solid: -face(solid))
     for solid in solids:
         in_front = occluded and view.visible(placed) > wanted + 0.06
-        one = place(solid, placed, view, frame, wanted, in_front, rng)
+        one = place(solid, placed, view, table, wanted, in_front, rng)
         if one is not None:
             placed.append(one)
-    return placed, frame
+    if settings.settle and table is not None:
+        placed = settle(placed, table, rng)
+        if not view.holds(placed[0], settings.largest_truncation) or view.visible(placed) < 1 - settings.occlusion:
+            return [], table
+    return placed, table
 
 
 def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Generator) -> list[Solid]:
@@ -160,29 +168,24 @@ def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Genera
     return out
 
 
-def _surroundings(scene: SceneSet, target: Placed, frame: np.ndarray | None, rng: np.random.Generator) -> tuple[Plane, ...]:
+def _surroundings(scene: SceneSet, target: Placed, table: Table | None, rng: np.random.Generator) -> tuple[Plane, ...]:
     """Return table, floor and wall, or the one surface behind floating clutter."""
-    if frame is None:
+    if table is None:
         back = np.eye(4)
         back[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.45, 3)).as_matrix()
         back[2, 3] = target.center[2] + target.solid.radius + rng.uniform(0.1, 1.2)
         kind = int(rng.integers(3))
         return (Plane(back, (9.0, 9.0), scene.textures[kind], scene.tiles[kind]),)
-    spin = np.eye(4)
-    spin[:3, :3] = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
-    room = 0.75 * np.array(scene.table_half_extent) - 0.1
-    spin[:2, 3] = spin[:2, :2] @ (rng.uniform(-1, 1, 2) * np.maximum(room, 0.05))
-    table = frame @ spin
     drop = np.eye(4)
     drop[2, 3] = -scene.table_height
-    floor = table @ drop
+    floor = table.camera_from_top @ drop
     wall_turn = np.eye(4)
     wall_turn[:3, :3] = Rotation.from_euler("zx", [rng.uniform(-30, 30), 90], degrees=True).as_matrix()
     wall_turn[:3, 3] = wall_turn[:3, 2] * -rng.uniform(0.6, 2.5)
     return (
-        Plane(table, scene.table_half_extent, scene.textures[0], scene.tiles[0]),
+        Plane(table.camera_from_top, table.half_extent, scene.textures[0], scene.tiles[0]),
         Plane(floor, (9.0, 9.0), scene.textures[1], scene.tiles[1]),
-        Plane(frame @ wall_turn, (9.0, 9.0), scene.textures[2], scene.tiles[2]),
+        Plane(table.camera_from_spot @ wall_turn, (9.0, 9.0), scene.textures[2], scene.tiles[2]),
     )
 
 
