@@ -4,10 +4,12 @@ Conventions: active rotations, column vectors (x' = R x), radians, quaternions a
 """
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 _SMALL = 1e-4  # below this angle [rad] the Taylor forms are exact to float32
 
@@ -93,10 +95,29 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
     return 2 * torch.asin((chord / (2 * math.sqrt(2))).clamp(max=1.0))
 
 
+class _Procrustes(torch.autograd.Function):
+    """The nearest rotation, with its own derivative: autograd's for the SVD is NaN where singular values are alike."""
+
+    @staticmethod
+    def forward(ctx: Any, M: Tensor) -> Tensor:
+        """M = U diag(s) Vh -> U diag(1, 1, +-1) Vh."""
+        U, s, Vh = torch.linalg.svd(M)
+        flip = torch.ones_like(s)
+        flip[..., 2] = torch.det(U @ Vh).sign()
+        U, s = U * flip[..., None, :], s * flip
+        ctx.save_for_backward(U, s, Vh)
+        return U @ Vh
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        """With W = U^T dR V skew: W_ij = (U^T dM V - its transpose)_ij / (s_i + s_j)."""
+        U, s, Vh = ctx.saved_tensors
+        A = U.mT @ grad @ Vh.mT
+        total = s[..., :, None] + s[..., None, :]
+        return U @ ((A - A.mT) / total.clamp_min(torch.finfo(s.dtype).eps)) @ Vh
+
+
 def project_to_so3(M: Tensor) -> Tensor:
     """Return the rotation nearest to M in the Frobenius norm (orthogonal Procrustes).  (*, 3, 3) -> (*, 3, 3)."""
-    U, _, Vh = torch.linalg.svd(M)
-    sign = torch.det(U @ Vh).sign()
-    D = torch.ones_like(M[..., 0])
-    D = torch.cat([D[..., :2], sign[..., None]], dim=-1)
-    return (U * D[..., None, :]) @ Vh
+    return _Procrustes.apply(M)
