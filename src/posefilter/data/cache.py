@@ -1,0 +1,202 @@
+"""Keep decoded, resized frames, so that training waits for no decoder: in memory, on disk, or not at all.
+
+Colour stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it counts as unknown), masks become bits.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.errors import UserError
+
+_UNITS = 10_000.0  # a metre
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What is kept of one record beside its image."""
+
+    mask_bits: np.ndarray  # (ceil(H W / 8),) uint8
+    shape: tuple[int, int]
+    intrinsics: np.ndarray  # (3, 3)
+    camera_from_object: np.ndarray  # (4, 4)
+    object_id: int
+    visibility: float
+
+    @property
+    def pixels(self) -> int:
+        """Return how many pixels the mask has."""
+        return int(np.unpackbits(self.mask_bits).sum())
+
+
+class FrameCache(Protocol):
+    """Somewhere to keep samples."""
+
+    def find(self, record: FrameRecord) -> Prepared | None:
+        """Return what is kept of a record, None for nothing, or where its files have changed since."""
+        ...
+
+    def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
+        """Keep a sample."""
+        ...
+
+    def load(self, record: FrameRecord, frame_id: int) -> Sample:
+        """Return a kept sample."""
+        ...
+
+
+class MemoryCache:
+    """Keep frames in this process's memory; forked loader workers share it."""
+
+    def __init__(self) -> None:
+        self._images: dict[str, np.ndarray] = {}
+        self._records: dict[str, Prepared] = {}
+
+    def find(self, record: FrameRecord) -> Prepared | None:
+        """Return what is kept of a record."""
+        return self._records.get(record.key)
+
+    def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
+        """Keep a sample; records of one image share its pixels."""
+        self._images.setdefault(record.name, pack_image(sample))
+        self._records[record.key] = prepared = prepare(sample)
+        return prepared
+
+    def load(self, record: FrameRecord, frame_id: int) -> Sample:
+        """Return a kept sample."""
+        return unpack(self._images[record.name], self._records[record.key], frame_id)
+
+
+class DiskCache:
+    """Keep frames in a folder, one file an image and one a record, for this and later runs.
+
+    A file is written whole or not at all, and is out of date as soon as a source file's size or time of change differs.
+    """
+
+    def __init__(self, folder: Path, version: str) -> None:
+        """Use a folder; `version` says all that decides the content beside the source files (size, class list, meshes)."""
+        self.folder = folder / hashlib.sha256(version.encode()).hexdigest()[:16]
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "README").write_text(f"decoded frames; may be deleted at any time\n{version}\n")
+        except OSError as error:
+            raise UserError(
+                f"{folder}: the cache cannot be written ({error.strerror}); set data.cache_dir or data.cache=memory"
+            ) from error
+        self._records: dict[str, Prepared] = {}
+
+    def find(self, record: FrameRecord) -> Prepared | None:
+        """Return what is kept of a record, None where a source file has changed."""
+        if record.key not in self._records:
+            path = self._path(record.key, _stamp(record), ".npz")
+            if not (path.is_file() and self._image_path(record).is_file()):
+                return None
+            with np.load(path) as kept:
+                height, width, object_id = (int(x) for x in kept["numbers"])
+                self._records[record.key] = Prepared(
+                    kept["mask_bits"],
+                    (height, width),
+                    kept["intrinsics"],
+                    kept["pose"],
+                    object_id,
+                    float(kept["visibility"]),
+                )
+        return self._records[record.key]
+
+    def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
+        """Write a sample."""
+        one = prepare(sample)
+        image = self._image_path(record)
+        if not image.is_file():
+            _write(image, lambda path: np.save(path, pack_image(sample)))
+        parts = {
+            "mask_bits": one.mask_bits,
+            "numbers": np.array([*one.shape, one.object_id]),
+            "intrinsics": one.intrinsics,
+            "pose": one.camera_from_object,
+            "visibility": np.array(one.visibility),
+        }
+        _write(self._path(record.key, _stamp(record), ".npz"), lambda path: np.savez(path, allow_pickle=False, **parts))
+        self._records[record.key] = one
+        return one
+
+    def load(self, record: FrameRecord, frame_id: int) -> Sample:
+        """Return a kept sample."""
+        one = self.find(record)
+        if one is None:
+            raise UserError(f"{record.files[0]}: changed while it was in use; start again")
+        return unpack(np.load(self._image_path(record)), one, frame_id)
+
+    def _image_path(self, record: FrameRecord) -> Path:
+        return self._path(record.name, _stamp(record, 2), ".npy")
+
+    def _path(self, name: str, stamp: str, suffix: str) -> Path:
+        code = hashlib.sha256(f"{name} {stamp}".encode()).hexdigest()[:24]
+        return self.folder / code[:2] / f"{code}{suffix}"
+
+
+class NoCache:
+    """Keep nothing but the numbers: decode anew each time."""
+
+    def __init__(self, read: Callable[[FrameRecord], Sample]) -> None:
+        self._read = read
+        self._records: dict[str, Prepared] = {}
+
+    def find(self, record: FrameRecord) -> Prepared | None:
+        """Return the numbers of a record that was read once."""
+        return self._records.get(record.key)
+
+    def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
+        """Keep the numbers."""
+        self._records[record.key] = prepared = prepare(sample)
+        return prepared
+
+    def load(self, record: FrameRecord, frame_id: int) -> Sample:
+        """Return the sample, decoded anew."""
+        one, sample = self._records[record.key], self._read(record)
+        return unpack(pack_image(sample), one, frame_id)
+
+
+def prepare(sample: Sample) -> Prepared:
+    """Return what is kept of a sample beside its image."""
+    height, width = sample.mask.shape
+    pose, K = sample.camera_from_object.astype(np.float32), sample.intrinsics.astype(np.float32)
+    return Prepared(np.packbits(sample.mask), (height, width), K, pose, sample.object_id, float(sample.visibility))
+
+
+def pack_image(sample: Sample) -> np.ndarray:
+    """Return colour and depth in one array.  -> (H, W, 5) uint8."""
+    units = np.round(sample.depth * _UNITS)
+    depth = np.where(units > 65535, 0, units).astype("<u2")
+    return np.concatenate([sample.rgb, depth[..., None].view(np.uint8)], axis=-1)
+
+
+def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
+    """Return the sample that was packed."""
+    height, width = one.shape
+    depth = np.ascontiguousarray(image[..., 3:]).view("<u2")[..., 0].astype(np.float32) / np.float32(_UNITS)
+    mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
+    rgb = np.ascontiguousarray(image[..., :3])
+    return Sample(
+        rgb, depth, mask, one.intrinsics.copy(), one.camera_from_object.copy(), one.object_id, frame_id, one.visibility
+    )
+
+
+def _stamp(record: FrameRecord, files: int | None = None) -> str:
+    """Return what changes when a source file does: any of them, or the first two (colour, depth)."""
+    states = [path.stat() for path in record.files[:files] if path.exists()]
+    return " ".join(f"{state.st_size}:{state.st_mtime_ns}" for state in states)
+
+
+def _write(path: Path, save: Callable[[Path], None]) -> None:
+    """Save beside the path, then rename."""
+    path.parent.mkdir(exist_ok=True)
+    partial = path.with_name(f".{os.getpid()}.{path.name}")
+    save(partial)
+    partial.replace(path)

@@ -1,0 +1,90 @@
+"""Frames as torch sees them: an indexable dataset, and a shuffle that depends on (seed, epoch) alone."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from torch.utils.data import Dataset, Sampler
+
+from posefilter.data.cache import FrameCache
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.errors import UserError
+from posefilter.types import Batch
+
+if TYPE_CHECKING:
+    from posefilter.data.augment import Augment
+
+
+def to_batch(sample: Sample) -> Batch:
+    """Return a sample as tensors, with no batch dimension: the default collate adds it."""
+    return Batch(
+        rgb=torch.from_numpy(np.ascontiguousarray(sample.rgb.transpose(2, 0, 1))).float() / 255,
+        depth=torch.from_numpy(sample.depth.astype(np.float32, copy=False))[None],
+        mask=torch.from_numpy(sample.mask.astype(bool, copy=False))[None],
+        intrinsics=torch.from_numpy(sample.intrinsics.astype(np.float32)),
+        camera_from_object=torch.from_numpy(sample.camera_from_object.astype(np.float32)),
+        object_id=torch.tensor(sample.object_id, dtype=torch.int64),
+        frame_id=torch.tensor(sample.frame_id, dtype=torch.int64),
+        visibility=torch.tensor(sample.visibility, dtype=torch.float32),
+    )
+
+
+class FrameDataset(Dataset[Batch]):
+    """The frames of one split.
+
+    Augmentation of sample i draws from a generator of (seed, epoch, i): whatever the workers, the order or the batch.
+    """
+
+    def __init__(
+        self, records: Sequence[FrameRecord], cache: FrameCache, augment: "Augment | None" = None, seed: int = 0
+    ) -> None:
+        self.records, self._cache, self._augment, self._seed = list(records), cache, augment, seed
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist must see it change
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.records)
+
+    def __getitem__(self, i: int) -> Batch:
+        """Return frame i, augmented where the split is."""
+        sample = self.sample(i)
+        if self._augment is not None:
+            rng = np.random.default_rng([self._seed, int(self._epoch), i])
+            sample = self._augment(sample, self._draw, rng)
+        return to_batch(sample)
+
+    def sample(self, i: int) -> Sample:
+        """Return frame i as it is."""
+        return self._cache.load(self.records[i], i)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch whose augmentation is drawn."""
+        self._epoch.fill_(epoch)
+
+    def _draw(self, rng: Generator) -> Sample:
+        """Return some frame of the split: occluders are cut from it."""
+        return self.sample(int(rng.integers(len(self))))
+
+
+class EpochShuffle(Sampler[int]):
+    """Shuffle by (seed, epoch).  Lightning tells samplers the epoch; this one passes it on."""
+
+    def __init__(self, length: int, seed: int, tell: Callable[[int], None]) -> None:
+        if length == 0:
+            raise UserError("no training frames are left: see data.split, data.min_visibility and data.object")
+        self._length, self._seed, self._tell, self._epoch = length, seed, tell, 0
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return self._length
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield the epoch's order."""
+        return iter(np.random.default_rng([self._seed, self._epoch, 1 << 20]).permutation(self._length).tolist())
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch."""
+        self._epoch = epoch
+        self._tell(epoch)

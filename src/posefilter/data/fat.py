@@ -1,0 +1,305 @@
+"""Read the Falling Things format: `single` and `mixed`, both cameras, any class; also what `generate.py` writes.
+
+The chain of a pose: mesh -> F (row vectors, metres to centimetres) -> aligned frame -> quaternion, location (cm) -> camera.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from posefilter.data import ycb
+from posefilter.data.decode import expect_size, need, numbers, read_color, read_depth, read_json, read_label
+from posefilter.data.frames import BadData, FrameRecord, NotShown, Sample
+from posefilter.data.meshes import MeshStore
+from posefilter.data.naming import choose_objects
+from posefilter.data.silhouette import Geometry
+from posefilter.errors import UserError
+from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rotation import matrix_from_quat_xyzw
+
+CM, DEPTH_UNITS = 0.01, 10_000.0  # metres a centimetre; depth image units a metre
+_FRAME = re.compile(r"^(\d+)\.(left|right)\.json$")
+_IMAGE = re.compile(r"^(\d+)\.(left|right)\.(jpg|png)$")
+_NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
+_CUBOID_TOLERANCE = 0.005  # [m]; the wood block's public mesh is off by more, all others by less than 1 mm
+_CLEARLY_VISIBLE = 0.2  # FAT's own visibility from which an empty mask contradicts the record
+
+
+@dataclass(frozen=True, eq=False)
+class _Class:
+    """A class, as a folder's settings have it."""
+
+    seg_id: int
+    aligned_from_mesh: np.ndarray  # (4, 4) rigid [m]
+    dimensions: np.ndarray | None  # (3,) of the cuboid [m]
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    K: np.ndarray  # (3, 3)
+    height: int
+    width: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One record, and what reading it takes."""
+
+    record: FrameRecord
+    kind: _Class
+    camera: _Camera
+    camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
+    visibility: float  # as FAT states it: not a share of pixels
+    twins: tuple[np.ndarray, ...]  # poses of every instance of the class in the image, this one's among them
+    twin: int  # which of them
+
+
+class FatReader:
+    """A folder in the FAT format: the whole dataset, `single`, `mixed`, or one scene's folder."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        objects: str | Sequence[str] | None = None,
+        meshes: MeshStore | None = None,
+        eyes: Sequence[str] = ("left", "right"),
+        parts: Sequence[str] = ("single", "mixed"),
+        on_error: str = "raise",
+    ) -> None:
+        """List the frames.
+
+        objects: classes, with or without FAT's `_16k`; None: all. meshes: for visibility, and to tell two instances of a
+        class apart (frames with two are left out without). on_error: "raise", or "skip" broken frames and count.
+        """
+        self.root, self.eyes, self.on_error = Path(root), tuple(eyes), on_error
+        self.skipped: Counter[str] = Counter()
+        self.notes: Counter[str] = Counter()
+        self._geometry = None if meshes is None else Geometry(meshes)
+        self._native: dict[str, np.ndarray] = {}
+        folders = sorted(_scene_folders(self.root, set(parts)))
+        if not folders:
+            raise UserError(f"{self.root}: no FAT scenes here: no folder with _object_settings.json and NNNNNN.left.json")
+        settings = [(folder, self._settings(folder)) for folder in folders]
+        known = sorted({name for _, one in settings if one for name in one[0]})
+        self.objects = choose_objects(objects, known, self.root, strip=lambda name: name.removesuffix("_16k"))
+        self._entries: list[_Entry] = []
+        for number, (folder, one) in enumerate(settings):
+            if one is not None:
+                self._entries += self._list_folder(number, folder, *one)
+
+    def records(self) -> list[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        return [entry.record for entry in self._entries]
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return FAT's aligned frame from the mesh file's.  -> (4, 4) [m]."""
+        if name not in self._native:
+            raise UserError(f"{self.root}: no object settings of class '{name}'")
+        return self._native[name].copy()
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.  Raises BadData."""
+        entry = self._entries[i]
+        record, camera = entry.record, entry.camera
+        color_path, depth_path, seg_path = record.files[:3]
+        rgb, depth, seg = read_color(color_path), read_depth(depth_path, DEPTH_UNITS), read_label(seg_path)
+        for path, image in zip(record.files, (rgb, depth, seg), strict=False):
+            expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
+        mask = self._mask(entry, seg, seg_path)
+        return Sample(
+            rgb,
+            depth,
+            mask,
+            camera.K.astype(np.float32),
+            entry.camera_from_object.astype(np.float32),
+            self.objects.index(record.object),
+            i,
+            float("nan"),
+        )
+
+    def visible_share(self, sample: Sample) -> float:
+        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
+        return (
+            float("nan") if self._geometry is None else self._geometry.visible_share(self.objects[sample.object_id], sample)
+        )
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels of any other labelled object.  -> (H, W) bool."""
+        entry = self._entries[i]
+        seg = read_label(entry.record.files[2])
+        return (seg != 0) & ~self._mask(entry, seg, entry.record.files[2])
+
+    def _mask(self, entry: _Entry, seg: np.ndarray, path: Path) -> np.ndarray:
+        mask = seg == entry.kind.seg_id
+        if len(entry.twins) > 1 and self._geometry is not None:
+            split = self._geometry.instances(entry.record.object, entry.twins, entry.camera.K, mask)
+            if split is None:
+                raise BadData(path, "two instances of a class and no mesh that fits to tell them apart", entry.record.object)
+            mask = split[entry.twin]
+        if not mask.any():
+            detail = f"no pixel of {entry.record.object}, id {entry.kind.seg_id}"
+            if entry.visibility >= _CLEARLY_VISIBLE and len(entry.twins) == 1 and _center_in_frame(entry):
+                raise BadData(path, "empty mask", f"{detail}, though its JSON says visibility {entry.visibility:.2f}")
+            raise NotShown(path, "listed, but not in the label", detail)
+        return mask
+
+    def _settings(self, folder: Path) -> tuple[dict[str, _Class], dict[str, _Camera]] | None:
+        """Return a folder's classes and cameras, None where they are broken and on_error is "skip"."""
+        try:
+            return _object_settings(folder / "_object_settings.json"), _camera_settings(folder / "_camera_settings.json")
+        except BadData as error:
+            self._leave_out(error)
+            return None
+
+    def _leave_out(self, error: BadData) -> None:
+        """Count a broken frame, or raise its error."""
+        if self.on_error != "skip":
+            raise error
+        self.skipped[error.cause] += 1
+
+    def _list_folder(
+        self, number: int, folder: Path, classes: dict[str, _Class], cameras: dict[str, _Camera]
+    ) -> Iterator[_Entry]:
+        for name in self.objects:
+            if name in classes:
+                self._remember(name, classes[name], folder)
+        names = {path.name for path in folder.iterdir()}
+        stems = {f"{m[1]}.{m[2]}" for m in map(_IMAGE.match, names) if m} | {n[:-5] for n in names if _FRAME.match(n)}
+        for stem in sorted(stems):
+            frame, eye = stem.split(".")
+            if eye not in self.eyes:
+                continue
+            try:
+                if eye not in cameras:
+                    raise BadData(folder / "_camera_settings.json", f"no camera named '{eye}'")
+                color = f"{stem}.png" if f"{stem}.png" in names and f"{stem}.jpg" not in names else f"{stem}.jpg"
+                files = tuple(folder / x for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json"))
+                yield from self._list_frame(2 * number + (eye == "right"), int(frame), files, classes, cameras[eye])
+            except BadData as error:
+                self._leave_out(error)
+
+    def _list_frame(
+        self, scene_id: int, im_id: int, files: tuple[Path, ...], classes: dict[str, _Class], camera: _Camera
+    ) -> list[_Entry]:
+        path = files[3]
+        content = read_json(path)
+        found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
+        for k, one in enumerate(need(content, "objects", path)):
+            name = _mesh_name(need(one, "class", path, f"objects[{k}]."))
+            if name not in classes:
+                raise BadData(path, "unknown class", f"'{name}' is not in the folder's _object_settings.json")
+            if name in self.objects:
+                pose = _camera_from_aligned(one, path, f"objects[{k}].") @ classes[name].aligned_from_mesh
+                found.setdefault(name, []).append((k, pose, float(one.get("visibility", 1.0))))
+        entries = []
+        for name, many in found.items():
+            if len(many) > 1 and self._geometry is None:
+                self.skipped["two instances of one class, and no meshes to tell them apart"] += len(many)
+                continue
+            if len(many) > 1:
+                self.notes["masks split between instances of one class by geometry"] += len(many)
+            twins = tuple(pose for _, pose, _ in many)
+            for twin, (k, pose, visibility) in enumerate(many):
+                scene = path.parent.relative_to(self.root) if path.parent != self.root else Path(path.parent.name)
+                record = FrameRecord(
+                    name=f"{scene.as_posix()}/{path.name.removesuffix('.json')}",
+                    group=path.parent.name,  # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
+                    scene_id=scene_id,
+                    im_id=im_id,
+                    obj_id=ycb.ycbvideo_index(name) if name in ycb.CLASSES else classes[name].seg_id,
+                    object=name,
+                    instance=k,
+                    files=files,
+                )
+                entries.append(_Entry(record, classes[name], camera, pose, visibility, twins, twin))
+        return entries
+
+    def _remember(self, name: str, kind: _Class, folder: Path) -> None:
+        """Keep a class's frame, and see whether the mesh is the one that the cuboid was measured on."""
+        known = self._native.setdefault(name, kind.aligned_from_mesh)
+        if not np.allclose(known, kind.aligned_from_mesh, atol=1e-4):
+            raise UserError(
+                f"{folder / '_object_settings.json'}: another fixed_model_transform of '{name}' than in other folders"
+            )
+        mesh = None if self._geometry is None else self._geometry.mesh(name)
+        if mesh is None or kind.dimensions is None or self._geometry is None:
+            return
+        aligned = mesh.vertices @ kind.aligned_from_mesh[:3, :3].T + kind.aligned_from_mesh[:3, 3]
+        low, high = aligned.min(0), aligned.max(0)
+        off = max(np.abs(high - low - kind.dimensions).max(), np.abs(high + low).max() / 2)
+        if off > _CUBOID_TOLERANCE:
+            self._geometry.without.add(name)
+            self.notes[f"mesh of {name} is not the one that FAT measured ({off * 1000:.0f} mm off): no visibility"] = 1
+
+
+def _scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
+    """Yield the folders that hold frames, not looking below them."""
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder (data.root)")
+    names = [path.name for path in root.iterdir()]
+    if any(_FRAME.match(name) or _IMAGE.match(name) for name in names) or "_object_settings.json" in names:
+        yield root
+        return
+    if any(_NEWER.search(name) for name in names):
+        raise UserError(f"{root}: these names (.cs.png, .depth.16.png) are a newer export's; FAT has .seg.png, .depth.png")
+    for name in names:
+        if (root / name).is_dir() and not name.startswith(".") and (name not in {"single", "mixed"} or name in parts):
+            yield from _scene_folders(root / name, parts)
+
+
+def _mesh_name(fat_class: Any) -> str:
+    return str(fat_class).removesuffix("_16k")
+
+
+def _object_settings(path: Path) -> dict[str, _Class]:
+    classes = {}
+    for k, one in enumerate(need(read_json(path), "exported_objects", path)):
+        where = f"exported_objects[{k}]."
+        F = numbers(one, "fixed_model_transform", path, (4, 4), where)
+        aligned = F.T.copy()  # row vectors -> columns
+        aligned[:3] *= CM  # x100 in the rotation, centimetres in the translation
+        if not is_rigid(torch.from_numpy(aligned), tolerance=2e-3):
+            raise BadData(path, f"'{where}fixed_model_transform' is not 100 x a rotation with its shift in the last row")
+        size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM if "cuboid_dimensions" in one else None
+        seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
+        classes[_mesh_name(need(one, "class", path, where))] = _Class(seg_id, aligned, size)
+    return classes
+
+
+def _camera_settings(path: Path) -> dict[str, _Camera]:
+    cameras = {}
+    for k, one in enumerate(need(read_json(path), "camera_settings", path)):
+        where = f"camera_settings[{k}]."
+        inner = need(one, "intrinsic_settings", path, where)
+        fx, fy, cx, cy = (
+            float(numbers(inner, key, path, (), f"{where}intrinsic_settings.")) for key in ("fx", "fy", "cx", "cy")
+        )
+        size = need(one, "captured_image_size", path, where)
+        width, height = (int(numbers(size, key, path, (), f"{where}captured_image_size.")) for key in ("width", "height"))
+        K = np.array([[fx, float(inner.get("s", 0.0)), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        cameras[str(need(one, "name", path, where))] = _Camera(K, height, width)
+    return cameras
+
+
+def _camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
+    quat = numbers(record, "quaternion_xyzw", path, (4,), where)
+    if abs(np.linalg.norm(quat) - 1) > 0.01:  # four decimals leave it 1e-4 off
+        raise BadData(path, f"'{where}quaternion_xyzw' is not a unit quaternion", f"norm {np.linalg.norm(quat):.3f}")
+    pose = np.eye(4)
+    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / np.linalg.norm(quat))).numpy()
+    pose[:3, 3] = numbers(record, "location", path, (3,), where) * CM
+    return pose
+
+
+def _center_in_frame(entry: _Entry) -> bool:
+    x, y, z = entry.camera_from_object[:3] @ np.linalg.inv(entry.kind.aligned_from_mesh)[:, 3]
+    if z <= 0:
+        return False
+    u, v, _ = entry.camera.K @ [x / z, y / z, 1]
+    return bool(0 <= u < entry.camera.width and 0 <= v < entry.camera.height)

@@ -1,0 +1,116 @@
+"""What every reader yields: frames of a dataset as records, and one object in one image as a `Sample`."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from posefilter.errors import UserError
+
+SATURATED = 65535  # what 16-bit depth images hold where the distance does not fit
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One object in one image.  `camera_from_object` starts in the mesh file's own frame."""
+
+    rgb: np.ndarray  # (H, W, 3) uint8
+    depth: np.ndarray  # (H, W) float32 z-depth [m], 0 where unknown
+    mask: np.ndarray  # (H, W) bool, the visible part of the object
+    intrinsics: np.ndarray  # (3, 3) float32 [px], pixel centres at integers
+    camera_from_object: np.ndarray  # (4, 4) float32 [m]
+    object_id: int  # index into the reader's objects
+    frame_id: int  # index into the reader's (or the split's) records
+    visibility: float  # visible share of the pixels that the object would have alone in the frame; NaN where unknown
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One object in one image, as a dataset lists it."""
+
+    name: str  # of the image, unique in the dataset: "<group>/<frame>", as frame lists spell it
+    group: str  # the scene: a split never cuts it
+    scene_id: int  # these three as BOP's result files want them
+    im_id: int
+    obj_id: int  # the dataset's own number of the class
+    object: str  # the class, as the mesh store knows it
+    instance: int  # which of the image's annotations
+    files: tuple[Path, ...]  # what decides the content; the first is the colour image
+
+    @property
+    def key(self) -> str:
+        """Return a name that no other record of the dataset has."""
+        return f"{self.name}#{self.instance}"
+
+
+class Reader(Protocol):
+    """A dataset on disk."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Return the classes that it was asked for, or all that it has."""
+        ...
+
+    @property
+    def skipped(self) -> Counter[str]:
+        """Return what listing left out: reasons and counts."""
+        ...
+
+    @property
+    def notes(self) -> Counter[str]:
+        """Return what else the log should say, with counts."""
+        ...
+
+    def records(self) -> Sequence[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        ...
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.
+
+        Raises BadData, naming the file, where it is not as it should be.
+        """
+        ...
+
+    def visible_share(self, sample: Sample) -> float:
+        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
+        ...
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels that the dataset labels as anything but record i.  -> (H, W) bool."""
+        ...
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return the transform from the mesh file's frame into the dataset's own object frame.  -> (4, 4) [m]."""
+        ...
+
+
+class BadData(UserError):  # noqa: N818
+    """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
+
+    def __init__(self, path: Path, cause: str, detail: str = "") -> None:
+        super().__init__(f"{path}: {cause}" + (f" ({detail})" if detail else ""))
+        self.path, self.cause, self.detail = path, cause, detail
+
+    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
+        """Survive the way from one process to another."""
+        return BadData, (self.path, self.cause, self.detail)
+
+
+class NotShown(BadData):
+    """An object is listed but has no pixel in the label: no mistake, but nothing to learn from either."""
+
+    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
+        """Survive the way from one process to another."""
+        return NotShown, (self.path, self.cause, self.detail)
+
+
+def tight_box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Return (left, top, right, bottom) of the mask's pixels, right and bottom exclusive; all 0 for an empty mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if len(rows) == 0:
+        return 0, 0, 0, 0
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

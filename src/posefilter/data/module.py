@@ -1,0 +1,300 @@
+"""The data of an experiment: one reader, its splits by scene, and loaders that never keep the training waiting."""
+
+import dataclasses
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+from lightning import LightningDataModule
+from rich.progress import Progress
+from torch.utils.data import DataLoader
+
+from posefilter.data.cache import DiskCache, FrameCache, MemoryCache, NoCache, Prepared
+from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.frames import BadData, FrameRecord, NotShown, Reader, Sample
+from posefilter.data.generated import ensure_scenes
+from posefilter.data.meshes import MeshStore, object_model
+from posefilter.data.points import model_points
+from posefilter.data.readers import open_reader
+from posefilter.data.resize import network_size, resize
+from posefilter.data.splits import NAMES, Share, split_records
+from posefilter.errors import UserError
+from posefilter.types import Batch, ObjectModel
+
+if TYPE_CHECKING:
+    from posefilter.data.augment import Augment
+
+log = logging.getLogger(__name__)
+
+_CHUNK = 64  # records decoded at a time
+_STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",), None: NAMES}
+
+
+class PoseDataModule(LightningDataModule):
+    """Frames of one dataset with the objects asked for, split by scene, resized, cached and augmented."""
+
+    def __init__(
+        self,
+        source: str,
+        root: str | Path,
+        object: str | Sequence[str] | None = None,
+        meshes: str | Path | MeshStore = "builtin",
+        image_width: int | None = None,
+        image_height: int | None = None,
+        split: Mapping[str, Share | None] | None = None,
+        split_seed: int = 0,
+        min_visibility: float = 0.0,
+        min_visibility_test: float = 0.0,
+        batch_size: int = 8,
+        batch_size_test: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        augment: "Augment | None" = None,
+        cache: str = "memory",
+        cache_dir: str | Path | None = None,
+        on_error: str = "raise",
+        limit_train: int | None = None,
+        limit_val: int | None = None,
+        limit_test: int | None = None,
+        points: int = 2000,
+        model_points: str | Path | None = None,
+        generate: Callable[[Path], Any] | None = None,
+        options: Mapping[str, Any] | None = None,
+        progress: bool = True,
+    ) -> None:
+        """Say what to read; nothing is opened before `setup`.
+
+        source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all. meshes: "builtin", a folder
+        or a mesh store. image_width alone keeps the aspect. split: what part of the scenes train, val and test get, see
+        `splits.split_records`; by default 0.8, 0.1, 0.1; split_seed shuffles the scenes. min_visibility: of training frames;
+        min_visibility_test: of validation and test frames (unknown visibility passes). cache: "memory", "none", or "disk"
+        (in `cache_dir`, by default the dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them.
+        limit_*: the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a folder with
+        <class>/points.xyz in the dataset's own frame instead. generate: called with the root where scenes are yet to be
+        rendered. options: the reader's own.
+        """
+        super().__init__()
+        if cache not in ("memory", "disk", "none"):
+            raise UserError(f"data.cache={cache}: choose memory, disk or none")
+        self.root, self.source = Path(root), source
+        self._object, self._meshes, self._options, self._generate = object, meshes, dict(options or {}), generate
+        self._image_width, self._image_height = image_width, image_height
+        self._split, self._split_seed = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}), split_seed
+        self._least = {"train": min_visibility, "val": min_visibility_test, "test": min_visibility_test}
+        self._limits = {"train": limit_train, "val": limit_val, "test": limit_test}
+        self._batch_size, self._batch_size_test = batch_size, batch_size_test or batch_size
+        self._workers, self._seed, self._augment, self._on_error = workers, seed, augment, on_error
+        self._cache_kind, self._cache_dir = cache, cache_dir
+        self._points, self._model_points, self._progress = points, model_points, progress
+        self._datasets: dict[str, FrameDataset] = {}
+        self._left_out: dict[str, Counter[str]] = {}
+
+    @cached_property
+    def meshes(self) -> MeshStore:
+        """Return the mesh store."""
+        return self._meshes if isinstance(self._meshes, MeshStore) else MeshStore(self._meshes)
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Return the dataset's reader."""
+        return open_reader(self.source, self.root, self._object, self.meshes, self._on_error, **self._options)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Return the classes; a batch's `object_id` is an index into them."""
+        return self.reader.objects
+
+    @cached_property
+    def _parts(self) -> dict[str, list[int]]:
+        """Return the indices of each split's records, before any frame is looked at."""
+        return split_records(self.reader.records(), self._split, self._split_seed, self.root)
+
+    @cached_property
+    def _all_records(self) -> Sequence[FrameRecord]:
+        return self.reader.records()
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {record.key: i for i, record in enumerate(self._all_records)}
+
+    @cached_property
+    def _cache(self) -> FrameCache:
+        if self._cache_kind == "memory":
+            return MemoryCache()
+        if self._cache_kind == "none":
+            return NoCache(self._read)
+        size = f"{self._image_width}x{self._image_height}"
+        version = (
+            f"1 {self.source} {self.root.resolve()} {self.objects} {self.meshes.root} {size} {sorted(self._options.items())}"
+        )
+        return DiskCache(Path(self._cache_dir or self.root / ".cache"), version)
+
+    def prepare_data(self) -> None:
+        """Render the scenes where the source is our own and they are not there yet."""
+        if self.source == "scenes":
+            ensure_scenes(self.root, self._generate)
+
+    def setup(self, stage: str | None = None) -> None:
+        """List, split and decode the frames that a stage needs."""
+        for name in _STAGES[stage]:
+            if name not in self._datasets:
+                records = self._usable(name)
+                self._datasets[name] = FrameDataset(
+                    records, self._cache, self._augment if name == "train" else None, self._seed
+                )
+                log.info("%s: %s", name, self.describe()["splits"][name])
+
+    def object_model(self, object_id: int) -> ObjectModel:
+        """Return what methods and metrics know of a class."""
+        name = self.objects[object_id]
+        points = model_points(self._model_points, self.root, name, self.reader.native_from_mesh(name))
+        return object_model(self.meshes.load(name), points=points, count=self._points)
+
+    def records(self, split: str) -> list[FrameRecord]:
+        """Return the records of a split: a batch's `frame_id` is an index into them."""
+        return self._dataset(split).records
+
+    @property
+    def train_dataset(self) -> FrameDataset:
+        """Return the training frames, augmented."""
+        return self._dataset("train")
+
+    @property
+    def val_dataset(self) -> FrameDataset:
+        """Return the validation frames."""
+        return self._dataset("val")
+
+    @property
+    def test_dataset(self) -> FrameDataset:
+        """Return the test frames."""
+        return self._dataset("test")
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch whose augmentation is drawn (Lightning's loops do it by themselves)."""
+        self.train_dataset.set_epoch(epoch)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        """Return shuffled, augmented batches."""
+        dataset = self.train_dataset
+        order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch)
+        return self._loader(dataset, self._batch_size, sampler=order, drop_last=len(dataset) >= self._batch_size)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        """Return validation batches in order."""
+        return self._loader(self.val_dataset, self._batch_size_test)
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        """Return test batches in order."""
+        return self._loader(self.test_dataset, self._batch_size_test)
+
+    def predict_dataloader(self) -> DataLoader[Batch]:
+        """Return test batches in order."""
+        return self.test_dataloader()
+
+    def split_record(self) -> dict[str, dict[str, int]]:
+        """Return which scenes each split has, with their frames: what the run writes down before it trains."""
+        records = self._all_records
+        return {name: dict(sorted(Counter(records[i].group for i in part).items())) for name, part in self._parts.items()}
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the log should say: objects, frames and scenes a split, and what was left out and why."""
+        splits = {}
+        for name, dataset in self._datasets.items():
+            splits[name] = {
+                "frames": len(dataset),
+                "scenes": len({record.group for record in dataset.records}),
+                "left_out": dict(self._left_out[name]),
+            }
+        return {
+            "source": self.source,
+            "root": str(self.root),
+            "objects": list(self.objects),
+            "records": len(self._all_records),
+            "splits": splits,
+            "left_out_while_listing": dict(self.reader.skipped),
+            "notes": dict(self.reader.notes),
+        }
+
+    def _dataset(self, split: str) -> FrameDataset:
+        if split not in NAMES:
+            raise UserError(f"split '{split}': there are {', '.join(NAMES)}")
+        if split not in self._datasets:
+            self.setup({"train": "fit", "val": "validate", "test": "test"}[split])
+        return self._datasets[split]
+
+    def _usable(self, split: str) -> list[FrameRecord]:
+        """Decode a split's frames into the cache; return those that can be used, at most the limit."""
+        self._left_out[split] = left_out = Counter[str]()
+        limit, part = self._limits[split], self._parts[split]
+        if limit is not None:  # smaller limits take a part of what larger ones take
+            part = [part[i] for i in np.random.default_rng([self._split_seed, NAMES.index(split)]).permutation(len(part))]
+        usable: list[FrameRecord] = []
+        for record, found in self._decode([self._all_records[i] for i in part], split):
+            if limit is not None and len(usable) >= limit:
+                break
+            if isinstance(found, BadData):
+                if self._on_error == "raise" and not isinstance(found, NotShown):
+                    raise UserError(f"{found}; data.on_error=skip leaves such frames out and counts them") from found
+                left_out[found.cause] += 1
+            elif found.pixels == 0:
+                left_out["the mask vanishes at this image size"] += 1
+            elif found.visibility < self._least[split]:
+                left_out[f"visibility below {self._least[split]}"] += 1
+            else:
+                usable.append(record)
+        if not usable and part:
+            raise UserError(f"{self.root}: no usable {split} frame of {len(part)}: {dict(left_out)}")
+        return usable
+
+    def _decode(self, records: list[FrameRecord], split: str) -> Iterator[tuple[FrameRecord, Prepared | BadData]]:
+        """Yield the records in order, each with what the cache keeps of it, or what is wrong with it."""
+        with (
+            ThreadPoolExecutor(max(self._workers, 2)) as pool,
+            Progress(disable=not self._progress or len(records) < _CHUNK) as bar,
+        ):
+            task = bar.add_task(f"decoding {split} frames", total=len(records))
+            for chunk in _chunks(records):
+                for pair in zip(chunk, pool.map(self._fetch, chunk), strict=True):
+                    bar.advance(task)
+                    yield pair
+
+    def _fetch(self, record: FrameRecord) -> Prepared | BadData:
+        kept = self._cache.find(record)
+        if kept is not None:
+            return kept
+        try:
+            sample = self._read(record)
+            sample = dataclasses.replace(sample, visibility=self.reader.visible_share(sample))
+        except BadData as error:
+            return error
+        return self._cache.keep(record, sample)
+
+    def _read(self, record: FrameRecord) -> Sample:
+        """Decode a frame and resize it."""
+        sample = self.reader.read(self._index[record.key])
+        height, width = sample.mask.shape
+        return resize(sample, *network_size(height, width, self._image_width, self._image_height))
+
+    def _loader(self, dataset: FrameDataset, batch_size: int, **how: Any) -> DataLoader[Batch]:
+        if self._workers > 0:  # a forked worker would wait for ever for OpenCV threads that only its parent has
+            cv2.setNumThreads(1)
+        return DataLoader(
+            dataset,
+            batch_size=batch_size,
+            num_workers=self._workers,
+            persistent_workers=self._workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            **how,
+        )
+
+
+def _chunks(records: list[FrameRecord]) -> Iterator[list[FrameRecord]]:
+    for at in range(0, len(records), _CHUNK):
+        yield records[at : at + _CHUNK]

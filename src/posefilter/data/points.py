@@ -1,0 +1,28 @@
+"""Read the points that a dataset defines ADD on."""
+
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.errors import UserError
+
+
+def model_points(folder: str | Path | None, root: Path, name: str, native_from_mesh: np.ndarray) -> np.ndarray | None:
+    """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P, 3) [m].
+
+    They are looked for in `folder`/<class>/points.xyz, else in `models` beside the dataset, as YCB-Video has them.
+    """
+    folders = [Path(folder)] if folder is not None else [root / "models", root.parent / "models"]
+    path = next((f / name / "points.xyz" for f in folders if (f / name / "points.xyz").is_file()), None)
+    if path is None:
+        if folder is not None:
+            raise UserError(f"{folder}: no {name}/points.xyz here (data.model_points)")
+        return None
+    try:
+        native = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except ValueError as error:
+        raise UserError(f"{path}: not rows of three numbers ({error})") from error
+    if native.shape[1] != 3 or len(native) < 4 or not np.isfinite(native).all():
+        raise UserError(f"{path}: not rows of three numbers (found {native.shape})")
+    mesh_from_native = np.linalg.inv(native_from_mesh)
+    return native @ mesh_from_native[:3, :3].T + mesh_from_native[:3, 3]

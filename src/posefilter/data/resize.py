@@ -1,0 +1,76 @@
+"""Resize a sample, so that camera, colour, depth and mask still agree to a fraction of a pixel."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+import torch
+
+from posefilter.data.frames import Sample
+from posefilter.errors import UserError
+from posefilter.geometry.camera import resize_intrinsics
+
+_SMOOTH = 0.02  # neighbouring depths within this share of each other lie on one surface
+
+
+def network_size(height: int, width: int, image_width: int | None, image_height: int | None) -> tuple[int, int]:
+    """Return the (height, width) to resize an image to; a missing side keeps the aspect, none keeps the size."""
+    if image_width is None and image_height is None:
+        return height, width
+    if image_width is None:
+        image_width = round(width * float(image_height or 0) / height)
+    if image_height is None:
+        image_height = round(height * image_width / width)
+    if min(image_width, image_height) < 8:
+        raise UserError(f"image size {image_width}x{image_height}: at least 8 pixels a side (data.image_width)")
+    if abs(image_width / width - image_height / height) > 0.02 * image_width / width:
+        raise UserError(
+            f"image size {image_width}x{image_height} would stretch {width}x{height}: give data.image_width alone"
+        )
+    return image_height, image_width
+
+
+def resize(sample: Sample, height: int, width: int) -> Sample:
+    """Return the sample at another size: colour averaged, mask by majority, depth interpolated within surfaces only."""
+    before = sample.mask.shape
+    if before == (height, width):
+        return sample
+    shrinks = height <= before[0] and width <= before[1]
+    K = torch.from_numpy(sample.intrinsics.astype(np.float64))
+    return dataclasses.replace(
+        sample,
+        rgb=cv2.resize(sample.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
+        depth=resize_depth(sample.depth, height, width),
+        mask=resize_mask(sample.mask, height, width),
+        intrinsics=resize_intrinsics(K, width / before[1], height / before[0]).numpy().astype(np.float32),
+    )
+
+
+def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the pixels of which the mask covers more than half; the nearest decides a tie.  -> (height, width) bool."""
+    shrinks = height <= mask.shape[0] and width <= mask.shape[1]
+    size = (width, height)
+    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    nearest = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+    return (share > 0.5 + 1e-4) | ((share > 0.5 - 1e-4) & nearest)
+
+
+def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return depth read at the new pixels' centres: between known neighbours on one surface, else the nearest pixel.
+
+    Taking the nearest everywhere would shift surfaces by up to half an old pixel, the same way all over the image;
+    interpolating everywhere would invent surfaces between near and far.  (H, W) [m] -> (height, width) [m].
+    """
+    corners, fractions = [], []
+    for new, old in ((height, depth.shape[0]), (width, depth.shape[1])):
+        at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+        low = np.minimum(at.astype(int), old - 2 if old > 1 else 0)
+        corners.append((low, np.minimum(low + 1, old - 1)))
+        fractions.append((at - low).astype(np.float32))
+    (top, bottom), (left, right) = corners
+    fy, fx = fractions[0][:, None], fractions[1][None, :]
+    a, b, c, d = (depth[rows][:, columns] for rows in (top, bottom) for columns in (left, right))
+    low, high = np.minimum(np.minimum(a, b), np.minimum(c, d)), np.maximum(np.maximum(a, b), np.maximum(c, d))
+    between = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
+    nearest = np.where(fy <= 0.5, np.where(fx <= 0.5, a, b), np.where(fx <= 0.5, c, d))
+    return np.where((low > 0) & (high - low <= _SMOOTH * low), between, nearest).astype(np.float32)
