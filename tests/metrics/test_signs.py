@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from posefilter.metrics.signs import auroc, explained, heading, near_edge, off_frame, on_object, pairwise_cosine
+from posefilter.metrics.signs import auroc, explained, heading, near_edge, off_frame, pairwise_cosine
 
 
 def test_pairwise_cosine_equals_the_double_loop() -> None:
@@ -42,11 +42,7 @@ def test_auroc_equals_counting_pairs() -> None:
 
 
 def test_shares_of_places() -> None:
-    mask = torch.zeros(1, 1, 100, 200, dtype=torch.bool)
-    mask[0, 0, 40:60, 80:120] = True
     state = torch.tensor([[[100.0, 50.0], [122.0, 50.0], [2.0, 2.0], [100.0, 99.0], [-5.0, 50.0]]])
-    assert on_object(state, mask).item() == pytest.approx(0.2)
-    assert on_object(state, mask, margin_px=3).item() == pytest.approx(0.4)
     assert off_frame(state, 200, 100).item() == pytest.approx(0.2)
     edge, corner = near_edge(state, 200, 100)
     assert edge.item() == pytest.approx(0.6)
