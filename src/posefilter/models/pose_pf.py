@@ -3,11 +3,11 @@
 from typing import Any, NamedTuple
 
 import torch
-from posefilter.models.base import PoseEstimator
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.base import PoseEstimator
 from posefilter.models.lessons import Lesson
 from posefilter.nets.likelihood import Pixels, lay_out
 from posefilter.nets.proposals import Cells, Coordinates, ObjectCoordinateNet, coordinate_loss, draw_poses, measure_cells
