@@ -80,7 +80,7 @@ class Average(Metric):
 
     def collect(self, values: Tensor) -> None:
         """Take in (B,) values."""
-        self.total += values.double().sum()
+        self.total += values.detach().double().sum()
         self.count += values.numel()
 
     def compute(self) -> Tensor:
