@@ -134,7 +134,9 @@ class PoseEstimator(LightningModule):
         """Clip each part's gradient by its own norm: a wild step of one network must not shrink another's."""
         if gradient_clip_val:
             for part in self.children():
-                nn.utils.clip_grad_norm_(part.parameters(), gradient_clip_val)
+                parameters = list(part.parameters())
+                if parameters:
+                    nn.utils.clip_grad_norm_(parameters, gradient_clip_val)
 
     # -- validation and test -------------------------------------------------------------------------------------------
 
