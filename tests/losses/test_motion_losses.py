@@ -6,7 +6,7 @@ import torch
 from posefilter.errors import UserError
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject
-from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides, overlap
+from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides, outline_box, overlap
 
 W = 20
 
@@ -65,13 +65,18 @@ def test_lesson_leaves_earlier_steps_alone(batch, model, make_trace) -> None:
 
 
 def test_sides_are_zero_for_the_true_box(batch, model, make_trace) -> None:
+    small = model._replace(hull=model.points * 0.2)  # 2 cm about (6.5, 3.5), at 1 m and 100 px: 4.5..8.5 by 1.5..5.5
     state = f64([[[6.0, 3.0], [15.0, 8.0]]])
     true = f64([[[1.5, 1.5, 2.5, 2.5], [0.0, 0.0, 0.0, 0.0]]]) / W
     sides = Sides(OnObject())
-    assert sides(make_trace(state, memory=true), batch, model).item() == pytest.approx(0.0, abs=1e-6)
+    assert sides(make_trace(state, memory=true), batch, small).item() == pytest.approx(0.0, abs=1e-6)
     wide = f64([[[1.5, 1.5, 6.5, 2.5], [0.0, 0.0, 0.0, 0.0]]]) / W
     want = 4 / W + 1 - 4 * 4 / (8 * 4)
-    assert sides(make_trace(state, memory=wide), batch, model).item() == pytest.approx(want)
+    assert sides(make_trace(state, memory=wide), batch, small).item() == pytest.approx(want)
+
+
+def test_outline_is_cut_at_the_frame(batch, model) -> None:
+    assert outline_box(batch, model)[0].tolist() == [-0.5, -0.5, 16.5, 9.5]  # 10 px about (6.5, 3.5), in 20 x 10
 
 
 def test_overlap_of_disjoint_boxes_is_zero() -> None:

@@ -14,7 +14,8 @@ from posefilter.filters.reweigh import Annealed
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.lookup import nearest_true
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.metrics.signs import explained, on_object, pairwise_cosine
+from posefilter.metrics.beliefs import on_object
+from posefilter.metrics.signs import SignsOfFailure
 from posefilter.nets.heads import Bounded, Unbounded
 from posefilter.types import Batch, Cloud, Reading, Step
 
@@ -61,8 +62,14 @@ def test_told_the_truth_every_particle_reaches_the_object(head: torch.nn.Module,
     pieces = (UniformPixels(), Constant(0.0), Annealed(), resample, LearnedMotion(), Best(), NoRefine())
     pixel_filter = ParticleFilter(100, 8, *pieces)
     trace = pixel_filter(batch, Told(batch.mask, head, "truth"), Generator().manual_seed(0))
-    assert on_object(trace.clouds[0].state, batch.mask).max() < 0.3
-    assert on_object(trace.clouds[-1].state, batch.mask).min() == 1.0
+    assert on_object(batch.mask, trace.clouds[0].state).max() < 0.3
+    assert on_object(batch.mask, trace.clouds[-1].state).min() == 1.0
+    signs = SignsOfFailure()
+    signs.update(trace, batch)
+    found = signs.compute()
+    assert found["heading"] > 0.99
+    assert found["off_frame"] == [0.0] * 8
+    assert found["on_object"][-1] == 1.0
 
 
 def test_told_only_the_mean_they_drift_together_and_miss() -> None:
@@ -70,8 +77,10 @@ def test_told_only_the_mean_they_drift_together_and_miss() -> None:
     batch = scenes()
     pieces = (UniformPixels(), Constant(0.0), Annealed(), Never(), LearnedMotion(), Best(), NoRefine())
     trace = ParticleFilter(100, 8, *pieces)(batch, Told(batch.mask, Unbounded(), "mean"), Generator().manual_seed(0))
-    first = trace.clouds[0].state
-    true = (nearest_true(batch.mask, first) - first).flatten(0, 1)
-    assert pairwise_cosine(trace.readings[0].motion).min() > 0.99
-    assert explained(trace.readings[0].motion.flatten(0, 1), true).abs() < 0.01
-    assert on_object(trace.clouds[-1].state, batch.mask).mean() < 0.5
+    signs = SignsOfFailure()
+    signs.update(trace, batch)
+    found = signs.compute()
+    assert found["pairwise_cosine"] > 0.99
+    assert found["offset_r2"] < 0.05
+    assert len(found["near_edge"]) == 8
+    assert on_object(batch.mask, trace.clouds[-1].state).mean() < 0.5

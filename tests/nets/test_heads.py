@@ -24,11 +24,13 @@ def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> No
     g = torch.Generator().manual_seed(1)
     center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
     raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
-    pose = OwnPointSixD(center, radius)(raw, point)
+    code = OwnPointSixD()
+    code.about(center, radius)
+    pose = code(raw, point)
     assert is_rigid(pose)
     back = transform(invert(pose), point[:, :, None])[:, :, 0]
     torch.testing.assert_close(back, center + radius * raw[..., 6:], atol=1e-5, rtol=0)
-    moved = OwnPointSixD(center, radius)(raw, point + torch.tensor([0.0, 0.0, 0.3]))  # the same outputs, farther away
+    moved = code(raw, point + torch.tensor([0.0, 0.0, 0.3]))  # the same outputs, farther away
     torch.testing.assert_close(moved[..., :3, 3] - pose[..., :3, 3], torch.tensor([0.0, 0.0, 0.3]).expand(2, 6, 3))
 
 

@@ -3,10 +3,16 @@
 Each function takes particles of several images and gives one number; NaN where the number has no meaning.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
+from torchmetrics import Metric
 
-from posefilter.geometry.lookup import touches
+from posefilter.geometry.lookup import nearest_true, touches
+from posefilter.metrics.beliefs import on_object
+from posefilter.metrics.collect import joined
+from posefilter.types import Batch, Trace
 
 
 def pairwise_cosine(motion: Tensor) -> Tensor:
@@ -53,11 +59,6 @@ def auroc(score: Tensor, positive: Tensor) -> Tensor:
     return ((ranks[positive].sum() - n * (n + 1) / 2) / (n * m)).float()
 
 
-def on_object(state: Tensor, mask: Tensor, margin_px: int = 0) -> Tensor:
-    """Return the share of particles within `margin_px` of the mask.  (B, N, 2) [px], (B, 1, H, W) bool -> (B,)."""
-    return touches(mask, state, 2 * margin_px + 1).float().mean(1)
-
-
 def off_frame(state: Tensor, width: int, height: int) -> Tensor:
     """Return the share of particles that left the frame.  (B, N, 2) [px] -> (B,)."""
     u, v = state.unbind(-1)
@@ -72,3 +73,55 @@ def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tu
     u, v = (state[..., 0] + 0.5) / width, (state[..., 1] + 0.5) / height
     side_u, side_v = (u < share) | (u > 1 - share), (v < share) | (v > 1 - share)
     return (side_u | side_v).float().mean(1), (side_u & side_v).float().mean(1)
+
+
+class SignsOfFailure(Metric):
+    """All of the above over many runs of a filter: numbers, and lists with one number a step.
+
+    off_frame, near_edge, near_corner, on_object: lists; pairwise_cosine: mean over images and steps; offset_r2 and heading:
+    displacements against the true offset to the mask's nearest pixel, over all steps; auroc: of the last likelihood, for
+    particles on the mask against the others.
+    """
+
+    full_state_update = False
+    shares: list[Tensor]
+    cosine: list[Tensor]
+    offsets: list[Tensor]
+    judged: list[Tensor]
+
+    def __init__(self, most: int = 256, **kwargs: Any) -> None:
+        """most: particles of an image whose offsets are kept a step."""
+        super().__init__(**kwargs)
+        self.most = most
+        for name in ("shares", "cosine", "offsets", "judged"):
+            self.add_state(name, default=[], dist_reduce_fx="cat")
+
+    def update(self, trace: Trace, batch: Batch) -> None:
+        """Collect a run."""
+        height, width = batch.rgb.shape[-2:]
+        kinds = []
+        for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
+            edge, corner = near_edge(cloud.state, width, height)
+            kinds.append(
+                torch.stack([on_object(batch.mask, cloud.state), off_frame(cloud.state, width, height), edge, corner])
+            )
+            self.cosine.append(pairwise_cosine(reading.motion))
+            some, motion = cloud.state[:, : self.most], reading.motion[:, : self.most]
+            true = nearest_true(batch.mask, some) - some
+            self.offsets.append(torch.cat([motion, true], dim=-1).flatten(0, 1).float())
+        self.shares.append(torch.stack(kinds).permute(2, 0, 1))  # (B, T, 4)
+        positive = touches(batch.mask, trace.clouds[-1].state)
+        judged = torch.stack([trace.readings[-1].log_likelihood.float(), positive.float()], dim=-1)
+        self.judged.append(judged.flatten(0, 1))
+
+    def compute(self) -> dict[str, Any]:
+        """Return the signs by name."""
+        shares, offsets, judged = joined(self.shares).mean(0), joined(self.offsets), joined(self.judged)
+        lists = zip(("on_object", "off_frame", "near_edge", "near_corner"), shares.T.tolist(), strict=True)
+        motion, true = offsets[:, :2], offsets[:, 2:]
+        return dict(lists) | {
+            "pairwise_cosine": float(joined(self.cosine).nanmean()),
+            "offset_r2": float(explained(motion, true)),
+            "heading": float(heading(motion, true)),
+            "auroc": float(auroc(judged[:, 0], judged[:, 1] > 0)),
+        }

@@ -23,6 +23,10 @@ class PoseCode(Protocol):
 
     width: int  # outputs that make a pose
 
+    def about(self, center: Tensor, radius: float) -> None:
+        """Learn the object's bounding sphere: (3,) [m] in its own frame, [m]."""
+        ...
+
     def __call__(self, raw: Tensor, point: Tensor) -> Tensor:
         """(B, N, width), the particles' own camera points (B, N, 3) [m] -> (B, N, 4, 4) camera_from_object."""
         ...
@@ -50,7 +54,14 @@ class Bounded(nn.Module):
         return torch.minimum(goal.clamp_min(0.0), corner) - state
 
 
-class AbsoluteQuaternion(nn.Module):
+class _AnyObject(nn.Module):
+    """A code that does not depend on the object."""
+
+    def about(self, center: Tensor, radius: float) -> None:
+        """Need nothing of the object."""
+
+
+class AbsoluteQuaternion(_AnyObject):
     """Seven outputs: a quaternion (x, y, z, w), made unit, and the translation in the camera [m]."""
 
     width = 7
@@ -65,16 +76,19 @@ class OwnPointSixD(nn.Module):
 
     The translation follows: t = p - R x, p being the measured point in the camera and x the told one in the object. So what
     is regressed is bounded by the object's size, and independent of where in the room it stands.
-    center, radius: of the object's bounding sphere [m], the unit and origin of x.
     """
 
     width = 9
     center: Tensor
 
-    def __init__(self, center: Tensor, radius: float) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.register_buffer("center", center.clone())
-        self.radius = radius
+        self.register_buffer("center", torch.zeros(3), persistent=False)
+        self.radius = 1.0
+
+    def about(self, center: Tensor, radius: float) -> None:
+        """Take the object's centre and radius as origin and unit of x."""
+        self.center, self.radius = center.to(self.center), radius
 
     def forward(self, raw: Tensor, point: Tensor) -> Tensor:
         """(B, N, 9), (B, N, 3) [m] -> (B, N, 4, 4)."""
@@ -86,7 +100,7 @@ class OwnPointSixD(nn.Module):
         return make_pose(R, point - (R @ x[..., None])[..., 0])
 
 
-class NoPose(nn.Module):
+class NoPose(_AnyObject):
     """No outputs: a detector's particle tells where, not how. Its `pose` is unturned, at its own point, for drawing only."""
 
     width = 0

@@ -1,0 +1,7 @@
+"""The paper's fourth method: the third on a small image (section 4.5)."""
+
+from posefilter.models.cnn_patch import CnnPatch
+
+
+class Downsized(CnnPatch):
+    """The same on an image reduced to 160 pixels (`width`), so that a patch covers more of the object."""

@@ -1,0 +1,189 @@
+"""What the four image-space methods share: a particle is a pixel, and reads the image where it stands."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor, nn
+
+from posefilter.geometry.camera import back_project
+from posefilter.geometry.lookup import nearest_pixel, pick
+from posefilter.geometry.spaces import PixelSpace
+from posefilter.metrics.signs import SignsOfFailure
+from posefilter.models.base import PoseEstimator
+from posefilter.models.box import Box
+from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
+from posefilter.nets.context import ContextMap
+from posefilter.nets.heads import fill_depth
+from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+
+
+@dataclass(frozen=True)
+class ImageScene:
+    """What an image-space method keeps of B images."""
+
+    image: Tensor  # (B, 4, H, W): colour in [-1, 1], depth [m]
+    depth: Tensor  # (B, 2, H, W): depth with its holes filled [m], and 1 where it was measured
+    intrinsics: Tensor  # (B, 3, 3) [px]
+    context: ContextMap
+
+
+@dataclass(frozen=True)
+class RelevantScene(ImageScene):
+    """The same, where the context also tells which regions matter."""
+
+    relevance: Tensor  # (B, 1, h, w), the chance that the cell shows the object
+
+
+class ImageSpace(PoseEstimator):
+    """Observe images and read particles off them; the networks, and what their outputs mean, are injected.
+
+    net: given how many numbers a particle is told besides its patch, the network that reads them; bounds: how the particles
+    bound the object in the image; lessons: losses beside the chosen one, by name; stages: factors on all of them as training
+    proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; truncate: cut the
+    gradient every so many steps (null: never), so that a long roll-out stays finite, which changes no value.
+    """
+
+    place_width: ClassVar[int] = 0  # numbers that tell a particle its own location
+    net: Any
+    glimpse: Any
+    context: Any
+    pose_code: Any
+    motion: Any
+
+    def __init__(
+        self,
+        net: Callable[[int], nn.Module],
+        glimpse: nn.Module,
+        context: nn.Module,
+        pose_code: nn.Module,
+        motion: nn.Module,
+        bounds: Box,
+        lessons: Mapping[str, Auxiliary] | None = None,
+        stages: Sequence[Stage] | None = None,
+        relevance: float = 1.0,
+        truncate: int | None = None,
+        object_model: ObjectModel | None = None,
+        **base: Any,
+    ) -> None:
+        super().__init__(**base)
+        self.glimpse, self.context, self.pose_code, self.motion = glimpse, context, pose_code, motion
+        self.net = net(self.context.width + self.place_width)
+        self.bounds = bounds
+        self.lessons, self.stages = dict(lessons or {}), tuple(stages or ())
+        check_stages(self.stages, ["loss", "relevance", *self.lessons])
+        self.relevance_weight, self.truncate = relevance, truncate
+        if object_model is not None:  # not in the base, where the pose code is not there yet
+            self.adopt(object_model)
+
+    @property
+    def space(self) -> PixelSpace:
+        """Return the image plane."""
+        return PixelSpace()
+
+    @property
+    def memory_width(self) -> int:
+        """Return L."""
+        return int(self.net.memory_width)
+
+    def observe(self, batch: Batch) -> ImageScene:
+        """Encode the images once."""
+        seen = self.context(batch.rgb, batch.depth, batch.intrinsics)
+        image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
+        depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
+        if seen.relevance is None:
+            return ImageScene(image, depth, batch.intrinsics, seen)
+        return RelevantScene(image, depth, batch.intrinsics, seen, torch.sigmoid(seen.relevance)[:, None])
+
+    def read(self, scene: ImageScene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+        """Look at each particle's patch and place, and tell likelihood, motion, pose and memory."""
+        state, memory = cloud.state, cloud.memory
+        if self.truncate and step.number % self.truncate == 0:
+            state, memory = state.detach(), memory.detach()
+        patch = self.glimpse(scene.image, state)
+        extra = torch.cat([self.context.look(scene.context, state), self.place(scene, state)], dim=-1)
+        said = self.net(patch, extra, memory)
+        height, width = scene.image.shape[-2:]
+        motion = self.motion(said.motion, state, width, height)
+        pose = self.pose_code(said.pose, self.own_points(scene, state)[0])
+        return Reading(F.logsigmoid(said.logit), motion, pose, said.memory)
+
+    def own_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool.
+
+        Depth is read at the particle's whole pixel: between pixels of two surfaces there is nothing.
+        """
+        H, W = scene.depth.shape[-2:]
+        corner = torch.tensor([W - 1, H - 1], device=state.device)
+        inside = torch.minimum(nearest_pixel(state).clamp_min(0), corner)
+        z, known = pick(scene.depth, inside).unbind(-1)
+        return back_project(state.detach(), z, scene.intrinsics), known > 0
+
+    def place(self, scene: ImageScene, state: Tensor) -> Tensor:
+        """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its location in [-1, 1]."""
+        height, width = scene.image.shape[-2:]
+        half = state.new_tensor([(width - 1) / 2, (height - 1) / 2])
+        return (state / half - 1)[..., : self.place_width]
+
+    def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
+        """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an image each, weighted."""
+        scene = self.observe(batch)
+        trace: Trace = self.train_filter(batch, _Observed(self, scene), generator)
+        losses = {"loss": self.loss(trace, batch, self.model)}
+        for name, lesson in self.lessons.items():
+            losses[name] = lesson.weight * lesson.loss(trace, batch, self.model)
+        if isinstance(scene, RelevantScene) and self.relevance_weight:
+            losses["relevance"] = self.relevance_weight * relevance_loss(scene.context, batch.mask)
+        factors = factors_at(self.stages, self.progress())
+        return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
+
+    def progress(self) -> float:
+        """Return the share of the training's steps that are done; 0 where no trainer counts them."""
+        if self._trainer is None or not self.stages:
+            return 0.0
+        return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
+
+    def adopt(self, model: ObjectModel) -> None:
+        """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
+        super().adopt(model)
+        self.pose_code.about(model.center, model.radius)
+        self.scores["signs"] = SignsOfFailure()
+
+    def score(self, trace: Trace, batch: Batch) -> None:
+        """Add a batch's errors, and its signs of failure."""
+        super().score(trace, batch)
+        cast(SignsOfFailure, self.scores["signs"]).update(trace, batch)
+
+    def results(self) -> dict[str, Any]:
+        """Return the metrics, and the signs of failure."""
+        return super().results() | {"signs": cast(SignsOfFailure, self.scores["signs"]).compute()}
+
+    def box(self, trace: Trace, batch: Batch) -> Tensor:
+        """Return how the particles bound the object, (B, 4) [px]."""
+        return self.bounds(trace, batch, self.model)
+
+
+class _Observed:
+    """A method that has looked at its images already, so that a roll-out and a loss on the scene share one look."""
+
+    def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
+        self.method, self.scene = method, scene
+        self.space, self.memory_width, self.read = method.space, method.memory_width, method.read
+        self.own_points = method.own_points
+
+    def observe(self, batch: Batch) -> ImageScene:
+        """Return what was seen."""
+        return self.scene
+
+
+def relevance_loss(context: ContextMap, mask: Tensor) -> Tensor:
+    """Cross-entropy of the map against whether its cells show the object, half of the weight on those that do.  -> (B,)."""
+    logit = context.relevance
+    assert logit is not None
+    shows = F.adaptive_max_pool2d(mask.float(), logit.shape[-2:])[:, 0]
+    entropy = F.binary_cross_entropy_with_logits(logit, shows, reduction="none")
+    on = (entropy * shows).sum((1, 2)) / shows.sum((1, 2)).clamp_min(1)
+    off = (entropy * (1 - shows)).sum((1, 2)) / (1 - shows).sum((1, 2)).clamp_min(1)
+    return (on + off) / 2

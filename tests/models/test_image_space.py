@@ -1,0 +1,245 @@
+"""The four methods: what they see, and that each learns its task on a toy world in seconds."""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+sys.path.insert(0, str(Path(__file__).parent))
+from toy import H, W, scenes, square
+
+from posefilter.errors import UserError
+from posefilter.filters.agreement import Agreement
+from posefilter.filters.guided import Guided
+from posefilter.filters.initialise import FromRelevance, Informed, UniformPixels
+from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.propose import LearnedMotion
+from posefilter.filters.refine import NoRefine
+from posefilter.filters.resample import Never, Systematic
+from posefilter.filters.reweigh import Annealed
+from posefilter.filters.schedule import Constant
+from posefilter.labels.displacement import TowardsObject
+from posefilter.labels.membership import OnObject, Quality
+from posefilter.losses.deviation import Add, Confidence, OwnPoint
+from posefilter.losses.likelihood import BalancedBce, Bce
+from posefilter.losses.motion import Chamfer, Lesson, Sides
+from posefilter.models.box import PoseBox, SpreadBox, VotedBox
+from posefilter.models.cnn_patch import CnnPatch
+from posefilter.models.downsized import Downsized
+from posefilter.models.image_space import ImageSpace
+from posefilter.models.patch_pf import PatchPF
+from posefilter.models.pixel_pf import PixelPF
+from posefilter.models.stages import Auxiliary, Stage, factors_at
+from posefilter.nets.context import ConvEncoder, NoContext
+from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
+from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointSixD, Unbounded
+from posefilter.nets.mlp import LatentNet, PatchNet
+from posefilter.types import Trace
+
+
+def run_filter(particles: int, steps: int, initialise=None, resample=None) -> ParticleFilter:
+    pieces = (Constant(0.0), Annealed(), resample or Never(), LearnedMotion(), Agreement(), NoRefine())
+    return ParticleFilter(particles, steps, initialise or UniformPixels(), *pieces)
+
+
+def working(kind: type[ImageSpace], size: int, **changes) -> ImageSpace:
+    detects = not kind.tells_pose
+    label = OnObject(size) if detects else Quality(size)
+    lessons = {"likelihood": Auxiliary(BalancedBce(label)), "motion": Auxiliary(Lesson(TowardsObject("nearest", 1)), 2.0)}
+    lessons["sides" if detects else "own_point"] = Auxiliary(Sides(OnObject()) if detects else OwnPoint(), 2.0)
+
+    def net(extra: int) -> nn.Module:
+        if detects:
+            return PatchNet(size, 4, extra, 8, 64, 4, "layer")
+        return LatentNet(4 * size**2 + extra, 16, 9, 64, 3, "layer")
+
+    parts = {
+        "net": net,
+        "glimpse": SmoothGlimpse(size),
+        "context": ConvEncoder((16, 24, 32, 32), 32),
+        "pose_code": NoPose() if detects else OwnPointSixD(),
+        "motion": Bounded(0.3),
+        "bounds": VotedBox() if detects else PoseBox(),
+        "lessons": lessons,
+        "filter": run_filter(64, 4, resample=Systematic()),
+        "train_filter": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
+        "loss": Chamfer(size) if detects else Confidence(OnObject(size)),
+        "optimizer": partial(torch.optim.AdamW, lr=3e-3),
+        "object_model": square(),
+    }
+    return kind(**(parts | changes))
+
+
+def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes) -> ImageSpace:
+    detects = not kind.tells_pose
+
+    def net(extra: int) -> nn.Module:
+        return PatchNet(size, 4, extra) if detects else LatentNet(4 * size**2 + extra)
+
+    parts = {
+        "net": net,
+        "glimpse": IntegerCut(size),
+        "context": NoContext(),
+        "pose_code": NoPose() if detects else AbsoluteQuaternion(),
+        "motion": Unbounded(),
+        "bounds": SpreadBox(size) if detects else PoseBox(),
+        "filter": run_filter(50, steps),
+        "loss": Chamfer(size) if detects else Add(),
+        "optimizer": partial(torch.optim.Adam, lr=1e-3),
+        "object_model": square(),
+    }
+    return kind(**(parts | changes))
+
+
+def teach(method: ImageSpace, steps: int, seed: int = 0) -> None:
+    batch = scenes(4)
+    optimizer = method.configure_optimizers()
+    method.train()
+    for step in range(steps):
+        loss = method.training_step(batch, seed * 10_000 + step)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(method.parameters(), 1.0)
+        optimizer.step()
+    method.eval()
+
+
+@pytest.mark.parametrize(("kind", "size"), [(PixelPF, 1), (PatchPF, 3), (PatchPF, 6), (Downsized, 9)])
+def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(kind: type[ImageSpace], size: int) -> None:
+    torch.manual_seed(0)
+    method = working(kind, size)
+    with torch.no_grad():
+        method.eval().test_step(scenes(4), 0)
+    before = method.results()
+    assert before["particles_on_object"] < 0.4
+    method._reset()
+    teach(method, 160)
+    with torch.no_grad():
+        method.test_step(scenes(4), 0)
+    after = method.results()
+    assert after["particles_on_object"] > 0.85
+    assert after["iou"] > 0.7
+    assert after["signs"]["auroc"] > 0.65
+    assert after["signs"]["on_object"][0] < 0.4 < after["signs"]["on_object"][-1]
+    if kind.tells_pose:
+        assert before["add"]["median_mm"] > 60
+        assert after["add"]["median_mm"] < 25
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "loss"), [(PixelPF, 1, Add()), (PatchPF, 3, Bce(OnObject(3))), (CnnPatch, 9, Chamfer(9))]
+)
+def test_the_papers_recipe_runs_and_its_loss_falls(kind: type[ImageSpace], size: int, loss) -> None:
+    torch.manual_seed(0)
+    method = paper(kind, size, loss=loss)
+    batch = scenes(4)
+    generator = method.generator("train", 0)
+    first = method.training_losses(batch, generator)
+    assert list(first) == ["loss"]  # nothing but the chosen loss: every remedy is off
+    teach(method, 25)
+    method.train()
+    assert method.training_losses(batch, method.generator("train", 0))["loss"].mean() < first["loss"].mean()
+
+
+def test_the_papers_sizes() -> None:
+    method = paper(PatchPF, 6)
+    assert method.memory_width == 256
+    assert method.net.latent[0].in_features == 4 * 36 + 2 + 256  # patch, location, latent
+    assert paper(PixelPF, 1).net.latent[0].in_features == 4 + 256
+    assert method.net.motion[0].in_features == 7 + 1 + 256
+
+
+def test_no_gradient_of_what_is_seen_reaches_the_motion_through_an_integer_cut() -> None:
+    """The paper's likelihood cannot teach method 1 where to go: only a place that is told can, or a smooth glimpse."""
+    batch = scenes(2)
+
+    def reaches(method: ImageSpace) -> bool:
+        losses = method.train().training_losses(batch, method.generator("train", 0))
+        gradient = torch.autograd.grad(losses["loss"].sum(), method.net.motion[0].weight, allow_unused=True)[0]
+        return gradient is not None and bool(gradient.abs().sum() > 0)
+
+    bce = Bce(OnObject())
+    assert not reaches(paper(PixelPF, 1, loss=bce))
+    assert reaches(paper(PixelPF, 1, loss=bce, glimpse=SmoothGlimpse(1)))
+    assert reaches(paper(PatchPF, 3, loss=bce))  # it is told its location, and can learn to flee to where the answer is no
+    assert not reaches(paper(PatchPF, 3, loss=bce, truncate=1))
+
+
+def test_neither_mask_nor_pose_is_looked_at_in_evaluation() -> None:
+    torch.manual_seed(0)
+    method = working(PatchPF, 3).eval()
+    batch = scenes(2)
+    lie = batch._replace(mask=~batch.mask, camera_from_object=batch.camera_from_object.flip(0))
+    with torch.no_grad():
+        a, b = (method.predict_step(x, 0) for x in (batch, lie))
+    assert torch.equal(a.belief.best, b.belief.best)
+    assert torch.equal(a.clouds[-1].state, b.clouds[-1].state)
+
+
+def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
+    torch.manual_seed(0)
+    method = working(PatchPF, 3)
+    teach(method, 40)
+    batch = scenes(4)
+
+    def share(initialise, resample) -> list[float]:
+        method._reset()
+        method.filter = run_filter(64, 3, initialise, resample)
+        with torch.no_grad():
+            method.test_step(batch, 0)
+        return method.results()["signs"]["on_object"]
+
+    uniform = share(UniformPixels(), Never())
+    assert share(FromRelevance(), Never())[0] > uniform[0] + 0.3
+    assert share(UniformPixels(), Guided(Systematic()))[1] > uniform[1]
+    blind = paper(PatchPF, 3, filter=run_filter(8, 2, FromRelevance())).eval()
+    with pytest.raises(UserError, match="relevance"):
+        blind.predict_step(batch, 0)
+
+
+def test_boxes_from_a_cloud() -> None:
+    method, batch = working(CnnPatch, 9).eval(), scenes(2)
+    with torch.no_grad():
+        trace: Trace = method.predict_step(batch, 0)
+    state = torch.stack(torch.meshgrid(torch.arange(10.0, 31.0), torch.arange(5.0, 16.0), indexing="xy"), -1).reshape(
+        1, -1, 2
+    )
+    n = state.shape[1]
+    even = torch.full((1, n), -float(torch.tensor(n).log()))
+    told = torch.tensor([20.0, 10.0, 40.0, 30.0])
+    memory = torch.cat([state - told[:2], told[2:] - state], -1) / W
+    cloud, reading = trace.clouds[-1], trace.readings[-1]
+    made = trace._replace(
+        clouds=(cloud._replace(state=state, log_weights=even),), readings=(reading._replace(memory=memory),)
+    )
+    assert SpreadBox(size=3, beyond=0.0)(made, batch, method.model)[0].tolist() == [8.5, 3.5, 31.5, 16.5]
+    torch.testing.assert_close(VotedBox()(made, batch, method.model)[0], told)
+
+
+def test_stages_change_the_weights_as_training_proceeds() -> None:
+    stages = (Stage(0.4, {"motion": 0.0}), Stage(0.7, {"own_point": 0.0, "likelihood": 0.0}), Stage(1.0, {}))
+    assert factors_at(stages, 0.2) == {"motion": 0.0}
+    assert factors_at(stages, 0.5) == {"own_point": 0.0, "likelihood": 0.0}
+    assert factors_at(stages, 1.0) == {}
+    assert factors_at((), 0.5) == {}
+    method, batch = working(PatchPF, 3, stages=stages), scenes(2)
+    losses = method.training_losses(batch, method.generator("train", 0))
+    assert losses["motion"].sum() == 0
+    assert losses["own_point"].sum() > 0
+    with pytest.raises(UserError, match="names the loss 'moton'"):
+        working(PatchPF, 3, stages=(Stage(1.0, {"moton": 0.0}),))
+    with pytest.raises(UserError, match="the ends must rise"):
+        working(PatchPF, 3, stages=(Stage(0.5, {}),))
+
+
+def test_own_points_are_where_the_truth_puts_them() -> None:
+    method, batch = working(PixelPF, 1), scenes(3)
+    pixel = torch.tensor([[[W / 2, H / 2]]]).expand(3, 1, 2)
+    point, known = method.own_points(method.observe(batch), pixel)
+    assert known.all()
+    depth = batch.depth[:, 0, H // 2, W // 2]
+    torch.testing.assert_close(point[:, 0, 2], depth)
+    torch.testing.assert_close(point[:, 0, 0], 0.5 / 60 * depth)
