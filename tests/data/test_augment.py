@@ -1,0 +1,94 @@
+"""Augmentation stays true: after any of it the known surface still fits the pose, the intrinsics and the mask."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.models.toy import SIDE, scenes
+
+from posefilter.data.augment import Augment, Blank, Colour, Compose, DepthNoise, PasteOccluder, RollAndZoom, Window
+from posefilter.data.frames import Sample
+
+
+def sample(i: int = 0) -> Sample:
+    """Return a toy scene as a sample: a square whose colour tells the place on it."""
+    b = scenes(4)
+    rgb = (b.rgb[i].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+    return Sample(
+        rgb, b.depth[i, 0].numpy(), b.mask[i, 0].numpy(), b.intrinsics[i].numpy(), b.camera_from_object[i].numpy(), 0, i, 1.0
+    )
+
+
+def misfit(x: Sample) -> tuple[float, float]:
+    """Return how far the mask's points lie off the square's plane [m], and how far their colour is from their place."""
+    rows, cols = np.nonzero(x.mask & (x.depth > 0))
+    K = x.intrinsics
+    z = x.depth[rows, cols]
+    points = np.stack([(cols - K[0, 2]) / K[0, 0] * z, (rows - K[1, 2]) / K[1, 1] * z, z], -1)
+    local = (points - x.camera_from_object[:3, 3]) @ x.camera_from_object[:3, :3]
+    said = x.rgb[rows, cols, :2] / 255.0
+    return float(np.abs(local[:, 2]).max()), float(np.median(np.abs(said - (local[:, :2] / SIDE + 0.5))))
+
+
+def apply(step: Augment, seed: int, x: Sample | None = None) -> Sample:
+    return step(x or sample(), lambda rng: sample(int(rng.integers(4))), np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    "step",
+    [RollAndZoom(any_roll=1.0), Window((32, 32)), PasteOccluder(1.0), Blank(), Compose([RollAndZoom(), Window((32, 48))])],
+)
+def test_geometry_stays_true(step: Augment) -> None:
+    changed = 0
+    for seed in range(12):
+        out = apply(step, seed)
+        if not out.mask.any():
+            continue
+        off_plane, off_color = misfit(out)
+        # depth is the nearest pixel's: on a plane tilted by up to 0.4 rad, half a pixel (7 mm) is worth 3 mm
+        assert off_plane < 0.009
+        assert off_color < 0.06
+        changed += not np.array_equal(out.rgb, sample().rgb)
+    assert changed >= 6
+
+
+def test_the_check_above_can_fail() -> None:
+    out = apply(RollAndZoom(any_roll=1.0), 3)
+    assert misfit(dataclasses.replace(out, camera_from_object=sample().camera_from_object))[1] > 0.1
+
+
+def test_a_window_shifts_the_principal_point() -> None:
+    out = apply(Window((32, 32), anywhere=0.0), 0)
+    assert out.rgb.shape == (32, 32, 3)
+    assert out.mask.any()
+    left, top = sample().intrinsics[:2, 2] - out.intrinsics[:2, 2]
+    cut = sample().rgb[int(top) : int(top) + 32, int(left) : int(left) + 32]
+    np.testing.assert_array_equal(out.rgb, cut)
+
+
+def test_an_occluder_is_in_front_and_leaves_enough() -> None:
+    hidden = 0
+    for seed in range(20):
+        out, before = apply(PasteOccluder(1.0, keep=0.3), seed), sample()
+        lost = before.mask & ~out.mask
+        hidden += bool(lost.any())
+        assert out.mask.sum() >= 0.3 * before.mask.sum()
+        assert (out.depth[lost] < before.depth[lost]).all()
+        assert out.visibility == pytest.approx(out.mask.sum() / before.mask.sum())
+    assert hidden > 5
+
+
+def test_noise_leaves_holes_alone_and_stays_small() -> None:
+    x = sample()
+    x.depth[5:9, 5:20] = 0
+    out = apply(DepthNoise(), 1, x)
+    assert (out.depth[5:9, 5:20] == 0).all()
+    known = x.depth > 0
+    assert 0 < np.abs(out.depth[known] - x.depth[known]).max() < 0.05
+
+
+def test_colour_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:
+    a, b, c = apply(Colour(), 1), apply(Colour(), 1), apply(Colour(), 2)
+    np.testing.assert_array_equal(a.rgb, b.rgb)
+    assert not np.array_equal(a.rgb, c.rgb)
+    np.testing.assert_array_equal(a.depth, sample().depth)

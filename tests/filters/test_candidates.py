@@ -1,0 +1,73 @@
+"""Candidates are where they are said to be, and persistent particles live on in the object's own frame."""
+
+import torch
+from tests.models.toy import scenes, square
+
+from posefilter.filters.candidates import PersistentParticles, around_truth, half_turns, jiggle
+from posefilter.geometry.pose import invert, make_pose, origin_of
+from posefilter.geometry.rotation import angle_between, exp_so3
+from posefilter.geometry.spaces import PoseSpace
+
+MODEL = square()
+SPACE = PoseSpace((0.0, 0.0, 0.0), MODEL.radius)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_candidates_hold_the_truth_and_every_kind() -> None:
+    batch = scenes(3)
+    poses = around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator())
+    assert poses.shape == (3, 1 + 4 * 8 + 4, 4, 4)
+    torch.testing.assert_close(poses[:, 0], batch.camera_from_object)
+    distance = SPACE.distance(poses, batch.camera_from_object[:, None])
+    assert distance[:, 1:9].min() < 0.01
+    flipped = angle_between(poses[:, -8:, :3, :3], batch.camera_from_object[:, None, :3, :3])
+    assert flipped.median() > 2.8
+    placed = poses[:, 25:29]
+    assert (origin_of(placed, MODEL.center) - batch.camera_from_object[:, None, :3, 3]).norm(dim=-1).median() < 0.15
+
+
+def test_half_turns_are_half_turns_about_the_centre() -> None:
+    batch = scenes(2)
+    center = torch.tensor([0.03, 0.01, -0.02])
+    poses = batch.camera_from_object[:, None].expand(-1, 6, -1, -1)
+    turned = half_turns(poses, center, generator())
+    torch.testing.assert_close(origin_of(turned, center), origin_of(poses, center))
+    assert (angle_between(turned[..., :3, :3], poses[..., :3, :3]) - torch.pi).abs().max() < 2e-3
+
+
+def test_jiggle_has_the_size_it_is_told() -> None:
+    poses = torch.eye(4).expand(1, 20_000, 4, 4)
+    moved = jiggle(poses, torch.full((1, 20_000), 0.02), SPACE, generator())
+    assert abs(moved[0, :, 0, 3].std().item() - 0.02) < 5e-4
+    turn = angle_between(moved[..., :3, :3], poses[..., :3, :3])
+    assert abs(turn.square().mean().sqrt().item() - 3**0.5 * 0.02 / MODEL.radius) < 5e-3
+
+
+def test_persistent_particles_follow_their_frame_under_another_camera() -> None:
+    batch = scenes(2)._replace(frame_id=torch.tensor([7, 9]))
+    kept = PersistentParticles(particles=5, levels=3, sigma=(0.01, 0.1), step=0.0)
+    poses, sigma = kept.recall(batch, SPACE, generator())
+    torch.testing.assert_close(sigma, torch.tensor([0.1, 0.1]))
+    scores = torch.full((2, 5), -100.0)
+    scores[:, 2] = 0.0  # one survivor
+    kept.advance(batch, poses, scores, sigma, torch.tensor([True, False]), SPACE, generator(1))
+    roll = make_pose(exp_so3(torch.tensor([0.0, 0.0, 0.5])), torch.zeros(3))
+    rolled = batch._replace(camera_from_object=roll @ batch.camera_from_object)
+    again, sigma = kept.recall(rolled, SPACE, generator(2))
+    torch.testing.assert_close(sigma, torch.tensor([0.1**0.5 * 0.01**0.5, 0.1]))
+    torch.testing.assert_close(again[0], (roll @ poses[0, 2]).expand(5, 4, 4), atol=1e-5, rtol=0)
+    relative = invert(rolled.camera_from_object)[1] @ again[1]
+    assert not torch.allclose(relative[0], (invert(batch.camera_from_object)[1] @ poses[1])[0], atol=1e-3)  # drawn anew
+
+
+def test_after_the_last_level_particles_start_anew() -> None:
+    batch = scenes(1)
+    kept = PersistentParticles(particles=4, levels=2, sigma=(0.01, 0.1))
+    used = torch.tensor([True])
+    for expected in (0.1, 0.01, 0.1):
+        poses, sigma = kept.recall(batch, SPACE, generator())
+        torch.testing.assert_close(sigma, torch.tensor([expected]))
+        kept.advance(batch, poses, torch.zeros(1, 4), sigma, used, SPACE, generator())

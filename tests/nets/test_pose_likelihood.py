@@ -1,0 +1,105 @@
+"""Which points a pose reads, and that its score depends on nothing else."""
+
+import pytest
+import torch
+
+from posefilter.geometry.camera import intrinsics, project, rays
+from posefilter.geometry.pose import invert, make_pose, origin_of, transform
+from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.nets.likelihood import PoseLikelihood, lay_out, look
+from posefilter.nets.paper_likelihood import PaperLikelihood
+
+H, W = 48, 64
+K = intrinsics(80.0, 90.0, 31.0, 22.0)[None]
+CENTER, RADIUS = torch.tensor([0.01, -0.02, 0.03]), 0.1
+
+
+def image() -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(0)
+    return torch.rand(1, 3, H, W, generator=g), 0.7 + 0.2 * torch.rand(1, 1, H, W, generator=g)
+
+
+def pose() -> torch.Tensor:
+    return make_pose(exp_so3(torch.tensor([0.4, -0.7, 0.2])), torch.tensor([0.02, 0.01, 0.8]))[None, None]
+
+
+def test_points_are_the_pixels_lifted_into_the_object_frame() -> None:
+    rgb, depth = image()
+    noise = torch.randn(1, 1, 20, 2, generator=torch.Generator().manual_seed(1))
+    points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise)
+    middle = origin_of(pose(), CENTER)
+    reach = 0.6 * RADIUS * K[0, 0, 0] / middle[0, 0, 2]
+    for k in range(20):  # one by one, by the definition
+        u, v = (project(middle, K)[0, 0] + reach * noise[0, 0, k]).round().long().tolist()
+        assert 0 <= u < W
+        assert 0 <= v < H
+        ray = rays(torch.tensor([[[float(u), float(v)]]]), K)[0, 0]
+        there = transform(invert(pose()[0, 0]), (ray * depth[0, 0, v, u])[None])[0] - CENTER
+        torch.testing.assert_close(points.position[0, 0, k], there, atol=1e-6, rtol=0)
+        torch.testing.assert_close(points.color[0, 0, k], rgb[0, :, v, u])
+        torch.testing.assert_close(points.ray[0, 0, k], pose()[0, 0, :3, :3].T @ (ray / ray.norm()), atol=1e-6, rtol=0)
+    assert points.known.all()
+    assert points.inside.all()
+
+
+def test_a_pixel_without_depth_gives_the_rays_nearest_point() -> None:
+    rgb, depth = image()
+    noise = torch.randn(1, 1, 50, 2, generator=torch.Generator().manual_seed(1))
+    points = look(lay_out(rgb, torch.zeros_like(depth), K), pose(), CENTER, RADIUS, noise)
+    assert not points.known.any()
+    assert (points.position * points.ray).sum(-1).abs().max() < 1e-5  # the nearest point is square to the ray
+
+
+def test_pixels_outside_the_frame_are_known_to_be_so() -> None:
+    rgb, depth = image()
+    away = make_pose(torch.eye(3), torch.tensor([2.0, 0.0, 0.8]))[None, None]
+    points = look(lay_out(rgb, depth, K), away, CENTER, RADIUS, torch.randn(1, 1, 50, 2))
+    assert not points.inside.any()
+
+
+def test_a_score_does_not_change_with_the_frame() -> None:
+    """Turning camera and object together about the optical axis must not matter, nor what other poses are asked."""
+    rgb, depth = image()
+    net = PoseLikelihood(width=32, blocks=1)
+    scene = lay_out(rgb, depth, K)
+    g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
+    others = make_pose(random_rotation(1, 5), torch.tensor([0.0, 0.0, 0.9]))
+    alone = net(scene, pose(), torch.tensor(0.02), CENTER, RADIUS, 64, g())
+    among = net(scene, torch.cat([pose(), others], 1), torch.tensor(0.02), CENTER, RADIUS, 64, g())
+    torch.testing.assert_close(alone[:, 0], among[:, 0])
+    assert (among[0, 1:] - among[0, 0]).abs().min() > 1e-5
+
+
+def test_the_noise_level_changes_the_score() -> None:
+    scene = lay_out(*image(), K)
+    net = PoseLikelihood(width=32, blocks=1)
+    g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
+    broad = net(scene, pose(), torch.tensor(0.2), CENTER, RADIUS, 64, g())
+    sharp = net(scene, pose(), torch.tensor(0.005), CENTER, RADIUS, 64, g())
+    assert (broad - sharp).abs().item() > 1e-4
+    assert net.level(torch.tensor([0.003, 0.25]))[:, 0].tolist() == pytest.approx([-1.0, 1.0], abs=1e-5)
+
+
+def test_gradients_reach_the_pose() -> None:
+    scene = lay_out(*image(), K)
+    shift = torch.zeros(3, requires_grad=True)
+    moved = make_pose(pose()[..., :3, :3], pose()[..., :3, 3] + shift)
+    net = PoseLikelihood(width=32, blocks=1)
+    net(scene, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)).sum().backward()
+    assert shift.grad is not None
+    assert shift.grad.abs().max() > 0
+
+
+def test_the_papers_likelihood_is_a_sum_over_points() -> None:
+    rgb, depth = image()
+    net = PaperLikelihood()
+    noise = torch.randn(1, 1, 30, 2, generator=torch.Generator().manual_seed(5))
+    points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise)
+    by_hand = sum(
+        net.judge_samples(points.position[0, 0, k] + CENTER, points.color[0, 0, k])
+        for k in range(30)
+        if points.inside[0, 0, k] and points.known[0, 0, k]
+    )
+    got = net(lay_out(rgb, depth, K), pose(), torch.tensor(0.0), CENTER, RADIUS, 30, torch.Generator().manual_seed(5))
+    torch.testing.assert_close(got[0, 0], by_hand)
+    assert sum(p.numel() for p in net.parameters()) == 6 * 128 + 128 + 5 * 2 * (128 * 128 + 128) + 128 + 1  # table 1
