@@ -3,48 +3,34 @@
 The chain of a pose: mesh -> F (row vectors, metres to centimetres) -> aligned frame -> quaternion, location (cm) -> camera.
 """
 
-import re
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
 from posefilter.data import ycb
-from posefilter.data.decode import expect_size, need, numbers, read_color, read_depth, read_json, read_label
+from posefilter.data.decode import expect_size, need, read_color, read_depth, read_json, read_label
+from posefilter.data.fat_settings import (
+    FRAME,
+    IMAGE,
+    FatCamera,
+    FatClass,
+    camera_from_aligned,
+    camera_settings,
+    mesh_name,
+    object_settings,
+    scene_folders,
+)
 from posefilter.data.frames import BadData, FrameRecord, NotShown, Sample
 from posefilter.data.meshes import MeshStore
 from posefilter.data.naming import choose_objects
-from posefilter.data.silhouette import Geometry
+from posefilter.data.reader_base import BaseReader
 from posefilter.errors import UserError
-from posefilter.geometry.pose import is_rigid
-from posefilter.geometry.rotation import matrix_from_quat_xyzw
 
-CM, DEPTH_UNITS = 0.01, 10_000.0  # metres a centimetre; depth image units a metre
-_FRAME = re.compile(r"^(\d+)\.(left|right)\.json$")
-_IMAGE = re.compile(r"^(\d+)\.(left|right)\.(jpg|png)$")
-_NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
+DEPTH_UNITS = 10_000.0  # depth image units a metre
 _CUBOID_TOLERANCE = 0.005  # [m]; the wood block's public mesh is off by more, all others by less than 1 mm
 _CLEARLY_VISIBLE = 0.2  # FAT's own visibility from which an empty mask contradicts the record
-
-
-@dataclass(frozen=True, eq=False)
-class _Class:
-    """A class, as a folder's settings have it."""
-
-    seg_id: int
-    aligned_from_mesh: np.ndarray  # (4, 4) rigid [m]
-    dimensions: np.ndarray | None  # (3,) of the cuboid [m]
-
-
-@dataclass(frozen=True, eq=False)
-class _Camera:
-    K: np.ndarray  # (3, 3)
-    height: int
-    width: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +38,15 @@ class _Entry:
     """One record, and what reading it takes."""
 
     record: FrameRecord
-    kind: _Class
-    camera: _Camera
+    kind: FatClass
+    camera: FatCamera
     camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
     visibility: float  # as FAT states it: not a share of pixels
     twins: tuple[np.ndarray, ...]  # poses of every instance of the class in the image, this one's among them
     twin: int  # which of them
 
 
-class FatReader:
+class FatReader(BaseReader):
     """A folder in the FAT format: the whole dataset, `single`, `mixed`, or one scene's folder."""
 
     def __init__(
@@ -77,12 +63,10 @@ class FatReader:
         objects: classes, with or without FAT's `_16k`; None: all. meshes: for visibility, and to tell two instances of a
         class apart (frames with two are left out without). on_error: "raise", or "skip" broken frames and count.
         """
-        self.root, self.eyes, self.on_error = Path(root), tuple(eyes), on_error
-        self.skipped: Counter[str] = Counter()
-        self.notes: Counter[str] = Counter()
-        self._geometry = None if meshes is None else Geometry(meshes)
+        super().__init__(root, meshes, on_error)
+        self.eyes = tuple(eyes)
         self._native: dict[str, np.ndarray] = {}
-        folders = sorted(_scene_folders(self.root, set(parts)))
+        folders = sorted(scene_folders(self.root, set(parts)))
         if not folders:
             raise UserError(f"{self.root}: no FAT scenes here: no folder with _object_settings.json and NNNNNN.left.json")
         settings = [(folder, self._settings(folder)) for folder in folders]
@@ -123,12 +107,6 @@ class FatReader:
             float("nan"),
         )
 
-    def visible_share(self, sample: Sample) -> float:
-        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
-        return (
-            float("nan") if self._geometry is None else self._geometry.visible_share(self.objects[sample.object_id], sample)
-        )
-
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labelled object.  -> (H, W) bool."""
         entry = self._entries[i]
@@ -137,11 +115,8 @@ class FatReader:
 
     def _mask(self, entry: _Entry, seg: np.ndarray, path: Path) -> np.ndarray:
         mask = seg == entry.kind.seg_id
-        if len(entry.twins) > 1 and self._geometry is not None:
-            split = self._geometry.instances(entry.record.object, entry.twins, entry.camera.K, mask)
-            if split is None:
-                raise BadData(path, "two instances of a class and no mesh that fits to tell them apart", entry.record.object)
-            mask = split[entry.twin]
+        if len(entry.twins) > 1:
+            mask = self._instance(entry.record.object, entry.twins, entry.twin, entry.camera.K, mask, path)
         if not mask.any():
             detail = f"no pixel of {entry.record.object}, id {entry.kind.seg_id}"
             if entry.visibility >= _CLEARLY_VISIBLE and len(entry.twins) == 1 and _center_in_frame(entry):
@@ -149,28 +124,22 @@ class FatReader:
             raise NotShown(path, "listed, but not in the label", detail)
         return mask
 
-    def _settings(self, folder: Path) -> tuple[dict[str, _Class], dict[str, _Camera]] | None:
+    def _settings(self, folder: Path) -> tuple[dict[str, FatClass], dict[str, FatCamera]] | None:
         """Return a folder's classes and cameras, None where they are broken and on_error is "skip"."""
         try:
-            return _object_settings(folder / "_object_settings.json"), _camera_settings(folder / "_camera_settings.json")
+            return object_settings(folder / "_object_settings.json"), camera_settings(folder / "_camera_settings.json")
         except BadData as error:
             self._leave_out(error)
             return None
 
-    def _leave_out(self, error: BadData) -> None:
-        """Count a broken frame, or raise its error."""
-        if self.on_error != "skip":
-            raise error
-        self.skipped[error.cause] += 1
-
     def _list_folder(
-        self, number: int, folder: Path, classes: dict[str, _Class], cameras: dict[str, _Camera]
+        self, number: int, folder: Path, classes: dict[str, FatClass], cameras: dict[str, FatCamera]
     ) -> Iterator[_Entry]:
         for name in self.objects:
             if name in classes:
                 self._remember(name, classes[name], folder)
         names = {path.name for path in folder.iterdir()}
-        stems = {f"{m[1]}.{m[2]}" for m in map(_IMAGE.match, names) if m} | {n[:-5] for n in names if _FRAME.match(n)}
+        stems = {f"{m[1]}.{m[2]}" for m in map(IMAGE.match, names) if m} | {n[:-5] for n in names if FRAME.match(n)}
         for stem in sorted(stems):
             frame, eye = stem.split(".")
             if eye not in self.eyes:
@@ -185,17 +154,17 @@ class FatReader:
                 self._leave_out(error)
 
     def _list_frame(
-        self, scene_id: int, im_id: int, files: tuple[Path, ...], classes: dict[str, _Class], camera: _Camera
+        self, scene_id: int, im_id: int, files: tuple[Path, ...], classes: dict[str, FatClass], camera: FatCamera
     ) -> list[_Entry]:
         path = files[3]
         content = read_json(path)
         found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
         for k, one in enumerate(need(content, "objects", path)):
-            name = _mesh_name(need(one, "class", path, f"objects[{k}]."))
+            name = mesh_name(need(one, "class", path, f"objects[{k}]."))
             if name not in classes:
                 raise BadData(path, "unknown class", f"'{name}' is not in the folder's _object_settings.json")
             if name in self.objects:
-                pose = _camera_from_aligned(one, path, f"objects[{k}].") @ classes[name].aligned_from_mesh
+                pose = camera_from_aligned(one, path, f"objects[{k}].") @ classes[name].aligned_from_mesh
                 found.setdefault(name, []).append((k, pose, float(one.get("visibility", 1.0))))
         entries = []
         for name, many in found.items():
@@ -220,7 +189,7 @@ class FatReader:
                 entries.append(_Entry(record, classes[name], camera, pose, visibility, twins, twin))
         return entries
 
-    def _remember(self, name: str, kind: _Class, folder: Path) -> None:
+    def _remember(self, name: str, kind: FatClass, folder: Path) -> None:
         """Keep a class's frame, and see whether the mesh is the one that the cuboid was measured on."""
         known = self._native.setdefault(name, kind.aligned_from_mesh)
         if not np.allclose(known, kind.aligned_from_mesh, atol=1e-4):
@@ -236,65 +205,6 @@ class FatReader:
         if off > _CUBOID_TOLERANCE:
             self._geometry.without.add(name)
             self.notes[f"mesh of {name} is not the one that FAT measured ({off * 1000:.0f} mm off): no visibility"] = 1
-
-
-def _scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
-    """Yield the folders that hold frames, not looking below them."""
-    if not root.is_dir():
-        raise UserError(f"{root}: no such folder (data.root)")
-    names = [path.name for path in root.iterdir()]
-    if any(_FRAME.match(name) or _IMAGE.match(name) for name in names) or "_object_settings.json" in names:
-        yield root
-        return
-    if any(_NEWER.search(name) for name in names):
-        raise UserError(f"{root}: these names (.cs.png, .depth.16.png) are a newer export's; FAT has .seg.png, .depth.png")
-    for name in names:
-        if (root / name).is_dir() and not name.startswith(".") and (name not in {"single", "mixed"} or name in parts):
-            yield from _scene_folders(root / name, parts)
-
-
-def _mesh_name(fat_class: Any) -> str:
-    return str(fat_class).removesuffix("_16k")
-
-
-def _object_settings(path: Path) -> dict[str, _Class]:
-    classes = {}
-    for k, one in enumerate(need(read_json(path), "exported_objects", path)):
-        where = f"exported_objects[{k}]."
-        F = numbers(one, "fixed_model_transform", path, (4, 4), where)
-        aligned = F.T.copy()  # row vectors -> columns
-        aligned[:3] *= CM  # x100 in the rotation, centimetres in the translation
-        if not is_rigid(torch.from_numpy(aligned), tolerance=2e-3):
-            raise BadData(path, f"'{where}fixed_model_transform' is not 100 x a rotation with its shift in the last row")
-        size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM if "cuboid_dimensions" in one else None
-        seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
-        classes[_mesh_name(need(one, "class", path, where))] = _Class(seg_id, aligned, size)
-    return classes
-
-
-def _camera_settings(path: Path) -> dict[str, _Camera]:
-    cameras = {}
-    for k, one in enumerate(need(read_json(path), "camera_settings", path)):
-        where = f"camera_settings[{k}]."
-        inner = need(one, "intrinsic_settings", path, where)
-        fx, fy, cx, cy = (
-            float(numbers(inner, key, path, (), f"{where}intrinsic_settings.")) for key in ("fx", "fy", "cx", "cy")
-        )
-        size = need(one, "captured_image_size", path, where)
-        width, height = (int(numbers(size, key, path, (), f"{where}captured_image_size.")) for key in ("width", "height"))
-        K = np.array([[fx, float(inner.get("s", 0.0)), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        cameras[str(need(one, "name", path, where))] = _Camera(K, height, width)
-    return cameras
-
-
-def _camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
-    quat = numbers(record, "quaternion_xyzw", path, (4,), where)
-    if abs(np.linalg.norm(quat) - 1) > 0.01:  # four decimals leave it 1e-4 off
-        raise BadData(path, f"'{where}quaternion_xyzw' is not a unit quaternion", f"norm {np.linalg.norm(quat):.3f}")
-    pose = np.eye(4)
-    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / np.linalg.norm(quat))).numpy()
-    pose[:3, 3] = numbers(record, "location", path, (3,), where) * CM
-    return pose
 
 
 def _center_in_frame(entry: _Entry) -> bool:

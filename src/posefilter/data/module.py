@@ -3,8 +3,7 @@
 import dataclasses
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +12,15 @@ import cv2
 import numpy as np
 import torch
 from lightning import LightningDataModule
-from rich.progress import Progress
 from torch.utils.data import DataLoader
 
 from posefilter.data.cache import DiskCache, FrameCache, MemoryCache, NoCache, Prepared
 from posefilter.data.dataset import EpochShuffle, FrameDataset
-from posefilter.data.frames import BadData, FrameRecord, NotShown, Reader, Sample
+from posefilter.data.frames import BadData, FrameRecord, Reader, Sample
 from posefilter.data.generated import ensure_scenes
-from posefilter.data.meshes import MeshStore, object_model
+from posefilter.data.meshes import BUILTIN, MeshStore, object_model
 from posefilter.data.points import model_points
+from posefilter.data.prepare import Criteria, usable
 from posefilter.data.readers import open_reader
 from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_CHUNK = 64  # records decoded at a time
 _STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",), None: NAMES}
 
 
@@ -114,15 +112,15 @@ class PoseDataModule(LightningDataModule):
     @cached_property
     def _parts(self) -> dict[str, list[int]]:
         """Return the indices of each split's records, before any frame is looked at."""
-        return split_records(self.reader.records(), self._split, self._split_seed, self.root)
+        return split_records(self._records, self._split, self._split_seed, self.root)
 
     @cached_property
-    def _all_records(self) -> Sequence[FrameRecord]:
+    def _records(self) -> Sequence[FrameRecord]:
         return self.reader.records()
 
     @cached_property
     def _index(self) -> dict[str, int]:
-        return {record.key: i for i, record in enumerate(self._all_records)}
+        return {record.key: i for i, record in enumerate(self._records)}
 
     @cached_property
     def _cache(self) -> FrameCache:
@@ -145,15 +143,14 @@ class PoseDataModule(LightningDataModule):
         """List, split and decode the frames that a stage needs."""
         for name in _STAGES[stage]:
             if name not in self._datasets:
-                records = self._usable(name)
-                self._datasets[name] = FrameDataset(
-                    records, self._cache, self._augment if name == "train" else None, self._seed
-                )
+                self._datasets[name] = self._prepare(name)
                 log.info("%s: %s", name, self.describe()["splits"][name])
 
     def object_model(self, object_id: int) -> ObjectModel:
         """Return what methods and metrics know of a class."""
         name = self.objects[object_id]
+        if self.source in ("ycb_video", "bop") and str(self.meshes.root) == BUILTIN:
+            raise UserError(f"{name}: builtin meshes are not the objects of real photographs; give data.meshes=DIR")
         points = model_points(self._model_points, self.root, name, self.reader.native_from_mesh(name))
         return object_model(self.meshes.load(name), points=points, count=self._points)
 
@@ -200,7 +197,7 @@ class PoseDataModule(LightningDataModule):
 
     def split_record(self) -> dict[str, dict[str, int]]:
         """Return which scenes each split has, with their frames: what the run writes down before it trains."""
-        records = self._all_records
+        records = self._records
         return {name: dict(sorted(Counter(records[i].group for i in part).items())) for name, part in self._parts.items()}
 
     def describe(self) -> dict[str, Any]:
@@ -216,7 +213,7 @@ class PoseDataModule(LightningDataModule):
             "source": self.source,
             "root": str(self.root),
             "objects": list(self.objects),
-            "records": len(self._all_records),
+            "records": len(self._records),
             "splits": splits,
             "left_out_while_listing": dict(self.reader.skipped),
             "notes": dict(self.reader.notes),
@@ -229,41 +226,19 @@ class PoseDataModule(LightningDataModule):
             self.setup({"train": "fit", "val": "validate", "test": "test"}[split])
         return self._datasets[split]
 
-    def _usable(self, split: str) -> list[FrameRecord]:
+    def _prepare(self, split: str) -> FrameDataset:
         """Decode a split's frames into the cache; return those that can be used, at most the limit."""
-        self._left_out[split] = left_out = Counter[str]()
-        limit, part = self._limits[split], self._parts[split]
+        part, limit = self._parts[split], self._limits[split]
         if limit is not None:  # smaller limits take a part of what larger ones take
-            part = [part[i] for i in np.random.default_rng([self._split_seed, NAMES.index(split)]).permutation(len(part))]
-        usable: list[FrameRecord] = []
-        for record, found in self._decode([self._all_records[i] for i in part], split):
-            if limit is not None and len(usable) >= limit:
-                break
-            if isinstance(found, BadData):
-                if self._on_error == "raise" and not isinstance(found, NotShown):
-                    raise UserError(f"{found}; data.on_error=skip leaves such frames out and counts them") from found
-                left_out[found.cause] += 1
-            elif found.pixels == 0:
-                left_out["the mask vanishes at this image size"] += 1
-            elif found.visibility < self._least[split]:
-                left_out[f"visibility below {self._least[split]}"] += 1
-            else:
-                usable.append(record)
-        if not usable and part:
-            raise UserError(f"{self.root}: no usable {split} frame of {len(part)}: {dict(left_out)}")
-        return usable
-
-    def _decode(self, records: list[FrameRecord], split: str) -> Iterator[tuple[FrameRecord, Prepared | BadData]]:
-        """Yield the records in order, each with what the cache keeps of it, or what is wrong with it."""
-        with (
-            ThreadPoolExecutor(max(self._workers, 2)) as pool,
-            Progress(disable=not self._progress or len(records) < _CHUNK) as bar,
-        ):
-            task = bar.add_task(f"decoding {split} frames", total=len(records))
-            for chunk in _chunks(records):
-                for pair in zip(chunk, pool.map(self._fetch, chunk), strict=True):
-                    bar.advance(task)
-                    yield pair
+            order = np.random.default_rng([self._split_seed, NAMES.index(split)]).permutation(len(part))
+            part = [part[i] for i in order]
+        records = [self._records[i] for i in part]
+        want = Criteria(self._least[split], limit, self._on_error)
+        title = f"decoding {split} frames"
+        chosen, self._left_out[split] = usable(records, self._fetch, want, max(self._workers, 2), title, self._progress)
+        if part and not chosen and limit != 0:
+            raise UserError(f"{self.root}: none of {len(part)} {split} frames can be used: {dict(self._left_out[split])}")
+        return FrameDataset(chosen, self._cache, self._augment if split == "train" else None, self._seed)
 
     def _fetch(self, record: FrameRecord) -> Prepared | BadData:
         kept = self._cache.find(record)
@@ -293,8 +268,3 @@ class PoseDataModule(LightningDataModule):
             pin_memory=torch.cuda.is_available(),
             **how,
         )
-
-
-def _chunks(records: list[FrameRecord]) -> Iterator[list[FrameRecord]]:
-    for at in range(0, len(records), _CHUNK):
-        yield records[at : at + _CHUNK]

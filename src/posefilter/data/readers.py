@@ -1,15 +1,22 @@
 """Open a dataset by the name of its format."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from posefilter.data.bop import BopReader
 from posefilter.data.fat import FatReader
 from posefilter.data.frames import Reader
 from posefilter.data.meshes import MeshStore
+from posefilter.data.ycb_video import YCBVideoReader
 from posefilter.errors import UserError
 
-READERS = {"scenes": FatReader, "fat": FatReader}
+READERS: dict[str, Callable[..., Reader]] = {
+    "scenes": FatReader,
+    "fat": FatReader,
+    "ycb_video": YCBVideoReader,
+    "bop": BopReader,
+}
 
 
 def open_reader(

@@ -1,0 +1,43 @@
+"""What all readers share: counting what they leave out, and asking meshes about masks."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.data.frames import BadData, Sample
+from posefilter.data.meshes import MeshStore
+from posefilter.data.silhouette import Geometry
+
+
+class BaseReader:
+    """A dataset on disk whose classes are `objects`."""
+
+    objects: tuple[str, ...]
+
+    def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
+        self.root, self.on_error = Path(root), on_error
+        self.skipped: Counter[str] = Counter()
+        self.notes: Counter[str] = Counter()
+        self._geometry = None if meshes is None else Geometry(meshes)
+
+    def visible_share(self, sample: Sample) -> float:
+        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
+        return (
+            float("nan") if self._geometry is None else self._geometry.visible_share(self.objects[sample.object_id], sample)
+        )
+
+    def _leave_out(self, error: BadData) -> None:
+        """Count a broken frame, or raise its error."""
+        if self.on_error != "skip":
+            raise error
+        self.skipped[error.cause] += 1
+
+    def _instance(
+        self, name: str, poses: tuple[np.ndarray, ...], which: int, K: np.ndarray, mask: np.ndarray, path: Path
+    ) -> np.ndarray:
+        """Return one instance's part of a mask that several instances of a class share.  Raises BadData without a mesh."""
+        parts = None if self._geometry is None else self._geometry.instances(name, poses, K, mask)
+        if parts is None:
+            raise BadData(path, "two instances of one class, and no mesh that fits to tell them apart", name)
+        return parts[which]
