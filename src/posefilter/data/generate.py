@@ -147,7 +147,8 @@ def _claim(out: Path, job: Job, frames: int) -> None:
     path = out / GENERATOR
     if path.is_file():
         try:
-            there = json.loads(path.read_text())["settings"]
+            record = json.loads(path.read_text())
+            there, frames = record["settings"], max(frames, int(record["frames"]))
         except (json.JSONDecodeError, KeyError, TypeError) as error:
             raise UserError(f"{path}: not a generator's record any more ({error}); choose another out=") from error
         differing = sorted(k for k in {*there, *settings} if there.get(k) != settings.get(k))

@@ -4,6 +4,7 @@ OpenGL's pixel (0, 0) has its centre at (0.5, 0.5), ours at (0, 0): the principa
 drawn at the bottom of the frame buffer, so that nothing need be flipped. Shadows are left to Embree's rays.
 """
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,7 +56,7 @@ class GLRenderer:
 
     def __init__(self) -> None:
         try:
-            import moderngl
+            moderngl: Any = importlib.import_module("moderngl")
         except ImportError as error:
             raise UserError("renderer=moderngl: the package is missing; pip install 'posefilter[moderngl]'") from error
         try:
@@ -66,7 +67,7 @@ class GLRenderer:
             ) from error
         self._gl.enable(moderngl.DEPTH_TEST)
         self._filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self._program = self._gl.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
+        self._program: Any = self._gl.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._arrays: dict[int, _Uploaded] = {}
         self._textures: dict[int, tuple[np.ndarray, Any]] = {}
         self._targets: dict[tuple[int, int], Any] = {}
@@ -126,7 +127,9 @@ class GLRenderer:
         """Empty the buffers: no surface is index -1 at depth 0."""
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
-        target.color_attachments[0].write(np.tile(np.float32([0, 0, 0, -1]), target.width * target.height).tobytes())
+        target.color_attachments[0].write(
+            np.tile(np.array([0, 0, 0, -1], np.float32), target.width * target.height).tobytes()
+        )
 
     def _read(self, target: Any, attachment: int, height: int, width: int) -> np.ndarray:
         data = target.read(components=4, attachment=attachment, dtype="f4", alignment=1)
