@@ -1,0 +1,124 @@
+"""Draw poses onto a photograph: the object's outline, and its axes at its centre."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from posefilter.data.mesh import Mesh
+from posefilter.data.render import EmbreeRenderer, render_depth
+from posefilter.pictures.canvas import (
+    AXES,
+    ESTIMATE,
+    TRUTH,
+    Colour,
+    draw_lines,
+    enlarge,
+    enlarge_intrinsics,
+    factor_for,
+    strip,
+)
+
+Shape = Mesh | np.ndarray | Tensor  # a mesh, or the (V, 3) vertices of a convex hull [m]
+WIDTH = 640  # [px] at least
+_NEAR = 0.01  # [m]; what is nearer to the camera's plane is not drawn
+
+
+def draw_overlay(
+    rgb: np.ndarray,
+    K: np.ndarray,
+    pose: np.ndarray,
+    shape: Shape,
+    colour: Colour = ESTIMATE,
+    truth: np.ndarray | None = None,
+    caption: str = "",
+    label: str = "estimate",
+    width: int = WIDTH,
+) -> np.ndarray:
+    """Draw where a pose puts the object, and where the truth does; the legend is on a strip below the photograph.
+
+    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]. -> (s H + strip, s W, 3) uint8, s the
+    least whole factor that gives `width` pixels.
+    """
+    factor = factor_for(rgb.shape[1], width)
+    picture = enlarge(rgb, factor)
+    K = enlarge_intrinsics(K, factor)
+    entries: list[tuple[str, Colour]] = []
+    if truth is not None:
+        draw_pose(picture, K, np.asarray(truth), shape, TRUTH)
+        entries.append(("truth", TRUTH))
+    draw_pose(picture, K, np.asarray(pose), shape, colour)
+    entries += [(label, colour), *zip("xyz", AXES, strict=True)]
+    return np.concatenate([picture, strip(picture.shape[1], caption, entries)])
+
+
+def draw_pose(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2) -> None:
+    """Draw a pose's outline and axes into a picture, in place.  Poses that are not finite draw nothing."""
+    if not np.isfinite(pose).all():
+        return
+    draw_lines(picture, outlines_of(pose, shape, K, *picture.shape[:2]), colour, width, closed=True)
+    draw_axes(picture, K, pose, shape, width)
+
+
+def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, width: int = 2) -> None:
+    """Draw the object's axes at the centre of its bounding box: x red, y green, z blue, the farthest first."""
+    points = vertices_of(shape)
+    low, high = points.min(0), points.max(0)
+    length = 0.3 * float(np.linalg.norm(high - low))
+    ends = (low + high) / 2 + length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    camera = ends @ pose[:3, :3].T + pose[:3, 3]
+    if (camera[:, 2] < _NEAR).any():
+        return
+    pixels = _project(camera, K)
+    for axis in np.argsort(-camera[1:, 2]):
+        draw_lines(picture, [pixels[[0, axis + 1]]], AXES[axis], width)
+
+
+def outlines_of(pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, width: int) -> list[np.ndarray]:
+    """Return the closed lines round the object: a mesh's silhouette, or the projected hull.  -> each (P, 2) [px]."""
+    if isinstance(shape, Mesh):
+        return outline(silhouette(shape, pose, K, height, width))
+    camera = _before_camera(vertices_of(shape) @ pose[:3, :3].T + pose[:3, 3])
+    if len(camera) < 3:
+        return []
+    return [cv2.convexHull(_project(camera, K).astype(np.float32))[:, 0]]
+
+
+def silhouette(mesh: Mesh, pose: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return which pixels the mesh covers, were it alone in the frame.  -> (H, W) bool."""
+    depth, _ = render_depth([mesh], [pose], K, height, width, _renderer())
+    return depth > 0
+
+
+def outline(mask: np.ndarray) -> list[np.ndarray]:
+    """Return the closed lines through the outermost pixels of a mask, and of its holes.  (H, W) bool -> each (P, 2) [px]."""
+    found: Sequence[np.ndarray] = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    return [line[:, 0] for line in found]
+
+
+def vertices_of(shape: Shape) -> np.ndarray:
+    """Return the points that bound the object.  -> (V, 3) [m]."""
+    if isinstance(shape, Mesh):
+        return shape.vertices
+    return np.asarray(shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape, np.float64)
+
+
+def _project(camera: np.ndarray, K: np.ndarray) -> np.ndarray:
+    return camera[:, :2] / camera[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
+
+
+def _before_camera(points: np.ndarray) -> np.ndarray:
+    """Cut the convex hull of camera points (V, 3) [m] at the near plane: those before it, and where edges pierce it."""
+    before = points[:, 2] >= _NEAR
+    if before.all():
+        return points
+    a, b = points[before][:, None], points[~before][None]
+    share = (a[..., 2:] - _NEAR) / (a[..., 2:] - b[..., 2:])
+    return np.concatenate([points[before], (a + share * (b - a)).reshape(-1, 3)])
+
+
+@cache
+def _renderer() -> EmbreeRenderer:
+    return EmbreeRenderer(keep=8)
