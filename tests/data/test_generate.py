@@ -223,6 +223,12 @@ def test_a_strangers_folder_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["holiday.jpg"]
 
 
+def test_a_spoilt_record_is_named(tmp_path: Path) -> None:
+    (tmp_path / "_generator.json").write_text('{"settings": {}, "fra')
+    with pytest.raises(UserError, match=r"_generator\.json: not a generator's record"):
+        generate(tmp_path, 1, **SETTINGS)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

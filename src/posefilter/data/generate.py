@@ -149,7 +149,7 @@ def _claim(out: Path, job: Job, frames: int) -> None:
         try:
             record = json.loads(path.read_text())
             there, frames = record["settings"], max(frames, int(record["frames"]))
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"{path}: not a generator's record any more ({error}); choose another out=") from error
         differing = sorted(k for k in {*there, *settings} if there.get(k) != settings.get(k))
         if differing:
