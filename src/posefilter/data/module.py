@@ -230,7 +230,9 @@ class PoseDataModule(LightningDataModule):
         """Decode a split's frames into the cache; return those that can be used, at most the limit."""
         part, limit = self._parts[split], self._limits[split]
         if limit is not None:  # smaller limits take a part of what larger ones take
-            order = np.random.default_rng([self._split_seed, NAMES.index(split)]).permutation(len(part))
+            same_as = self._split.get(split)
+            first = NAMES.index(same_as if same_as in NAMES else split)
+            order = np.random.default_rng([self._split_seed, first]).permutation(len(part))
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
         want = Criteria(self._least[split], limit, self._on_error)

@@ -20,8 +20,9 @@ def split_records(
 ) -> dict[str, list[int]]:
     """Return the indices of each split's records.
 
-    A share is a fraction of the scenes, a list of scene names (with * and ?), or a file that lists frames (`0048/000001`
-    a line, or BOP's targets as JSON). Fractions divide the scenes that neither lists nor files took, shuffled by the seed.
+    A share is a fraction of the scenes, a list of scene names (with * and ?), a file that lists frames (`0048/000001` a line,
+    or BOP's targets as JSON), or another part's name: the same frames again, as a test of memory wants. Fractions divide the
+    scenes that neither lists nor files took, shuffled by the seed.
     Raises UserError where names are unknown, fractions exceed one, or scenes are too few.
     """
     unknown = sorted(set(split) - set(NAMES))
@@ -30,7 +31,7 @@ def split_records(
     out: dict[str, list[int]] = {name: [] for name in NAMES}
     taken: dict[str, str] = {}  # scene -> split
     for name, share in split.items():
-        if share is None or isinstance(share, int | float):
+        if share is None or isinstance(share, int | float) or share in NAMES:
             continue
         chosen = _listed(records, share, root) if isinstance(share, str) else _named(records, list(share), name)
         for scene in {records[i].group for i in chosen}:
@@ -43,6 +44,9 @@ def split_records(
     for i, record in enumerate(records):
         if record.group in owner:
             out[owner[record.group]].append(i)
+    for name, share in split.items():
+        if isinstance(share, str) and share in NAMES:
+            out[name] = out[share]
     return out
 
 
