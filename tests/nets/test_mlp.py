@@ -19,8 +19,8 @@ def test_layers_are_as_the_paper_counts_them() -> None:
 @pytest.mark.parametrize(("normalisation", "mixes"), [("batch", True), ("layer", False)])
 def test_batch_statistics_mix_particles_and_layer_statistics_do_not(normalisation: str, mixes: bool) -> None:
     torch.manual_seed(0)
-    latent = LatentNet(4, memory_width=8, width=16, normalisation=normalisation).train()
-    patch = PatchNet(3, width=8, memory_width=4, normalisation=normalisation).train()
+    latent = LatentNet(0, 1, memory_width=8, width=16, normalisation=normalisation).train()
+    patch = PatchNet(0, 3, width=8, memory_width=4, normalisation=normalisation).train()
     g = torch.Generator().manual_seed(1)
     pixel = torch.rand(2, 5, 4, 1, 1, generator=g)
     window = torch.rand(2, 5, 4, 3, 3, generator=g)
@@ -34,7 +34,7 @@ def test_batch_statistics_mix_particles_and_layer_statistics_do_not(normalisatio
 
 def test_latent_net_remembers() -> None:
     torch.manual_seed(0)
-    net = LatentNet(4, memory_width=8, pose_width=9, width=16, normalisation="layer")
+    net = LatentNet(0, 1, memory_width=8, pose_width=9, width=16, normalisation="layer")
     seen, extra = torch.rand(1, 3, 4, 1, 1), torch.zeros(1, 3, 0)
     first = net(seen, extra, torch.zeros(1, 3, 8))
     second = net(seen, extra, first.memory)

@@ -78,9 +78,9 @@ def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tu
 class SignsOfFailure(Metric):
     """All of the above over many runs of a filter: numbers, and lists with one number a step.
 
-    off_frame, near_edge, near_corner, on_object: lists; pairwise_cosine: mean over images and steps; offset_r2 and heading:
-    displacements against the true offset to the mask's nearest pixel, over all steps; auroc: of the last likelihood, for
-    particles on the mask against the others.
+    off_frame, near_edge, near_corner, on_object: lists; pairwise_cosine: mean over images and steps; offset_r2, heading:
+    displacements against the true offset to the mask's nearest pixel; auroc: of the likelihood, particles on the mask being
+    the positives. The last three are over all steps.
     """
 
     full_state_update = False
@@ -90,7 +90,7 @@ class SignsOfFailure(Metric):
     judged: list[Tensor]
 
     def __init__(self, most: int = 256, **kwargs: Any) -> None:
-        """most: particles of an image whose offsets are kept a step."""
+        """most: particles of an image that are kept a step."""
         super().__init__(**kwargs)
         self.most = most
         for name in ("shares", "cosine", "offsets", "judged"):
@@ -109,10 +109,10 @@ class SignsOfFailure(Metric):
             some, motion = cloud.state[:, : self.most], reading.motion[:, : self.most]
             true = nearest_true(batch.mask, some) - some
             self.offsets.append(torch.cat([motion, true], dim=-1).flatten(0, 1).float())
+            positive = touches(batch.mask, some).float()
+            judged = torch.stack([reading.log_likelihood[:, : self.most].float(), positive], dim=-1)
+            self.judged.append(judged.flatten(0, 1))
         self.shares.append(torch.stack(kinds).permute(2, 0, 1))  # (B, T, 4)
-        positive = touches(batch.mask, trace.clouds[-1].state)
-        judged = torch.stack([trace.readings[-1].log_likelihood.float(), positive.float()], dim=-1)
-        self.judged.append(judged.flatten(0, 1))
 
     def compute(self) -> dict[str, Any]:
         """Return the signs by name."""

@@ -16,6 +16,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.models.box import Box
 from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
 from posefilter.nets.context import ContextMap
+from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
 from posefilter.nets.heads import fill_depth
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
@@ -40,7 +41,7 @@ class RelevantScene(ImageScene):
 class ImageSpace(PoseEstimator):
     """Observe images and read particles off them; the networks, and what their outputs mean, are injected.
 
-    net: given how many numbers a particle is told besides its patch, the network that reads them; bounds: how the particles
+    net: given the patch's size, how many extra numbers a particle is told and how many make a pose; bounds: how particles
     bound the object in the image; lessons: losses beside the chosen one, by name; stages: factors on all of them as training
     proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; truncate: cut the
     gradient every so many steps (null: never), so that a long roll-out stays finite, which changes no value.
@@ -55,13 +56,13 @@ class ImageSpace(PoseEstimator):
 
     def __init__(
         self,
-        net: Callable[[int], nn.Module],
-        glimpse: nn.Module,
+        net: Callable[..., nn.Module],
+        glimpse: IntegerCut | SmoothGlimpse,
         context: nn.Module,
         pose_code: nn.Module,
         motion: nn.Module,
         bounds: Box,
-        lessons: Mapping[str, Auxiliary] | None = None,
+        lessons: Mapping[str, Auxiliary | None] | None = None,
         stages: Sequence[Stage] | None = None,
         relevance: float = 1.0,
         truncate: int | None = None,
@@ -70,9 +71,10 @@ class ImageSpace(PoseEstimator):
     ) -> None:
         super().__init__(**base)
         self.glimpse, self.context, self.pose_code, self.motion = glimpse, context, pose_code, motion
-        self.net = net(self.context.width + self.place_width)
+        self.net = net(extra=self.context.width + self.place_width, size=glimpse.size, pose_width=self.pose_code.width)
         self.bounds = bounds
-        self.lessons, self.stages = dict(lessons or {}), tuple(stages or ())
+        self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
+        self.stages = tuple(stages or ())
         check_stages(self.stages, ["loss", "relevance", *self.lessons])
         self.relevance_weight, self.truncate = relevance, truncate
         if object_model is not None:  # not in the base, where the pose code is not there yet

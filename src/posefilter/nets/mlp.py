@@ -59,22 +59,23 @@ class LatentNet(nn.Module):
 
     def __init__(
         self,
-        inputs: int,
-        memory_width: int = 256,
+        extra: int,
+        size: int,
         pose_width: int = 7,
+        memory_width: int = 256,
         width: int = 512,
         layers: int = 4,
         normalisation: str = "batch",
     ) -> None:
         super().__init__()
         self.memory_width = memory_width
-        self.latent = mlp(inputs + memory_width, memory_width, width, layers, normalisation)
+        self.latent = mlp(4 * size * size + extra + memory_width, memory_width, width, layers, normalisation)
         self.pose = mlp(memory_width, pose_width, width, layers, normalisation)
         self.likelihood = mlp(memory_width, 1, width, layers, normalisation)
         self.motion = mlp(pose_width + 1 + memory_width, 2, width, layers, normalisation)
 
     def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
-        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; C k^2 + E must be `inputs`."""
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; C = 4, k = `size`, E = `extra`."""
         latent = self.latent(torch.cat([patch.flatten(2), extra, memory], dim=-1))
         pose, logit = self.pose(latent), self.likelihood(latent)
         motion = self.motion(torch.cat([pose, logit, latent], dim=-1))
@@ -90,18 +91,20 @@ class PatchNet(nn.Module):
 
     def __init__(
         self,
+        extra: int,
         size: int,
-        channels: int = 4,
-        extra: int = 0,
+        pose_width: int = 0,
         width: int = 32,
         hidden: int = 0,
         memory_width: int = 0,
         normalisation: str = "batch",
     ) -> None:
         super().__init__()
+        if pose_width:
+            raise UserError("net=patch tells no pose: choose pose_code=none, or net=latent")
         self.memory_width = memory_width
         blocks: list[nn.Module] = []
-        for inputs in (channels, width, width):
+        for inputs in (4, width, width):
             norm = nn.BatchNorm2d(width) if normalisation == "batch" else nn.GroupNorm(1, width)
             blocks += [nn.Conv2d(inputs, width, 3, padding=1), norm, nn.ReLU(inplace=True)]
         self.convolve = nn.Sequential(*blocks)
