@@ -20,7 +20,7 @@ def split_records(
 ) -> dict[str, list[int]]:
     """Return the indices of each split's records.
 
-    A share is a fraction of the scenes, a list of scene names (with * and ?), a file that lists frames (`0048/000001` a line,
+    A share is a fraction of the scenes, a list of scene names (* and ? allowed), a file of frames (`0048/000001` a line,
     or BOP's targets as JSON), or another part's name: the same frames again, as a test of memory wants. Fractions divide the
     scenes that neither lists nor files took, shuffled by the seed.
     Raises UserError where names are unknown, fractions exceed one, or scenes are too few.
