@@ -51,6 +51,7 @@ class PoseEstimator(LightningModule):
         self._object_model: ObjectModel | None = None
         self.scores: nn.ModuleDict = nn.ModuleDict()
         self.seconds_per_image: list[float] = []
+        self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
         if object_model is not None:
             self.adopt(object_model)
 
@@ -222,6 +223,7 @@ class PoseEstimator(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Carry the object along, as plain tensors, numbers and strings."""
+        checkpoint["recipe"] = self.recipe
         checkpoint["object_model"] = dict(self.model._asdict())
         checkpoint["state_dict"] = {k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("scores.")}
 

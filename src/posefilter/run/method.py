@@ -1,0 +1,75 @@
+"""Build a method, from a configuration or from a checkpoint that carries its own."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+
+from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
+from posefilter.run.build import hint, instantiate, locate
+from posefilter.run.job import Job
+from posefilter.run.pieces import changed
+from posefilter.types import ObjectModel
+
+_NOT_KEPT = ("out", "folder", "trainer", "callbacks", "logger", "resume", "debug", "console")
+
+
+def check_loss(job: Job) -> None:
+    """Raise UserError unless the chosen loss fits the chosen method, naming those that do."""
+    method, loss = locate(str(job.cfg.model._target_), "model"), job.choices["loss"]
+    legal = getattr(method, "legal_losses", ())
+    if loss not in legal:
+        model = job.choices["model"]
+        raise UserError(f"loss={loss} does not fit model={model}: choose {', '.join(legal)}{hint(loss, legal)}")
+
+
+def recipe(job: Job) -> dict[str, Any]:
+    """Return what a checkpoint carries, so that the method can be built again: choices, and settings not yet resolved."""
+    settings = OmegaConf.to_container(job.cfg, resolve=False)
+    assert isinstance(settings, dict)
+    return {
+        "choices": {group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")},
+        "settings": {key: value for key, value in settings.items() if key not in _NOT_KEPT},
+    }
+
+
+def build_method(recipe: dict[str, Any], model: ObjectModel) -> PoseEstimator:
+    """Build the method of a recipe for an object."""
+    settings = OmegaConf.create(recipe["settings"])
+    method = instantiate(settings.model, "model")
+    assert isinstance(method, PoseEstimator)
+    method.recipe = recipe
+    method.adopt(model)
+    return method
+
+
+def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
+    """Read a checkpoint of ours.  Raises UserError where the path holds none."""
+    if not path:
+        raise UserError("checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/")
+    file = Path(path)
+    if file.is_dir():
+        file = file / "checkpoints" / "best.ckpt"
+    if not file.is_file():
+        raise UserError(f"checkpoint={path}: no such file")
+    try:
+        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged archive fails in many ways, and pickle raises what it likes
+        raise UserError(f"checkpoint={path}: not readable as a checkpoint ({type(error).__name__})") from error
+    if not isinstance(checkpoint, dict) or not {"state_dict", "recipe", "object_model"} <= set(checkpoint):
+        raise UserError(f"checkpoint={path}: not made by this project's train.py (no recipe or object in it)")
+    return checkpoint
+
+
+def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> PoseEstimator:
+    """Build the method that a checkpoint holds, with some of its pieces changed, and load its weights."""
+    recipe = checkpoint["recipe"]
+    recipe = {**recipe, "settings": changed(recipe["settings"], wanted or {})}
+    method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
+    missing, foreign = method.load_state_dict(checkpoint["state_dict"], strict=False)
+    lost = [key for key in missing if not key.startswith("scores.")]
+    if lost or foreign:
+        raise UserError(f"checkpoint: its weights do not fit the method ({len(lost)} missing, {len(foreign)} unknown)")
+    return method.eval()

@@ -1,0 +1,83 @@
+"""Results: metrics.json, and the table on the console."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from posefilter.run.job import Job
+from posefilter.run.machine import device_name, git_state, versions
+
+_ROWS = (
+    ("ADD AUC", ("add", "auc"), "{:.1f}"),
+    ("ADD < 0.1 diameter", ("add", "recall_01d"), "{:.1f} %"),
+    ("ADD < 2 cm", ("add", "recall_2cm"), "{:.1f} %"),
+    ("ADD, median", ("add", "median_mm"), "{:.1f} mm"),
+    ("ADD-S AUC", ("add_s", "auc"), "{:.1f}"),
+    ("ADD-S, median", ("add_s", "median_mm"), "{:.1f} mm"),
+    ("box IoU", ("iou",), "{:.3f}"),
+    ("particles on the object", ("particles_on_object",), "{:.1%}"),
+    ("time an image", ("seconds_per_image",), "{:.3f} s"),
+)
+
+
+def record(results: dict[str, Any], job: Job, data: dict[str, Any], checkpoint: Path | None) -> dict[str, Any]:
+    """Return the whole of metrics.json: what was found, and all that it takes to find it again."""
+    return {
+        **results,
+        "model": job.choices.get("model"),
+        "loss": job.choices.get("loss"),
+        "variant": job.choices.get("variant"),
+        "seed": job.cfg.get("seed"),
+        "data": data,
+        "checkpoint": str(checkpoint) if checkpoint else None,
+        "git": git_state(),
+        "device": device_name(),
+        "versions": versions(),
+        "overrides": job.overrides,
+    }
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON that any parser reads: numbers that are none become null; whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.part")
+    partial.write_text(json.dumps(finite(content), indent=2, allow_nan=False) + "\n")
+    partial.replace(path)
+
+
+def finite(content: Any) -> Any:
+    """Return plain content with NaN and infinity as null."""
+    if isinstance(content, dict):
+        return {str(key): finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content
+
+
+def show(metrics: dict[str, Any], title: str, plain: bool, written: dict[str, Path]) -> None:
+    """Print the table, and where everything was written."""
+    rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
+    for label, path, form in _ROWS:
+        value: Any = metrics
+        for key in path:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, int | float):
+            rows.append((label, form.format(value)))
+    if plain:
+        print(f"{title}: " + "; ".join(f"{label} {value}" for label, value in rows))
+        for label, place in written.items():
+            print(f"{label}: {place}")
+        return
+    console = Console()
+    table = Table("", "", title=title, show_header=False, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+    for label, place in written.items():
+        console.print(f"[dim]{label}:[/dim] {place}", highlight=False, soft_wrap=True)

@@ -1,0 +1,112 @@
+"""Train a method, test its best checkpoint, and write down what came of it."""
+
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningDataModule, Trainer
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig
+
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
+from posefilter.run.build import instantiate
+from posefilter.run.console import progress
+from posefilter.run.job import Job
+from posefilter.run.machine import settle
+from posefilter.run.method import build_method, check_loss, method_of, read_checkpoint, recipe
+from posefilter.run.results import record, show, write_json
+from posefilter.run.resume import last_checkpoint
+
+
+def train(job: Job) -> float:
+    """Train and test; write metrics.json into the job's folder.  Returns the score that sweeps maximise."""
+    done = finished(job)
+    if done is not None:
+        print(f"{job.folder}: done before; delete its metrics.json to run it again")
+        return score(done)
+    check_loss(job)
+    settle(job.cfg.threads, job.cfg.seed)
+    data = build_data(job.cfg.data)
+    data.setup("fit")
+    method = build_method(recipe(job), data.object_model(0))
+    trainer = build_trainer(job)
+    write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
+    trainer.fit(method, datamodule=data, ckpt_path=start_from(job), weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    best = job.folder / "checkpoints" / "best.ckpt"
+    results = test(trainer, data, best)
+    metrics = record(results, job, data.describe(), best)
+    write_json(job.folder / "metrics.json", metrics)
+    files = {"run": job.folder, "checkpoint": best, "next": f"python evaluate.py checkpoint={best} data=..."}
+    show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console == "plain", files)
+    return score(metrics)
+
+
+def build_data(node: DictConfig) -> PoseDataModule:
+    """Build the data module, and have its scenes rendered where they are missing."""
+    data = instantiate(node, "data")
+    if not isinstance(data, PoseDataModule):
+        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
+    data.prepare_data()
+    return data
+
+
+def build_trainer(job: Job) -> Trainer:
+    """Build the trainer with its callbacks and logger; they write into the job's folder."""
+    quiet()
+    cfg = job.cfg.copy()
+    cfg.folder = str(job.folder)
+    callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
+    callbacks.append(progress(cfg.console))
+    loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]
+    trainer = instantiate(cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False)
+    assert isinstance(trainer, Trainer)
+    return trainer
+
+
+def test(trainer: Trainer, data: LightningDataModule, checkpoint: Path) -> dict[str, Any]:
+    """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
+    method = method_of(read_checkpoint(checkpoint))
+    trainer.test(method, datamodule=data, verbose=False)
+    return method.results()
+
+
+def start_from(job: Job) -> str | None:
+    """Return the checkpoint to go on from: of `resume`, or of a sweep's job that was cut short."""
+    if job.cfg.resume:
+        return str(last_checkpoint(job.cfg.resume))
+    last = job.folder / "checkpoints" / "last.ckpt"
+    return str(last) if job.swept and last.is_file() else None
+
+
+def finished(job: Job) -> dict[str, Any] | None:
+    """Return the metrics of a sweep's job that was done before, with the same overrides."""
+    path = job.folder / "metrics.json"
+    if not (job.swept and path.is_file()):
+        return None
+    metrics: dict[str, Any] = json.loads(path.read_text())
+    return metrics if sorted(metrics["overrides"]) == sorted(job.overrides) else None
+
+
+def score(metrics: dict[str, Any]) -> float:
+    """Return what sweeps maximise: ADD AUC, or the particles on the object where no pose is told."""
+    if metrics["add"]:
+        return float(metrics["add"]["auc"])
+    return 100 * float(metrics["particles_on_object"])
+
+
+def quiet() -> None:
+    """Silence advice that does not apply here."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for text in (".*does not have many workers.*", ".*LeafSpec.*", ".*Checkpoint directory.*", ".*log_every_n_steps.*"):
+        warnings.filterwarnings("ignore", text)
+    torch.set_float32_matmul_precision("high")
+
+
+__all__ = ["PoseEstimator", "build_data", "build_trainer", "train"]

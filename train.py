@@ -1,0 +1,10 @@
+"""Train a method and test it: python train.py [model=...] [loss=...] [data=...]; see conf/train.yaml."""
+
+import sys
+from pathlib import Path
+
+from posefilter.run import run_command
+from posefilter.run.train import train
+
+if __name__ == "__main__":
+    sys.exit(run_command("train", train, Path(__file__).parent))
