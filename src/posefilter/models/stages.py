@@ -1,6 +1,7 @@
 """Losses beside the chosen one, and how their weights change as training proceeds."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 from posefilter.contracts import Loss
@@ -18,7 +19,7 @@ class Stage(NamedTuple):
     """A part of training, and the factor on each loss by name (1 where it is not named) while it lasts."""
 
     until: float  # share of the training's steps at which it ends
-    factors: Mapping[str, float]
+    factors: Mapping[str, float] = MappingProxyType({})
 
 
 def check_stages(stages: Sequence[Stage], names: Sequence[str]) -> None:

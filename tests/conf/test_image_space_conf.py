@@ -1,0 +1,99 @@
+"""Every image-space model x variant x legal loss composes from conf/, builds, and takes a step."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+from toy import scenes, square
+
+from posefilter.models.cnn_patch import CnnPatch
+from posefilter.models.downsized import Downsized
+from posefilter.models.image_space import ImageSpace
+from posefilter.models.patch_pf import PatchPF
+from posefilter.models.pixel_pf import PixelPF
+from posefilter.run.command import compose_job
+from posefilter.run.method import build_method, recipe
+
+CONF = Path(__file__).parents[2] / "conf"
+KINDS: dict[str, type[ImageSpace]] = {
+    "pixel_pf": PixelPF,
+    "patch_pf": PatchPF,
+    "cnn_patch": CnnPatch,
+    "downsized": Downsized,
+}
+SMALL = ["filter.particles=12", "filter.steps=2"]
+
+
+def build(tmp_path: Path, *overrides: str) -> ImageSpace:
+    job = compose_job("train", CONF, [*overrides, *SMALL], tmp_path)
+    method = build_method(recipe(job), square())
+    assert isinstance(method, ImageSpace)
+    return method
+
+
+def step(method: ImageSpace) -> dict[str, torch.Tensor]:
+    losses = method.train().training_losses(scenes(2), method.generator("train", 0))
+    total = torch.stack([value.mean() for value in losses.values()]).sum()
+    assert total.isfinite()
+    total.backward()
+    assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in method.parameters())
+    return losses
+
+
+@pytest.mark.parametrize("variant", ["paper", "working"])
+@pytest.mark.parametrize(("model", "loss"), [(m, loss) for m, kind in KINDS.items() for loss in kind.legal_losses])
+def test_every_legal_loss_takes_a_step(model: str, loss: str, variant: str, tmp_path: Path) -> None:
+    losses = step(build(tmp_path, f"model={model}", f"variant={variant}", f"loss={loss}"))
+    assert ("motion" in losses) == (variant == "working")
+    assert ("relevance" in losses) == (variant == "working")
+
+
+@pytest.mark.parametrize("model", KINDS)
+def test_the_papers_figures(model: str, tmp_path: Path) -> None:
+    job = compose_job("train", CONF, [f"model={model}", "variant=paper"], tmp_path)
+    want = {"pixel_pf": (1000, 10, 1), "patch_pf": (50, 100, 3), "cnn_patch": (50, 30, 9), "downsized": (50, 30, 9)}[model]
+    assert (job.cfg.filter.particles, job.cfg.filter.steps, job.cfg.patch) == want
+    assert job.choices["loss"] == {"pixel_pf": "add", "patch_pf": "bce"}.get(model, "chamfer")
+    assert (job.cfg.data.image_width == 160) == (model == "downsized")
+    method = build_method(recipe(job), square())
+    assert not method.lessons
+    assert not method.stages
+    assert method.train_filter is method.filter
+    batch_norms = sum(isinstance(m, torch.nn.modules.batchnorm._BatchNorm) for m in method.modules())
+    assert batch_norms == (12 if method.tells_pose else 3)
+
+
+REMEDIES = [
+    "context=none", "context=pyramid", "context=resnet18", "glimpse=integer", "normalisation=batch", "motion=unbounded",
+    "motion_lesson=none", "motion_lesson=center", "likelihood_lesson=none", "likelihood_lesson=focal", "stages=three",
+    "train_filter=same", "resample=never", "resample=guided", "initialise=from_relevance", "initialise=informed",
+    "propose=learned_and_gaussian", "patch=6",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("model", ["patch_pf", "downsized"])
+@pytest.mark.parametrize("change", REMEDIES)
+def test_each_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
+    method = build(tmp_path, f"model={model}", change)
+    step(method)
+    with torch.no_grad():
+        trace = method.eval().predict_step(scenes(2), 0)
+    assert trace.belief.best.isfinite().all()
+
+
+@pytest.mark.parametrize("change", ["pose_code=absolute", "pose_lesson=none", "estimate=densest_pose", "estimate=mean"])
+@pytest.mark.parametrize("model", ["pixel_pf", "patch_pf"])
+def test_each_pose_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
+    step(build(tmp_path, f"model={model}", change))
+
+
+def test_the_memorisation_test_shows_the_images_that_it_learned(tmp_path: Path) -> None:
+    job = compose_job("train", CONF, ["model=patch_pf", "experiment=memorise"], tmp_path)
+    assert job.choices["augment"] == "none"
+    data = job.cfg.data
+    assert data.split.test == data.split.val == "train"
+    assert data.limit_train == data.limit_test == data.limit_val
+    assert data.min_visibility == data.min_visibility_test
