@@ -85,6 +85,7 @@ class BopReader(BaseReader):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose bop or original")
         numbers_seen = {int(one.get("obj_id", 0)) for _, scene in scenes for gt in scene[0].values() for one in gt}
         self.objects = choose_objects(wanted, sorted(self._name(n) for n in numbers_seen if n > 0), base)
+        self._distrust_builtin()
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
         self._entries = [entry for folder, scene in scenes for entry in self._list_scene(base, folder, *scene)]
 

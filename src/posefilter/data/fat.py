@@ -66,6 +66,7 @@ class FatReader(BaseReader):
         super().__init__(root, meshes, on_error)
         self.eyes = tuple(eyes)
         self._native: dict[str, np.ndarray] = {}
+        self._ambiguous: dict[str, Path] = {}  # a folder whose frame of the class is not the first folder's
         folders = sorted(scene_folders(self.root, set(parts)))
         if not folders:
             raise UserError(f"{self.root}: no FAT scenes here: no folder with _object_settings.json and NNNNNN.left.json")
@@ -76,6 +77,8 @@ class FatReader(BaseReader):
         for number, (folder, one) in enumerate(settings):
             if one is not None:
                 self._entries += self._list_folder(number, folder, *one)
+        if objects is None:
+            self.objects = tuple(name for name in self.objects if any(e.record.object == name for e in self._entries))
 
     def records(self) -> list[FrameRecord]:
         """Return every object of every image, in a fixed order."""
@@ -85,6 +88,9 @@ class FatReader(BaseReader):
         """Return FAT's aligned frame from the mesh file's.  -> (4, 4) [m]."""
         if name not in self._native:
             raise UserError(f"{self.root}: no object settings of class '{name}'")
+        if name in self._ambiguous:
+            path = self._ambiguous[name] / "_object_settings.json"
+            raise UserError(f"{path}: another fixed_model_transform of '{name}' than in other folders")
         return self._native[name].copy()
 
     def read(self, i: int) -> Sample:
@@ -193,9 +199,7 @@ class FatReader(BaseReader):
         """Keep a class's frame, and see whether the mesh is the one that the cuboid was measured on."""
         known = self._native.setdefault(name, kind.aligned_from_mesh)
         if not np.allclose(known, kind.aligned_from_mesh, atol=1e-4):
-            raise UserError(
-                f"{folder / '_object_settings.json'}: another fixed_model_transform of '{name}' than in other folders"
-            )
+            self._ambiguous.setdefault(name, folder)
         mesh = None if self._geometry is None else self._geometry.mesh(name)
         if mesh is None or kind.dimensions is None or self._geometry is None:
             return

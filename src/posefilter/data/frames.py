@@ -60,6 +60,11 @@ class Reader(Protocol):
         ...
 
     @property
+    def examples(self) -> dict[str, str]:
+        """Return the first message for each of those reasons."""
+        ...
+
+    @property
     def notes(self) -> Counter[str]:
         """Return what else the log should say, with counts."""
         ...

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.data.frames import BadData, Sample
-from posefilter.data.meshes import MeshStore
+from posefilter.data.meshes import BUILTIN, MeshStore
 from posefilter.data.silhouette import Geometry
 
 
@@ -18,6 +18,7 @@ class BaseReader:
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
         self.skipped: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}  # of each reason to skip, the first message
         self.notes: Counter[str] = Counter()
         self._geometry = None if meshes is None else Geometry(meshes)
 
@@ -32,6 +33,13 @@ class BaseReader:
         if self.on_error != "skip":
             raise error
         self.skipped[error.cause] += 1
+        self.examples.setdefault(error.cause, str(error))
+
+    def _distrust_builtin(self) -> None:
+        """Take no silhouettes from builtin meshes: they are not the objects of real photographs."""
+        if self._geometry is not None and str(self._geometry.meshes.root) == BUILTIN:
+            self._geometry = None
+            self.notes["builtin meshes are not the objects of these photographs: visibility stays unknown"] = 1
 
     def _instance(
         self, name: str, poses: tuple[np.ndarray, ...], which: int, K: np.ndarray, mask: np.ndarray, path: Path

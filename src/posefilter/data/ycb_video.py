@@ -14,7 +14,7 @@ from scipy.io.matlab import MatReadError
 from posefilter.data import ycb
 from posefilter.data.decode import expect_size, numbers, read_color, read_depth, read_label
 from posefilter.data.frames import BadData, FrameRecord, NotShown, Sample
-from posefilter.data.meshes import BUILTIN, MeshStore
+from posefilter.data.meshes import MeshStore
 from posefilter.data.naming import choose_objects
 from posefilter.data.reader_base import BaseReader
 from posefilter.errors import UserError
@@ -63,15 +63,15 @@ class YCBVideoReader(BaseReader):
         usable = [c for c in self._classes if mesh_frame == "ycb_video" or c not in ycb.WITHOUT_GEOMETRY]
         self.objects = choose_objects(objects, usable if objects is None else self._classes, self.root)
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
-        if self._geometry is not None and str(self._geometry.meshes.root) == BUILTIN:
-            self._geometry = None
-            self.notes["builtin meshes are not the objects of these photographs: visibility stays unknown"] = 1
+        self._distrust_builtin()
         self._entries: list[_Entry] = []
         for scene_id, im_id, name, stem in self._frames(set(parts), frames):
             try:
                 self._entries += self._list_frame(scene_id, im_id, name, stem)
             except BadData as error:
                 self._leave_out(error)
+        if objects is None:
+            self.objects = tuple(name for name in self.objects if any(e.record.object == name for e in self._entries))
 
     def records(self) -> list[FrameRecord]:
         """Return every object of every image, in a fixed order."""
