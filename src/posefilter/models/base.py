@@ -18,6 +18,7 @@ from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.boxes import box_of_pose
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
@@ -86,6 +87,7 @@ class PoseEstimator(LightningModule):
         self.scores = nn.ModuleDict({"iou": BoxIoU(), "particles_on_object": ParticlesOnObject()})
         if self.tells_pose:
             self.scores["poses"] = PoseErrors([model])
+            self.scores["by_visibility"] = ErrorsByVisibility([model])
             self.scores["belief"] = BeliefQuality([model])
 
     def generator(self, stage: str, batch_number: int) -> Generator:
@@ -168,6 +170,7 @@ class PoseEstimator(LightningModule):
         self.scores["particles_on_object"].update(batch.mask, self.particle_pixels(trace.clouds[-1], batch))
         if self.tells_pose:
             self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
+            self.scores["by_visibility"].collect(trace.belief.best, batch.camera_from_object, batch.visibility)
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
@@ -193,6 +196,7 @@ class PoseEstimator(LightningModule):
         times = self.seconds_per_image
         out["seconds_per_image"] = sum(times) / len(times) if times else None
         out["belief"] = self.scores["belief"].compute() if self.tells_pose else None
+        out["by_visibility"] = self.scores["by_visibility"].compute() if self.tells_pose else None
         return out
 
     def _reset(self) -> None:

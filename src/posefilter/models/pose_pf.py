@@ -7,11 +7,13 @@ from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.metrics.collect import Average
+from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.models.lessons import Lesson
 from posefilter.nets.likelihood import Pixels, lay_out
 from posefilter.nets.proposals import Cells, Coordinates, ObjectCoordinateNet, coordinate_loss, draw_poses, measure_cells
-from posefilter.types import Batch, Cloud, Reading, Step
+from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 
 class PoseScene(NamedTuple):
@@ -38,6 +40,7 @@ class PosePF(PoseEstimator):
     """
 
     legal_losses = ("contrast", "regression")
+    judged_pixels, judged_at = 4096, 0.004  # for comparing the estimate with the truth: image points, noise level [m]
 
     def __init__(
         self,
@@ -102,6 +105,35 @@ class PosePF(PoseEstimator):
             losses["proposals"] = self.proposal_weight * fit
             self.watch("coordinate_error_mm", 1000 * error.mean())
         return losses
+
+    def adopt(self, model: ObjectModel) -> None:
+        """Learn which object it is about; count, too, how often the truth is outscored."""
+        super().adopt(model)
+        self.scores["truth_outscored"] = Average()
+        self.scores["truth_outscored_by_wrong"] = Average()
+
+    def score(self, trace: Trace, batch: Batch) -> None:
+        """Add a batch's errors, and whether the estimate scores higher than the truth does.
+
+        An estimate that climbed the score outscores the truth by a little even where it is right; what tells of a bad
+        likelihood is an estimate that does so and is wrong (ADD of 0.1 diameters or more).
+        """
+        super().score(trace, batch)
+        scene = self.observe(batch)
+        pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
+        generator = torch.Generator(device=self.device).manual_seed(self.seed)
+        scores = self.score_poses(scene, pair, self.judged_at, generator, self.judged_pixels)
+        outscored = scores[:, 0] > scores[:, 1]
+        wrong = add(trace.belief.best, batch.camera_from_object, self.model.points) > 0.1 * self.model.diameter
+        self.scores["truth_outscored"].collect(outscored.float())
+        self.scores["truth_outscored_by_wrong"].collect((outscored & wrong).float())
+
+    def results(self) -> dict[str, Any]:
+        """Return the metrics, with the shares of images in which the truth was outscored."""
+        out = super().results()
+        for name in ("truth_outscored", "truth_outscored_by_wrong"):
+            out["belief"][name] = float(self.scores[name].compute())
+        return out
 
     def _center(self) -> Tensor:
         return self.model.center.to(self.device)
