@@ -97,3 +97,23 @@ def test_the_memorisation_test_shows_the_images_that_it_learned(tmp_path: Path) 
     assert data.split.test == data.split.val == "train"
     assert data.limit_train == data.limit_test == data.limit_val
     assert data.min_visibility == data.min_visibility_test
+
+
+@pytest.mark.parametrize("sweep", ["ladder", "ladder_detect"])
+def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path: Path) -> None:
+    model = "patch_pf" if sweep == "ladder" else "cnn_patch"
+    rungs = (CONF / "sweep" / f"{sweep}.yaml").read_text().split("rung: paper,")[1].strip().split(",")
+    base = {v: compose_job("train", CONF, [f"model={model}", f"rung={v}"], tmp_path).choices for v in ("paper", "working")}
+    assert base["paper"]["variant"] == "paper"
+    before = base["paper"]
+    ignored = ("rung", "variant", "deviation", "sweep")
+    for rung in rungs:
+        job = compose_job("train", CONF, [f"model={model}", f"rung={rung}"], tmp_path)
+        choices = job.choices
+        if rung.startswith("c") or rung.endswith(("_c9_votes", "c9_own_point")):
+            against, before = before, choices
+        else:
+            against = base["working" if "m" in rung.split("_")[0][:1] or "_m" in rung else "paper"]
+        changed = {k for k in choices if choices[k] != against.get(k) and k not in ignored and not k.startswith("hydra")}
+        assert rung == "working" or changed, rung
+        assert len(changed) == 1 or rung.endswith("own_point") or rung == "working", (rung, changed)

@@ -75,7 +75,7 @@ class ImageSpace(PoseEstimator):
         self.bounds = bounds
         self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
         self.stages = tuple(stages or ())
-        check_stages(self.stages, ["loss", "relevance", *self.lessons])
+        check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
         self.relevance_weight, self.truncate = relevance, truncate
         if object_model is not None:  # not in the base, where the pose code is not there yet
             self.adopt(object_model)
