@@ -122,9 +122,9 @@ class PasteOccluder:
         half_w, half_h = rng.uniform(*self.size, 2) * width
         angle = rng.uniform(0, np.pi)
         y, x = np.mgrid[:height, :width].astype(np.float32)
-        x, y = x - cols[at], y - rows[at]
-        a = (x * np.cos(angle) + y * np.sin(angle)) / half_w
-        b = (-x * np.sin(angle) + y * np.cos(angle)) / half_h
+        right, down = x - cols[at], y - rows[at]
+        a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
+        b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
         mask = sample.mask & ~patch
         if mask.sum() < self.keep * sample.mask.sum():

@@ -50,7 +50,7 @@ class PoseEstimator(LightningModule):
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
         self._object_model: ObjectModel | None = None
-        self.scores: nn.ModuleDict = nn.ModuleDict()
+        self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
         if object_model is not None:
@@ -143,11 +143,11 @@ class PoseEstimator(LightningModule):
 
     # -- validation and test -------------------------------------------------------------------------------------------
 
-    def validation_step(self, batch: Batch, batch_number: int) -> Trace:
+    def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]  # callbacks look at it
         """Run the filter and collect its errors."""
         return self._judge(batch, "validate", batch_number)
 
-    def test_step(self, batch: Batch, batch_number: int) -> Trace:
+    def test_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
         """Run the filter and collect its errors; callbacks write the belief down."""
         return self._judge(batch, "test", batch_number)
 

@@ -4,10 +4,10 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
+from torchmetrics import MeanMetric
 
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.collect import Average
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.models.lessons import Lesson
@@ -109,8 +109,8 @@ class PosePF(PoseEstimator):
     def adopt(self, model: ObjectModel) -> None:
         """Learn which object it is about; count, too, how often the truth is outscored."""
         super().adopt(model)
-        self.scores["truth_outscored"] = Average()
-        self.scores["truth_outscored_by_wrong"] = Average()
+        self.scores["truth_outscored"] = MeanMetric()
+        self.scores["truth_outscored_by_wrong"] = MeanMetric()
 
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
@@ -125,8 +125,8 @@ class PosePF(PoseEstimator):
         scores = self.score_poses(scene, pair, self.judged_at, generator, self.judged_pixels)
         outscored = scores[:, 0] > scores[:, 1]
         wrong = add(trace.belief.best, batch.camera_from_object, self.model.points) > 0.1 * self.model.diameter
-        self.scores["truth_outscored"].collect(outscored.float())
-        self.scores["truth_outscored_by_wrong"].collect((outscored & wrong).float())
+        self.scores["truth_outscored"].update(outscored.float())
+        self.scores["truth_outscored_by_wrong"].update((outscored & wrong).float())
 
     def results(self) -> dict[str, Any]:
         """Return the metrics, with the shares of images in which the truth was outscored."""
