@@ -121,8 +121,8 @@ class PasteOccluder:
         at = rng.integers(len(rows))
         half_w, half_h = rng.uniform(*self.size, 2) * width
         angle = rng.uniform(0, np.pi)
-        y, x = np.mgrid[:height, :width].astype(np.float32)
-        right, down = x - cols[at], y - rows[at]
+        down, right = np.mgrid[:height, :width].astype(np.float32)
+        right, down = right - cols[at], down - rows[at]
         a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
         b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
@@ -172,8 +172,8 @@ class DepthNoise:
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with noisy depth; unknown pixels stay unknown."""
         d = sample.depth
-        grain = rng.normal(size=(d.shape[0] // 2, d.shape[1] // 2)).astype(np.float32)
-        grain = cv2.resize(grain, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        coarse = rng.normal(size=(d.shape[0] // 2, d.shape[1] // 2)).astype(np.float32)
+        grain = cv2.resize(coarse, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
         noisy = d * (1 + rng.normal() * self.scale) + d * d * grain * (self.noise * rng.uniform())
         return dataclasses.replace(sample, depth=np.where(d > 0, noisy, 0).astype(np.float32))
 

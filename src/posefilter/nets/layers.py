@@ -6,6 +6,13 @@ import torch
 from torch import Tensor, nn
 
 
+def fast_bfloat16(device: torch.device) -> bool:
+    """Tell whether bfloat16 is worth while on a device: where the processor only emulates it, it is several times slower."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
 def fourier(x: Tensor, octaves: int) -> Tensor:
     """Append sines and cosines of doubling frequencies, the first of period 2.  (*, D) -> (*, D (1 + 2 octaves))."""
     angles = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))

@@ -112,7 +112,8 @@ class PoseLikelihood(nn.Module):
         """Score poses at noise levels.  poses (B, N, 4, 4), sigma (B,) or () [m] -> (B, N)."""
         B = poses.shape[0]
         noise = torch.randn(B, 1, pixels, 2, generator=generator, device=poses.device)
-        points = look(image, poses, center, radius, noise)
+        with torch.autocast(poses.device.type, enabled=False):  # half a millimetre is lost on a pose in half precision
+            points = look(image, poses, center, radius, noise)
         level = self.level(sigma.expand(B))
         judged = torch.where(points.inside, self.judge(points, level, radius), self.outside(level)[:, None])
         too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])  # [m]: nothing is seen closer than that

@@ -28,6 +28,7 @@ class PaperLikelihood(nn.Module):
     ) -> Tensor:
         """Score poses.  poses (B, N, 4, 4) -> (B, N); `sigma` is not used."""
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)
-        points = look(image, poses, center, radius, noise, self.spread)
-        judged = self.judge_samples(points.position + center, points.color)
+        with torch.autocast(poses.device.type, enabled=False):
+            points = look(image, poses, center, radius, noise, self.spread)
+            judged = self.judge_samples(points.position + center, points.color)
         return torch.where(points.inside & points.known, judged, 0.0).sum(-1)

@@ -12,7 +12,7 @@ from torch import Generator, Tensor, nn
 
 from posefilter.geometry.camera import back_project, pixel_grid, rays
 from posefilter.geometry.pose import fit_rigid
-from posefilter.nets.layers import ResBlock, conv_norm
+from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
 
 STRIDE = 8  # pixels a cell
 
@@ -82,7 +82,7 @@ class ObjectCoordinateNet(nn.Module):
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
         """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8."""
         geometry = self._geometry(depth, K)
-        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32):
+        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=fast_bfloat16(rgb.device)):
             x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
             x8 = self.down8(self.down4(self.enter(torch.cat([x, geometry], dim=1))))
             x16 = self.down16(x8)
