@@ -1,0 +1,101 @@
+"""How the filter fares, iteration by iteration: effective particles, spread, noise level and best log-likelihood."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from posefilter.contracts import Space
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.metrics.beliefs import spread
+from posefilter.pictures.canvas import rasterise, save_picture
+from posefilter.pictures.curves import draw_health
+from posefilter.types import Trace
+
+
+class FilterHealth(Callback):
+    """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one figure.
+
+    folder: where the figure is written too (null: nowhere); most: iterations that become scalars, evenly chosen.
+    """
+
+    def __init__(self, folder: str | Path | None = None, most: int = 20) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.most = most
+        self._sums: dict[str, torch.Tensor] = {}
+        self._images = 0
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forget the last validation."""
+        self._sums, self._images = {}, 0
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        """Take in one batch."""
+        if trainer.sanity_checking or not isinstance(outputs, Trace):
+            return
+        space: Any = pl_module.space
+        for name, values in health(outputs, space).items():
+            total = values.sum(0).cpu()
+            self._sums[name] = self._sums[name] + total if name in self._sums else total
+        self._images += len(outputs.belief.best)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the means."""
+        curves = self.curves()
+        if not curves or not trainer.is_global_zero:
+            return
+        for logger in trainer.loggers:
+            logger.log_metrics(scalars(curves, self.most), trainer.global_step)
+        picture = rasterise(draw_health(curves, self._images, f"Filter health at step {trainer.global_step}"))
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.experiment.add_image("filter/health", picture, trainer.global_step, dataformats="HWC")
+        if self.folder is not None:
+            save_picture(picture, self.folder / "filter_health.png")
+
+    def curves(self) -> dict[str, list[float]]:
+        """Return the means over the images by name, one number an iteration."""
+        return {name: (total / self._images).tolist() for name, total in self._sums.items()}
+
+
+def health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
+    """Return each image's numbers by name, (B, T) each.
+
+    ess: 1 / sum w^2 over the number of particles, in (0, 1]; spread_*: weighted root mean square distance from the mean;
+    sigma_*: noise level; best_log_likelihood: of the image's best particle.
+    """
+    steps: list[dict[str, torch.Tensor]] = []
+    for cloud, reading, step in zip(trace.clouds, trace.readings, trace.steps, strict=True):
+        state, log_weights = cloud.state.detach(), cloud.log_weights.detach().float()
+        weights = log_weights.exp()
+        row = {"ess": 1 / weights.square().sum(1) / weights.shape[1]}
+        if isinstance(space, PoseSpace):
+            row["spread_m"], row["spread_rad"] = spread(state, log_weights, space)
+        else:
+            mean = space.mean(state, weights)[:, None]
+            row["spread_px"] = (weights * space.distance(state, mean).square()).sum(1).sqrt()
+        unit = "m" if isinstance(space, PoseSpace) else "px"
+        row[f"sigma_{unit}"] = step.sigma.detach().to(weights).expand(len(weights))
+        row["best_log_likelihood"] = reading.log_likelihood.detach().float().max(1).values
+        steps.append(row)
+    return {name: torch.stack([row[name] for row in steps], dim=1).double() for name in steps[0]}
+
+
+def scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
+    """Return curves as scalars with names that sort, `filter/ess/step_03`: `most` of each, evenly chosen."""
+    out: dict[str, float] = {}
+    for name, values in curves.items():
+        for step in evenly(len(values), most):
+            out[f"filter/{name}/step_{step:02d}"] = values[step]
+    return out
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """Return at most `most` indices below `count`, evenly spread, the first and the last among them."""
+    if count <= most:
+        return list(range(count))
+    return sorted({round(i * (count - 1) / (most - 1)) for i in range(most)}) if most > 1 else [count - 1]
