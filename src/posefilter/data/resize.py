@@ -47,12 +47,15 @@ def resize(sample: Sample, height: int, width: int) -> Sample:
 
 
 def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the pixels of which the mask covers more than half; the nearest decides a tie.  -> (height, width) bool."""
+    """Return the pixels of which the mask covers more than half.  -> (height, width) bool.
+
+    Ties are decided as on a chess board: the nearest old pixel would shift masks by a sixth of a pixel at half the size.
+    """
     shrinks = height <= mask.shape[0] and width <= mask.shape[1]
-    size = (width, height)
-    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    nearest = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
-    return (share > 0.5 + 1e-4) | ((share > 0.5 - 1e-4) & nearest)
+    interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=interpolation)
+    even = (np.arange(height)[:, None] + np.arange(width)) % 2 == 0
+    return (share > 0.5 + 1e-4) | ((share > 0.5 - 1e-4) & even)
 
 
 def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:

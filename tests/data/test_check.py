@@ -1,0 +1,149 @@
+"""The dataset check: silent on a true dataset, and names the cause of each way to get one wrong."""
+
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+from dataset_trees import HIGH, LOW, K, bop_scene, pose, write_mesh, ycb_frame
+
+from posefilter.data import ycb
+from posefilter.data.bop import BopReader
+from posefilter.data.check import check_dataset, format_report
+from posefilter.data.meshes import MeshStore
+from posefilter.data.ycb_video import YCBVideoReader
+from posefilter.errors import UserError
+
+NAME = "003_cracker_box"
+NATIVE = ycb.ycbvideo_from_original(NAME)
+POSES = [pose((0.2 + 0.5 * k, 0.3 * k - 0.7, 0.4), (0.05 - 0.03 * k, 0.01 * k - 0.02, 0.42 + 0.02 * k)) for k in range(4)]
+FRONT = pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.33))
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    write_mesh(folder, NAME)
+    return MeshStore(write_mesh(folder, "obj_000002"))
+
+
+def tree(root, native=NATIVE, **change):
+    for k, each in enumerate(POSES):
+        ycb_frame(root / "0001" / f"{k + 1:06d}", [(2, each), (3, FRONT)], native, **change)
+    return root
+
+
+def check(root, meshes, **how):
+    return check_dataset(YCBVideoReader(root, NAME, meshes, **how), meshes)
+
+
+def test_a_true_dataset_passes(tmp_path, meshes):
+    reader = YCBVideoReader(tree(tmp_path), NAME, meshes)
+    report = check_dataset(reader, meshes, out=tmp_path / "out")
+    (row,) = report["objects"]
+    assert set(report) == {"objects", "problems"}
+    assert set(row) == {"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}
+    assert report["problems"] == []
+    assert (row["object"], row["frames"]) == (NAME, 4)
+    assert row["silhouette_iou"] > 0.99
+    assert row["depth_error_mm"] < 0.1
+    assert 0.4 < row["visible_share"] < 1
+    assert json.loads((tmp_path / "out" / "data_report.json").read_text()) == report
+    sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
+    assert sheet.shape == (2 * 276, 3 * 512, 3)
+    assert NAME in format_report(report)
+    assert "no problems" in format_report(report)
+
+
+def scaled(factor):
+    def change(poses):
+        out = poses.copy()
+        out[:, 3] *= factor
+        return out
+
+    return change
+
+
+def inverted(poses):
+    out = np.zeros_like(poses)
+    for k in range(poses.shape[2]):
+        out[..., k] = np.linalg.inv(np.vstack([poses[..., k], [0, 0, 0, 1]]))[:3]
+    return out
+
+
+def wide(factor):
+    out = K.copy()
+    out[:2] *= factor
+    out[:2, 2] += (factor - 1) / 2
+    return out
+
+
+WRONG = {
+    "depth x 10": ({"factor_depth": 1000.0}, "depth is 10 times"),
+    "depth x 0.1": ({"factor_depth": 100_000.0}, "depth is 0.1 times"),
+    "depth x 1000": ({"factor_depth": 10.0}, "depth is 1000 times"),
+    "millimetres": ({"poses": scaled(1000)}, "translations are in millimetres"),
+    "centimetres": ({"poses": scaled(100)}, "translations are in centimetres"),
+    "kilometres": ({"poses": scaled(0.001)}, "translations are too small by a factor of 1000"),
+    "inverse": ({"poses": inverted}, "wrong way round"),
+    "frame": ({"native": np.eye(4)}, "poses are of the mesh file's frame already|google_16k\\) frame"),
+    "640 wide": ({"K": wide(4.0)}, "intrinsics belong to pictures 640 px wide, not 160"),
+    "half pixel": ({"K": K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])}, r"off by \+0\.5 px: pixel corners"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_the_cause_is_named(tmp_path, meshes, case):
+    change, words = WRONG[case]
+    report = check(tree(tmp_path, **{"native": NATIVE, **change}), meshes)
+    assert len(report["problems"]) == 1, report
+    assert re.search(words, report["problems"][0]), report["problems"]
+
+
+def test_two_causes_at_once(tmp_path, meshes):
+    report = check(tree(tmp_path, poses=scaled(1000), factor_depth=1000.0), meshes)
+    assert "millimetres" in report["problems"][0]
+    assert "depth is 10 times" in report["problems"][1]
+
+
+def test_models_of_the_other_frame(tmp_path, meshes):
+    report = check(tree(tmp_path), meshes, mesh_frame="ycb_video")
+    assert "YCB-Video's object frame, meshes in the original" in report["problems"][0]
+
+
+def test_a_centred_frame_is_named(tmp_path, meshes):
+    center = np.eye(4)
+    center[:3, 3] = (LOW + HIGH) / 2
+    bop_scene(tmp_path / "000001", [[(2, each @ center)] for each in POSES])
+    for folder in (tmp_path / "000001",):  # pixels show the mesh at `each @ center`; let the file say the centre's pose
+        content = json.loads((folder / "scene_gt.json").read_text())
+        for k, each in enumerate(POSES):
+            content[str(k)][0]["cam_t_m2c"] = ((each @ center @ center)[:3, 3] * 1000).tolist()
+        (folder / "scene_gt.json").write_text(json.dumps(content))
+    report = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)
+    assert "centre of the bounding box" in report["problems"][0]
+
+
+def test_a_wrong_mesh_is_a_problem_without_a_cause(tmp_path, meshes):
+    wrong = write_mesh(tmp_path / "wrong", NAME)
+    path = wrong / NAME / "google_16k" / "textured.obj"
+    path.write_text(path.read_text().replace("0.17", "0.11").replace("0.12", "0.07"))
+    report = check(tree(tmp_path / "data"), MeshStore(wrong))
+    assert "no cause that was tried explains it" in report["problems"][0]
+    assert report["objects"][0]["silhouette_iou"] < 0.9
+
+
+def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):
+    tree(tmp_path)
+    victim = tmp_path / "0001" / "000002-color.png"
+    victim.write_bytes(victim.read_bytes()[:500])
+    report = check(tmp_path, meshes)
+    assert "000002-color.png: truncated" in report["problems"][0]
+    assert report["objects"][0]["frames"] == 3
+    reader = YCBVideoReader(tmp_path, "004_sugar_box", meshes)
+    missing = check_dataset(reader, meshes)
+    assert "004_sugar_box: no mesh of this name" in missing["problems"][0]
+    assert missing["objects"][0]["silhouette_iou"] is None
+    with pytest.raises(UserError, match="limit=0"):
+        check_dataset(reader, meshes, limit=0)

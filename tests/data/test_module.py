@@ -1,0 +1,308 @@
+"""The data module: splits by scene, resizing with the camera, caches, epochs, broken files."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from dataset_trees import HEIGHT, WIDTH, K, bop_scene, fat_folder, fat_frame, fat_tree, pose, truth, write_mesh
+from torch.utils.data import default_collate
+
+from posefilter.data.meshes import MeshStore
+from posefilter.data.module import PoseDataModule
+from posefilter.data.resize import network_size, resize_depth, resize_mask
+from posefilter.errors import UserError
+from posefilter.geometry.camera import resize_intrinsics
+from posefilter.types import Batch
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    root = tmp_path_factory.mktemp("fat")
+    write_mesh(root / "meshes", "toy")
+    return fat_tree(root / "data", scenes=6, frames=3).parent
+
+
+def module(root, **how):
+    settings = {"source": "fat", "root": root / "data", "object": "toy", "meshes": root / "meshes", "progress": False}
+    return PoseDataModule(**{**settings, **how})
+
+
+def test_scenes_are_never_cut_and_the_seed_decides(root):
+    splits = {}
+    for seed in (0, 0, 1, 2):
+        dm = module(root, split={"train": 0.5, "val": 0.2, "test": 0.3}, split_seed=seed)
+        parts = {name: {r.group for r in dm.records(name)} for name in ("train", "val", "test")}
+        assert sum(len(p) for p in parts.values()) == len(set().union(*parts.values())) == 6
+        assert [len(parts[name]) for name in ("train", "val", "test")] == [3, 1, 2]
+        recorded = dm.split_record()
+        assert {name: set(scenes) for name, scenes in recorded.items()} == parts
+        assert all(frames == 3 for scenes in recorded.values() for frames in scenes.values())
+        splits.setdefault(seed, []).append(json.dumps(recorded))
+    assert splits[0][0] == splits[0][1]
+    assert len({splits[seed][0] for seed in splits}) > 1
+
+
+def test_scenes_by_name_lists_and_the_rest(root, tmp_path):
+    (root / "data" / "list.txt").write_text("mixed/kitchen_5/000001.left\n")
+    dm = module(root, split={"test": "list.txt", "val": ["kitchen_4"], "train": 1.0})
+    assert [r.name for r in dm.records("test")] == ["mixed/kitchen_5/000001.left"]
+    assert {r.group for r in dm.records("val")} == {"kitchen_4"}
+    assert {r.group for r in dm.records("train")} == {f"kitchen_{i}" for i in range(4)}  # not the rest of kitchen_5
+    assert len(module(root, split={"test": 1.0}).records("test")) == 18
+    for split, words in (
+        ({"train": 0.9, "test": 0.3}, "sum to 1"),
+        ({"test": ["attic_*"]}, "no scene 'attic_"),
+        ({"test": "nolist.txt"}, "no such list"),
+        ({"testing": 0.5}, "unknown part 'testing'"),
+        ({"train": ["kitchen_1"], "test": ["kitchen_?"]}, "in both"),
+    ):
+        with pytest.raises(UserError, match=words):
+            module(root, split=split).setup()
+
+
+def test_too_few_scenes_say_so(tmp_path):
+    fat_tree(tmp_path, scenes=2)
+    with pytest.raises(UserError, match="2 scenes cannot be divided into train, val, test"):
+        PoseDataModule("fat", tmp_path, "toy").setup()
+
+
+def test_bop_targets_choose_frames(tmp_path):
+    bop_scene(tmp_path / "000048", [[(2, pose())], [(2, pose())]])
+    (tmp_path / "targets.json").write_text(json.dumps([{"scene_id": 48, "im_id": 1, "obj_id": 2, "inst_count": 1}]))
+    dm = PoseDataModule("bop", tmp_path, "obj_000002", split={"test": "targets.json"})
+    assert [r.im_id for r in dm.records("test")] == [1]
+
+
+def test_a_batch_is_the_truth_at_network_size(root):
+    dm = module(root, image_width=80, split={"test": 1.0}, batch_size=4)
+    batch = next(iter(dm.test_dataloader()))
+    assert isinstance(batch, Batch)
+    assert batch.rgb.shape == (4, 3, 60, 80)
+    assert batch.rgb.dtype == torch.float32
+    assert 0.3 < float(batch.rgb.max()) <= 1
+    assert batch.frame_id.tolist() == [0, 1, 2, 3]
+    small = resize_intrinsics(torch.from_numpy(K), 0.5, 0.5)
+    for k in range(4):
+        record = dm.records("test")[int(batch.frame_id[k])]
+        native = dm.reader.read(next(i for i, r in enumerate(dm.reader.records()) if r == record))
+        np.testing.assert_allclose(batch.camera_from_object[k], native.camera_from_object)
+        np.testing.assert_allclose(batch.intrinsics[k], small, atol=1e-4)
+        expected = truth(native.camera_from_object.astype(float), small.numpy(), 60, 80)
+        mask = batch.mask[k, 0].numpy()
+        assert (mask & (expected > 0)).sum() / (mask | (expected > 0)).sum() > 0.97
+        inner = mask & (expected > 0)
+        assert np.median(np.abs(batch.depth[k, 0].numpy() - expected)[inner]) < 1.2e-4
+        slipped = truth(native.camera_from_object.astype(float), K * [[0.5], [0.5], [1.0]], 60, 80)
+        both = inner & (slipped > 0)
+        if k > 0:  # canary: half a pixel would show (the first face is frontal)
+            assert np.median(np.abs(batch.depth[k, 0].numpy() - slipped)[both]) > 2e-4
+    torch.testing.assert_close(batch.visibility, torch.ones(4), atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("size", [(60, 80), (40, 53), (96, 128), (240, 320)])
+def test_depth_of_an_oblique_plane_stays_exact(size):
+    def plane(camera, height, width):
+        v, u = np.mgrid[:height, :width]
+        rays = np.stack([(u - camera[0, 2]) / camera[0, 0], (v - camera[1, 2]) / camera[1, 1], np.ones(u.shape)], -1)
+        return 0.6 / (rays @ np.array([0.5, -0.4, 0.75]))
+
+    old = plane(K, HEIGHT, WIDTH).astype(np.float32)
+    camera = resize_intrinsics(torch.from_numpy(K), size[1] / WIDTH, size[0] / HEIGHT).numpy()
+    error = np.abs(resize_depth(old, *size) - plane(camera, *size))[1:-1, 1:-1]
+    assert error.max() < 1e-4
+
+
+def test_depth_is_not_mixed_across_edges_or_holes():
+    depth = np.full((8, 8), 0.5, np.float32)
+    depth[:, 3:] = 1.0
+    depth[5:, :] = 0
+    assert set(np.unique(resize_depth(depth, 4, 4)).tolist()) <= {0.0, 0.5, 1.0}
+    assert set(np.unique(resize_depth(depth, 5, 7)).tolist()) <= {0.0, 0.5, 1.0}
+
+
+def test_masks_keep_their_area():
+    v, u = np.mgrid[:120, :160]
+    disc = (u - 81.3) ** 2 + (v - 55.8) ** 2 < 37.0**2
+    for height, width in ((60, 80), (40, 53), (45, 60)):
+        small = resize_mask(disc, height, width)
+        assert small.sum() / (height * width) == pytest.approx(disc.mean(), rel=0.01)
+        rows, columns = np.nonzero(small)
+        before = np.mean(np.nonzero(disc), axis=1)
+        expected = (before + 0.5) * [height / 120, width / 160] - 0.5
+        np.testing.assert_allclose([rows.mean(), columns.mean()], expected, atol=0.07)
+
+
+def test_sizes():
+    assert network_size(480, 640, 320, None) == (240, 320)
+    assert network_size(540, 960, None, 270) == (270, 480)
+    assert network_size(480, 640, None, None) == (480, 640)
+    with pytest.raises(UserError, match="stretch"):
+        network_size(480, 640, 320, 320)
+
+
+def test_caches_agree_and_disk_notices_change(root, tmp_path):
+    def batch(kind):
+        dm = module(root, image_width=80, split={"test": 1.0}, batch_size=18, cache=kind, cache_dir=tmp_path / "cache")
+        return next(iter(dm.test_dataloader()))
+
+    first = batch("memory")
+    for kind in ("none", "disk", "disk"):
+        for a, b in zip(first, batch(kind), strict=True):
+            torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+
+
+def test_disk_cache_is_used_and_renewed(tmp_path, monkeypatch):
+    fat_tree(tmp_path / "data", scenes=1, frames=2)
+    how = {"source": "fat", "root": tmp_path / "data", "object": "toy", "split": {"test": 1.0}, "cache": "disk"}
+    first = PoseDataModule(**how).test_dataset[0]
+    fresh = PoseDataModule(**how)
+    monkeypatch.setattr(type(fresh.reader), "read", lambda self, i: pytest.fail("decoded although cached"))
+    torch.testing.assert_close(fresh.test_dataset[0].rgb, first.rgb)
+    monkeypatch.undo()
+    other = pose((0.9, 0.1, 0.2), (0.02, 0.01, 0.5))
+    fat_frame(tmp_path / "data" / "mixed" / "kitchen_0", 0, [("toy", 24, other)])
+    renewed = PoseDataModule(**how).test_dataset[0]
+    np.testing.assert_allclose(renewed.camera_from_object, other, atol=1e-6)
+    np.testing.assert_array_equal(renewed.mask[0].numpy(), truth(other) > 0)
+
+
+def test_visibility_filters_training_and_test_apart(tmp_path):
+    write_mesh(tmp_path / "meshes", "toy")
+    front = pose((0.1, 0.2, 0.3), (0.04, -0.02, 0.33))
+    for s in range(4):
+        folder = fat_folder(tmp_path / "data" / "mixed" / f"kitchen_{s}", {"toy": 24, "other": 36})
+        fat_frame(folder, 0, [("toy", 24, pose())])
+        fat_frame(folder, 1, [("toy", 24, pose()), ("other", 36, front)])
+    dm = PoseDataModule(
+        "fat",
+        tmp_path / "data",
+        "toy",
+        tmp_path / "meshes",
+        split={"train": 0.5, "test": 0.5},
+        min_visibility=0.9,
+        progress=False,
+    )
+    assert [r.name[-11:] for r in dm.records("train")] == ["000000.left"] * 2
+    assert len(dm.records("test")) == 4
+    assert dm.describe()["splits"]["train"]["left_out"] == {"visibility below 0.9": 2}
+
+
+def test_smaller_limits_take_a_part_of_larger_ones(root):
+    names = {}
+    for limit in (2, 5, 9):
+        dm = module(root, split={"train": 0.7, "test": 0.3}, limit_train=limit)
+        names[limit] = [r.key for r in dm.records("train")]
+        assert len(names[limit]) == limit
+        assert len(dm.records("test")) == 6
+    assert names[9][:5] == names[5]
+    assert names[5][:2] == names[2]
+
+
+def shade(sample, draw, rng):
+    other = draw(rng)
+    return dataclasses.replace(sample, rgb=np.full_like(sample.rgb, rng.integers(256)), visibility=float(other.frame_id))
+
+
+def epoch_of(dm, epoch):
+    loader = dm.train_dataloader()
+    loader.sampler.set_epoch(epoch)  # as Lightning does
+    return default_collate([item for batch in loader for item in map(Batch._make, zip(*batch, strict=True))])
+
+
+def test_augmentation_depends_on_seed_epoch_and_frame_alone(root):
+    def run(workers, seed, epoch):
+        how = {"split": {"train": 0.7, "test": 0.3}, "augment": shade, "batch_size": 3, "workers": workers, "seed": seed}
+        dm = module(root, image_width=80, **how)
+        batch = epoch_of(dm, epoch)
+        order = batch.frame_id.argsort()
+        return batch.frame_id.tolist(), [
+            f[order][:, 0, 0, 0].tolist() if f.ndim == 4 else f[order].tolist() for f in (batch.rgb, batch.visibility)
+        ]
+
+    order, values = run(0, 0, 3)
+    assert run(2, 0, 3) == (order, values)
+    assert sorted(order) == list(range(12))
+    assert run(0, 0, 4)[0] != order
+    assert run(0, 0, 4)[1] != values
+    assert run(0, 1, 3)[1] != values
+
+
+def test_workers_that_persist_see_the_epoch_change(root):
+    dm = module(root, image_width=80, split={"train": 1.0}, augment=shade, batch_size=18, workers=1)
+    loader = dm.train_dataloader()
+    shades = []
+    for epoch in (0, 1, 0):
+        loader.sampler.set_epoch(epoch)
+        (batch,) = list(loader)
+        shades.append(batch.rgb[batch.frame_id.argsort()][:, 0, 0, 0])
+    assert not torch.equal(shades[0], shades[1])
+    assert torch.equal(shades[0], shades[2])
+
+
+def test_validation_and_test_are_not_augmented(root):
+    dm = module(root, split={"train": 0.5, "val": 0.2, "test": 0.3}, augment=shade)
+    assert float(dm.train_dataset[0].rgb.std()) < 1e-6
+    assert float(dm.val_dataset[0].rgb.std()) > 0.01
+    assert float(dm.test_dataset[0].rgb.std()) > 0.01
+
+
+def test_broken_frames_raise_or_are_counted(tmp_path):
+    fat_tree(tmp_path, scenes=1, frames=4)
+    victim = tmp_path / "mixed" / "kitchen_0" / "000002.left.depth.png"
+    victim.write_bytes(victim.read_bytes()[:300])
+    how = {"source": "fat", "root": tmp_path, "object": "toy", "split": {"test": 1.0}}
+    with pytest.raises(UserError, match=r"000002\.left\.depth\.png: truncated.*on_error=skip"):
+        PoseDataModule(**how).setup("test")
+    dm = PoseDataModule(**how, on_error="skip")
+    assert [r.im_id for r in dm.records("test")] == [0, 1, 3]
+    assert dm.describe()["splits"]["test"] == {"frames": 3, "scenes": 1, "left_out": {"truncated or corrupt image": 1}}
+
+
+def test_scenes_are_rendered_where_they_are_missing(tmp_path):
+    calls = []
+
+    def generate(out):
+        calls.append(out)
+        fat_tree(out, scenes=3)
+
+    dm = PoseDataModule("scenes", tmp_path / "new", "toy", generate=generate)
+    for _ in range(2):
+        dm.prepare_data()
+    assert calls == [tmp_path / "new"]
+    (tmp_path / "new" / "_generator.json").write_text(json.dumps({"frames": 10}))  # nine are there: it was cut short
+    dm.prepare_data()
+    assert len(calls) == 2
+    with pytest.raises(UserError, match="no scenes here"):
+        PoseDataModule("scenes", tmp_path / "none", "toy").prepare_data()
+
+
+def test_object_models_and_published_points(root, tmp_path):
+    dm = module(root, split={"test": 1.0}, points=500)
+    assert dm.object_model(0).points.shape == (500, 3)
+    native = dm.reader.native_from_mesh("toy")
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    (tmp_path / "toy").mkdir()
+    np.savetxt(tmp_path / "toy" / "points.xyz", points @ native[:3, :3].T + native[:3, 3])
+    published = module(root, split={"test": 1.0}, model_points=tmp_path).object_model(0).points
+    np.testing.assert_allclose(published, points, atol=1e-6)
+    with pytest.raises(UserError, match=r"no toy/points\.xyz"):
+        module(root, model_points=tmp_path / "none").object_model(0)
+
+
+def test_wrong_settings_are_named(root):
+    with pytest.raises(UserError, match=r"data\.source=fats"):
+        module(root, source="fats").setup()
+    with pytest.raises(UserError, match=r"data\.cache=ram"):
+        module(root, cache="ram")
+    with pytest.raises(UserError, match="'flavour'"):
+        module(root, options={"flavour": 1}).setup()
+    with pytest.raises(UserError, match=r"data\.on_error=ignore"):
+        module(root, on_error="ignore").setup()
+
+
+def test_an_open_mesh_store_may_be_given(root):
+    dm = module(root, meshes=MeshStore(root / "meshes"), split={"test": 1.0})
+    assert dm.objects == ("toy",)
+    assert dm.object_model(0).name == "toy"

@@ -1,0 +1,135 @@
+"""The YCB-Video reader against analytic truth: frames, labels, lists, and what is listed but not shown."""
+
+import numpy as np
+import pytest
+import scipy.io
+from dataset_trees import HEIGHT, WIDTH, K, pose, truth, write_png, ycb_frame
+
+from posefilter.data import ycb
+from posefilter.data.frames import BadData, NotShown
+from posefilter.data.ycb_video import YCBVideoReader
+from posefilter.errors import UserError
+
+NAME = "003_cracker_box"
+NATIVE = ycb.ycbvideo_from_original(NAME)
+
+
+@pytest.fixture
+def root(tmp_path):
+    for scene in ("0048", "0050"):
+        for frame in (1, 2):
+            ycb_frame(tmp_path / "data" / scene / f"{frame:06d}", [(2, pose((0.1 * frame, 0.2, 0.3)))], NATIVE)
+    ycb_frame(tmp_path / "data_syn" / "000123", [(2, pose())], NATIVE, syn=True)
+    (tmp_path / "image_sets").mkdir()
+    (tmp_path / "image_sets" / "keyframe.txt").write_text("0048/000002\n0050/000001\n0099/000001\n")
+    return tmp_path
+
+
+def test_pose_is_of_the_original_mesh_frame(root):
+    reader = YCBVideoReader(root, NAME)
+    sample = reader.read(0)
+    expected = pose((0.1, 0.2, 0.3))
+    np.testing.assert_allclose(sample.camera_from_object, expected, atol=1e-6)
+    np.testing.assert_array_equal(sample.mask, truth(expected) > 0)
+    np.testing.assert_allclose(sample.intrinsics, K, atol=1e-4)
+    assert np.abs(sample.depth - np.where(sample.mask, truth(expected), 0.9)).max() < 0.6e-4
+    record = reader.records()[0]
+    assert (record.scene_id, record.im_id, record.obj_id, record.group, record.name) == (48, 1, 2, "0048", "0048/000001")
+    raw = scipy.io.loadmat(record.files[3])["poses"][..., 0]
+    np.testing.assert_allclose(
+        (sample.camera_from_object @ np.linalg.inv(reader.native_from_mesh(NAME)))[:3], raw, atol=1e-6
+    )
+    assert np.linalg.norm(raw[:, 3] - expected[:3, 3]) > 0.1  # canary: the two frames are far apart
+
+
+def test_models_in_ycbvideos_own_frame_are_taken_as_they_are(root):
+    reader = YCBVideoReader(root, NAME, mesh_frame="ycb_video")
+    raw = scipy.io.loadmat(reader.records()[0].files[3])["poses"][..., 0]
+    np.testing.assert_allclose(reader.read(0).camera_from_object[:3], raw, atol=1e-6)
+
+
+def test_rendered_frames_with_alpha_and_float_indices(root):
+    reader = YCBVideoReader(root, NAME, parts=("data", "data_syn"))
+    (i,) = [i for i, r in enumerate(reader.records()) if r.name == "data_syn/000123"]
+    sample = reader.read(i)
+    assert sample.rgb.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(sample.camera_from_object, pose(), atol=1e-6)
+    assert reader.records()[i].group == "data_syn/1"
+    assert len(YCBVideoReader(root, NAME).records()) == 4
+    assert YCBVideoReader(root / "data", NAME).records()[0].name == "0048/000001"
+    assert YCBVideoReader(root / "data_syn", NAME).records()[0].name == "data_syn/000123"
+
+
+def test_a_list_of_key_frames_chooses_and_counts_what_is_not_there(root):
+    reader = YCBVideoReader(root, NAME, frames="keyframe.txt")
+    assert [r.name for r in reader.records()] == ["0048/000002", "0050/000001"]
+    assert list(reader.notes.values()) == [1]
+    (root / "image_sets" / "other.txt").write_text("0077/000001\n")
+    with pytest.raises(UserError, match="none of its 1 frames"):
+        YCBVideoReader(root, NAME, frames="other.txt")
+
+
+def test_listed_but_not_in_the_label(root):
+    ycb_frame(root / "data" / "0051" / "000001", [(2, pose())], NATIVE, unlabelled=5)
+    reader = YCBVideoReader(root, ["006_mustard_bottle"])
+    assert [r.name for r in reader.records()] == ["0051/000001"]
+    with pytest.raises(NotShown):
+        reader.read(0)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 10_000.0])
+def test_factor_depth_scales_depth(tmp_path, factor):
+    ycb_frame(tmp_path / "0001" / "000001", [(2, pose())], NATIVE, units=factor, factor_depth=factor)
+    sample = YCBVideoReader(tmp_path, NAME).read(0)
+    np.testing.assert_allclose(sample.depth[sample.mask], truth(pose())[sample.mask], atol=0.6 / factor)
+
+
+def test_the_wood_block_is_refused_with_the_way_out(tmp_path):
+    ycb_frame(tmp_path / "0001" / "000001", [(16, pose())], np.eye(4))
+    with pytest.raises(UserError, match="mesh_frame=ycb_video"):
+        YCBVideoReader(tmp_path, "036_wood_block")
+    assert YCBVideoReader(tmp_path).objects == ()
+
+
+BROKEN = {
+    "key": ({"without": "factor_depth"}, "missing key 'factor_depth'"),
+    "nan": ({"poses": lambda p: p * np.nan}, "'poses' holds NaN"),
+    "no rotation": ({"poses": lambda p: p * 2}, "no rotation"),
+    "size": ({"K": np.eye(4)}, "'intrinsic_matrix' has the wrong size"),
+    "class": ({"cls": 1}, "unknown class"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_meta_is_named_or_counted(tmp_path, case):
+    change, cause = BROKEN[case]
+    index = 77 if case == "class" else 2
+    ycb_frame(tmp_path / "0001" / "000001", [(index, pose())], NATIVE, **change)
+    ycb_frame(tmp_path / "0001" / "000002", [(2, pose())], NATIVE)
+    with pytest.raises(BadData, match=cause) as caught:
+        YCBVideoReader(tmp_path, NAME)
+    assert "000001-meta.mat" in str(caught.value)
+    reader = YCBVideoReader(tmp_path, NAME, on_error="skip")
+    assert [r.name for r in reader.records()] == ["0001/000002"]
+    assert sum(reader.skipped.values()) == 1
+    assert "000001-meta.mat" in next(iter(reader.examples.values()))
+
+
+def test_broken_files_are_named(tmp_path):
+    stem = tmp_path / "0001" / "000001"
+    ycb_frame(stem, [(2, pose())], NATIVE)
+    reader = YCBVideoReader(tmp_path, NAME)
+    label = stem.with_name("000001-label.png")
+    write_png(label, np.full((HEIGHT, WIDTH), 200, np.uint8))
+    with pytest.raises(BadData, match=r"unknown class.*label 200"):
+        reader.read(0)
+    write_png(label, np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(BadData, match="empty mask"):
+        reader.read(0)
+    write_png(label, np.full((HEIGHT, WIDTH // 2), 2, np.uint8))
+    with pytest.raises(BadData, match=r"label.png: wrong image size \(80x120"):
+        reader.read(0)
+    meta = stem.with_name("000001-meta.mat")
+    meta.write_bytes(meta.read_bytes()[:200])
+    with pytest.raises(BadData, match=r"000001-meta\.mat: (not readable|missing key)"):
+        YCBVideoReader(tmp_path, NAME)
