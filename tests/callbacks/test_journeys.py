@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from posefilter.callbacks.journeys import journey_figure, journey_film, save_film
+from posefilter.callbacks.journeys import journey_figure, journey_film, lineage, save_film
+from posefilter.types import Cloud
 
 
 def journey() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -37,3 +38,16 @@ def test_film_moves_and_is_an_animation(tmp_path: Path) -> None:
     with Image.open(tmp_path / "films" / "a.webp") as film:
         assert film.format == "WEBP"
         assert film.n_frames >= 9
+
+
+def test_a_journey_is_a_line_of_ancestors() -> None:
+    def cloud(x: list[float], parents: list[int]) -> Cloud:
+        state = torch.tensor(x)[None, :, None].expand(1, -1, 2)
+        return Cloud(state, torch.zeros(1, 3, 0), torch.zeros(1, 3), torch.tensor([parents]))
+
+    clouds = [
+        cloud([0.0, 10.0, 20.0], [0, 1, 2]),
+        cloud([11.0, 12.0, 21.0], [1, 1, 2]),
+        cloud([22.0, 13.0, 14.0], [2, 0, 1]),
+    ]
+    assert lineage(clouds)[0, :, :, 0].T.tolist() == [[20.0, 21.0, 22.0], [10.0, 11.0, 13.0], [10.0, 12.0, 14.0]]

@@ -1,5 +1,6 @@
 """Pictures of the particles' journeys over an image: the paper's figures 2 and 4, as a figure and as a short film."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,21 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from posefilter.geometry.lookup import touches
+from posefilter.types import Cloud
 
 ON, OFF, START = (60, 220, 90), (255, 80, 60), (250, 220, 60)
+
+
+def lineage(clouds: Sequence[Cloud]) -> Tensor:
+    """Return where each particle of the last cloud, and its ancestors before it, stood.  -> (B, T, N, *S)."""
+    last = clouds[-1]
+    rows = torch.arange(len(last.state), device=last.state.device)[:, None]
+    index = torch.arange(last.state.shape[1], device=last.state.device).expand(len(last.state), -1)
+    path = []
+    for cloud in reversed(clouds):
+        path.append(cloud.state[rows, index])
+        index = cloud.ancestors[rows, index]
+    return torch.stack(path[::-1], dim=1)
 
 
 def journey_figure(rgb: Tensor, mask: Tensor, states: Tensor, most: int = 100) -> Figure:

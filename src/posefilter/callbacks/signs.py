@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from posefilter.callbacks.journeys import journey_figure, journey_film, save_film
+from posefilter.callbacks.journeys import journey_figure, journey_film, lineage, save_film
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.types import Batch, Trace
 
@@ -53,7 +53,7 @@ class Signs(Callback):
 
     def draw(self, trainer: Trainer, trace: Trace, batch: Batch, stage: str, film: bool) -> None:
         """Draw the journeys of a batch's first images."""
-        states = torch.stack([cloud.state for cloud in trace.clouds], dim=1)
+        states = lineage(trace.clouds)
         for i in range(min(self.images, len(states))):
             figure = journey_figure(batch.rgb[i], batch.mask[i], states[i])
             self.show(trainer, figure, f"journeys/{stage}_{i}", f"{stage}_journeys_{i}")
