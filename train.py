@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 
 from posefilter.run import run_command
-from posefilter.run.train import train
 
 if __name__ == "__main__":
-    sys.exit(run_command("train", train, Path(__file__).parent))
+    sys.exit(run_command("train", Path(__file__).parent))

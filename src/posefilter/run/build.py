@@ -21,10 +21,9 @@ _PLAIN = (bool, int, float, str)
 def instantiate(node: Any, where: str, **given: Any) -> Any:
     """Build what a node describes: `_target_` names a class or function, `_partial_: true` leaves it to be called later.
 
-    Lists and dictionaries are built element by element; a dictionary without a `_target_` stays one, an empty one (the choice
-    `none`) becomes None. `where`: the node's
-    place in the configuration, for messages; given: arguments that no file can hold. Raises UserError, naming the key, for a
-    target outside the project, torch and lightning, and for arguments that are unknown, missing or of the wrong type.
+    Lists and dictionaries are built element by element; a dictionary without a `_target_` stays one, an empty one (the
+    choice `none`) becomes None. `where`: the node's place in the configuration, for messages; given: arguments that no file
+    can hold. Raises UserError, naming the key, for a target outside the project, torch and lightning, and for arguments that are unknown, missing or of the wrong type.
     """
     if isinstance(node, DictConfig | ListConfig):
         node = OmegaConf.to_container(node, resolve=True)
@@ -118,7 +117,7 @@ def check_arguments(
 
 
 def fits(value: Any, wanted: Any) -> bool:
-    """Tell whether a value may be what an annotation asks for: plain types exactly, of others that it is not a plain value."""
+    """Tell whether a value may be what an annotation asks for; of types that are not plain, only that it is not plain."""
     if wanted in (inspect.Parameter.empty, Any) or isinstance(wanted, str | typing.TypeVar):
         return True
     origin, inner = get_origin(wanted), get_args(wanted)

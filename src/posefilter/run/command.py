@@ -1,5 +1,6 @@
 """From a command line to a job, and from a mistake to one readable line."""
 
+import importlib
 import os
 import re
 import sys
@@ -18,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.errors import UserError
 from posefilter.run.build import hint
-from posefilter.run.job import Job, first, plain_name
+from posefilter.run.job import Job, check_settings, first, plain_name, run_of
 from posefilter.run.pieces import loosen
 from posefilter.run.resume import with_resumed
 
@@ -27,9 +28,10 @@ EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointErro
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
 
 
-def run_command(name: str, work: Work, home: Path, arguments: list[str] | None = None) -> int:
+def run_command(name: str, home: Path, arguments: list[str] | None = None) -> int:
     """Compose `conf/<name>.yaml` with the command line, do the work (or a sweep of it), and return the exit status.
 
+    The work is the function `name` of the module `posefilter.run.<name>`, imported only when the settings have stood up.
     A mistake ends in one line on stderr and status 2; `debug=trace` shows where it came from.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -41,7 +43,7 @@ def run_command(name: str, work: Work, home: Path, arguments: list[str] | None =
     try:
         arguments = loosen(with_resumed(arguments), name)
         sys.argv = [sys.argv[0], *arguments]
-        hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(_task(work))()
+        hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(_task(name))()
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -56,12 +58,14 @@ def run_command(name: str, work: Work, home: Path, arguments: list[str] | None =
     return 0
 
 
-def _task(work: Work) -> Callable[[DictConfig], Any]:
+def _task(name: str) -> Callable[[DictConfig], Any]:
     """Return the function that Hydra calls for each job."""
 
     def task(cfg: DictConfig) -> Any:
         job = job_of(cfg)
+        work: Work = getattr(importlib.import_module(f"posefilter.run.{name}"), name)
         try:
+            check_settings(cfg)
             return work(job)
         except EXPECTED as error:
             if job.swept:  # the other jobs go on; Hydra raises it again at the end
@@ -85,8 +89,9 @@ def job_of(cfg: DictConfig) -> Job:
 
 
 def register_resolvers() -> None:
-    """Teach configurations `${first:a,b}`, the first that is not null, and `${plain:text}`, fit for a folder's name."""
+    """Teach configurations `${first:a,b}` (the first not null), `${plain:text}` (fit for a folder), `${run_of:checkpoint}`."""
     OmegaConf.register_new_resolver("first", first, replace=True)
+    OmegaConf.register_new_resolver("run_of", run_of, replace=True)
     OmegaConf.register_new_resolver("plain", plain_name, replace=True)
 
 
@@ -108,12 +113,14 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.rpartition("/")
         options = sorted(error.options)
-        return f"{group}={choice}: there is no such choice{hint(choice, options)}; there are {', '.join(options)}"
+        return (
+            f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there are {', '.join(options)}"
+        )
     if isinstance(error, ConfigCompositionException):
         found = re.search(r"Could not override '([^']+)'", text)
         if found:
             key = found[1]
-            return f"{key}: there is no such setting{hint(key, known_keys(name, conf, arguments, key))}"
+            return f"{key}: there is no such setting{near(key, known_keys(name, conf, arguments, key))}"
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
         return f"{error.full_key}: {first_line(error)}"
     return first_line(error)
@@ -123,6 +130,16 @@ def first_line(error: BaseException) -> str:
     """Return an error's first line, or its kind where it says nothing."""
     lines = str(error).splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+def near(wrong: str, known: list[str]) -> str:
+    """Return the nearest key of the same depth; else what the wrong key's section has."""
+    told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
+    section = wrong.rpartition(".")[0]
+    if told or section not in known:
+        return told or hint(wrong, known)
+    own = [key for key in known if key.rpartition(".")[0] == section]
+    return f"; {section} has {', '.join(own)}" if own else f"; {section} has no settings"
 
 
 def known_keys(name: str, conf: Path, arguments: list[str], wrong: str) -> list[str]:

@@ -6,13 +6,9 @@ import time
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 
-from posefilter.errors import UserError
-
 
 def progress(console: str) -> Callback:
     """Return the progress display: "rich" bars on a terminal, else ("plain", or no terminal) a line at each validation."""
-    if console not in ("rich", "plain"):
-        raise UserError(f"console={console}: choose rich or plain")
     return RichProgressBar(leave=True) if console == "rich" and sys.stdout.isatty() else PlainProgress()
 
 

@@ -7,6 +7,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from posefilter.errors import UserError
+
+_WHOLE = ("seed", "threads")
+
 
 @dataclass(frozen=True)
 class Job:
@@ -28,3 +32,23 @@ def first(*values: Any) -> Any:
 def plain_name(text: str) -> str:
     """Return a text fit for a folder's name: no slashes, no Hydra signs, at most 120 characters."""
     return re.sub(r"[^\w.,=\-]+", "_", re.sub(r"(^|,)[+~]+", r"\1", str(text))).strip("_")[:120] or "run"
+
+
+def run_of(path: Any) -> str:
+    """Return the folder that files about a checkpoint go to: its run, or one of their own below outputs/evaluations."""
+    if path is None:
+        return "outputs/evaluations/unnamed"
+    file = Path(str(path))
+    if file.is_dir():
+        return str(file)
+    return str(file.parent.parent) if file.parent.name == "checkpoints" else f"outputs/evaluations/{file.stem}"
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Raise UserError where a setting that every command has is not of its kind."""
+    for key in _WHOLE:
+        value = cfg.get(key)
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 0):
+            raise UserError(f"{key}={value}: must be a whole number, 0 or more")
+    if cfg.get("console", "plain") not in ("rich", "plain"):
+        raise UserError(f"console={cfg.console}: choose rich or plain")

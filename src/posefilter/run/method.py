@@ -1,10 +1,11 @@
 """Build a method, from a configuration or from a checkpoint that carries its own."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
@@ -35,13 +36,19 @@ def recipe(job: Job) -> dict[str, Any]:
     }
 
 
-def build_method(recipe: dict[str, Any], model: ObjectModel) -> PoseEstimator:
-    """Build the method of a recipe for an object."""
+def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> PoseEstimator:
+    """Build the method of a recipe, for an object if it is known."""
     settings = OmegaConf.create(recipe["settings"])
-    method = instantiate(settings.model, "model")
+    try:
+        method = instantiate(settings.model, "model")
+    except UserError as error:
+        where, found, rest = str(error).partition(":")
+        key, equals, value = where.partition("=")
+        raise UserError(typed_key(settings, key) + equals + value + found + rest) from error
     assert isinstance(method, PoseEstimator)
     method.recipe = recipe
-    method.adopt(model)
+    if model is not None:
+        method.adopt(model)
     return method
 
 
@@ -73,3 +80,16 @@ def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) 
     if lost or foreign:
         raise UserError(f"checkpoint: its weights do not fit the method ({len(lost)} missing, {len(foreign)} unknown)")
     return method.eval()
+
+
+def typed_key(settings: DictConfig, where: str) -> str:
+    """Return a place in the model's tree as one types it: `model.filter.initialise.behind` is `initialise.behind`."""
+    path: list[str] = []
+    for part in where.split("."):
+        path.append(part)
+        node: Any = OmegaConf.to_container(settings, resolve=False)
+        for key in path:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and (link := re.fullmatch(r"\$\{([\w.]+)\}", node)):
+            path = link[1].split(".")
+    return ".".join(path)

@@ -8,6 +8,7 @@ from posefilter.errors import UserError
 from posefilter.run.build import hint
 
 PIECES = ("filter", "initialise", "schedule", "reweigh", "resample", "propose", "estimate", "refine", "model")
+OWN = (*PIECES, "data")
 LOOSE = ("evaluate", "predict")
 
 
@@ -15,7 +16,7 @@ def loosen(arguments: list[str], name: str) -> list[str]:
     """Let settings of pieces through that only the checkpoint knows: `filter.particles=9` becomes `++filter.particles=9`."""
     if name not in LOOSE:
         return arguments
-    return [f"++{a}" if a.split("=", 1)[0].split(".")[0] in PIECES and "." in a.split("=", 1)[0] else a for a in arguments]
+    return [f"++{a}" if a.split("=", 1)[0].split(".")[0] in OWN and "." in a.split("=", 1)[0] else a for a in arguments]
 
 
 def changes(cfg: DictConfig) -> dict[str, Any]:

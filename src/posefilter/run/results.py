@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ def finite(content: Any) -> Any:
     return content
 
 
-def show(metrics: dict[str, Any], title: str, plain: bool, written: dict[str, Path]) -> None:
+def show(metrics: dict[str, Any], title: str, plain: bool, written: Mapping[str, Path | str]) -> None:
     """Print the table, and where everything was written."""
     rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
     for label, path, form in _ROWS:

@@ -13,7 +13,6 @@ from omegaconf import DictConfig
 
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
-from posefilter.models.base import PoseEstimator
 from posefilter.run.build import instantiate
 from posefilter.run.console import progress
 from posefilter.run.job import Job
@@ -31,9 +30,10 @@ def train(job: Job) -> float:
         return score(done)
     check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
+    method = build_method(recipe(job))  # first, since it is the sooner to complain
     data = build_data(job.cfg.data)
     data.setup("fit")
-    method = build_method(recipe(job), data.object_model(0))
+    method.adopt(data.object_model(0))
     trainer = build_trainer(job)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
     trainer.fit(method, datamodule=data, ckpt_path=start_from(job), weights_only=True)
@@ -43,7 +43,11 @@ def train(job: Job) -> float:
     results = test(trainer, data, best)
     metrics = record(results, job, data.describe(), best)
     write_json(job.folder / "metrics.json", metrics)
-    files = {"run": job.folder, "checkpoint": best, "next": f"python evaluate.py checkpoint={best} data=..."}
+    files: dict[str, Path | str] = {
+        "run": job.folder,
+        "checkpoint": best,
+        "next": f"python evaluate.py checkpoint={best} data=...",
+    }
     show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console == "plain", files)
     return score(metrics)
 
@@ -87,7 +91,8 @@ def start_from(job: Job) -> str | None:
 
 def finished(job: Job) -> dict[str, Any] | None:
     """Return the metrics of a sweep's job that was done before, with the same overrides."""
-    path = job.folder / "metrics.json"
+    kept, path = job.folder / "metrics_train.json", job.folder / "metrics.json"
+    path = kept if kept.is_file() else path
     if not (job.swept and path.is_file()):
         return None
     metrics: dict[str, Any] = json.loads(path.read_text())
@@ -107,6 +112,3 @@ def quiet() -> None:
     for text in (".*does not have many workers.*", ".*LeafSpec.*", ".*Checkpoint directory.*", ".*log_every_n_steps.*"):
         warnings.filterwarnings("ignore", text)
     torch.set_float32_matmul_precision("high")
-
-
-__all__ = ["PoseEstimator", "build_data", "build_trainer", "train"]

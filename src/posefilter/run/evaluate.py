@@ -1,0 +1,166 @@
+"""Test a checkpoint, or poses from anywhere, on a dataset."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning import Trainer
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+from posefilter.metrics.boxes import box_of_pose
+from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.run.build import instantiate
+from posefilter.run.job import Job
+from posefilter.run.machine import settle
+from posefilter.run.method import method_of, read_checkpoint
+from posefilter.run.pieces import changed, changes
+from posefilter.run.results import record, show, write_json
+from posefilter.run.train import build_data, quiet, score
+from posefilter.types import ObjectModel
+
+_OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
+_SAME_OBJECT = 0.003  # [m] by which the centre and radius of two meshes of one object may differ
+
+
+def evaluate(job: Job) -> float:
+    """Write metrics.json, and for a checkpoint poses.csv and beliefs.npz.  Returns the score that sweeps compare."""
+    quiet()
+    settle(job.cfg.threads, job.cfg.seed)
+    if bool(job.cfg.checkpoint) == bool(job.cfg.estimates):
+        raise UserError("give either checkpoint=RUN/checkpoints/best.ckpt or estimates=poses.csv")
+    metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
+    keep_training_metrics(job.folder)
+    write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
+    files = {"metrics": job.folder / "metrics.json", **files}
+    show(metrics, str(job.cfg.estimates or job.cfg.checkpoint), job.cfg.console == "plain", files)
+    return score(metrics)
+
+
+def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
+    checkpoint = read_checkpoint(job.cfg.checkpoint)
+    method = method_of(checkpoint, changes(job.cfg))
+    if job.cfg.seed is not None:
+        method.seed = job.cfg.seed
+    data = build_data(data_settings(job, checkpoint["recipe"]["settings"], method.model.name))
+    data.setup("test")
+    method.adopt(object_to_judge(data, method.model))
+    records = Records(beliefs=True)
+    trainer = instantiate(job.cfg.trainer, "trainer", callbacks=[records], logger=False)
+    assert isinstance(trainer, Trainer)
+    trainer.test(method, datamodule=data, verbose=False)
+    files = {"beliefs": job.folder / "beliefs.npz"}
+    native = data.reader.native_from_mesh
+    if method.tells_pose:
+        files["poses"] = job.folder / "poses.csv"
+        write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
+    write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
+    told = Job(job.cfg, {**checkpoint["recipe"]["choices"], **_chosen(job)}, job.overrides, job.folder, job.name, job.swept)
+    return record(method.results(), told, data.describe(), Path(job.cfg.checkpoint)), files
+
+
+def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Score a BOP results file: of each instance that is there, its most confident estimate."""
+    if not job.cfg.get("data"):
+        raise UserError("estimates need to know of which data: give data=fat|ycb_video|bop|scenes and data.root=DIR")
+    rows = read_poses_csv(Path(job.cfg.estimates))
+    data = build_data(data_settings(job, {}, None))
+    data.setup("test")
+    best = {}
+    for row in sorted(rows, key=lambda row: row.score):
+        best[row.scene_id, row.im_id, row.obj_id] = row
+    errors, iou = PoseErrors([data.object_model(i) for i in range(len(data.objects))]), BoxIoU()
+    used = 0
+    for batch in data.test_dataloader():
+        own = [data.records("test")[i] for i in batch.frame_id.tolist()]
+        told = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
+        poses = torch.full_like(batch.camera_from_object, torch.nan)
+        for i, found in enumerate(told):
+            if found is not None:
+                used += 1
+                pose = to_mesh(found.camera_from_native, data.reader.native_from_mesh(own[i].object))
+                poses[i] = torch.from_numpy(pose.astype(np.float32))
+        errors.update(poses, batch.camera_from_object, batch.object_id)
+        height, width = batch.rgb.shape[-2:]
+        for i, index in enumerate(batch.object_id.tolist()):
+            hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
+            truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)
+            guess = box_of_pose(poses[i : i + 1], hull, K, height, width).nan_to_num(0.0)
+            iou.update(guess, truth)
+    if not used:
+        raise UserError(f"estimates={job.cfg.estimates}: none of its {len(rows)} rows is of an instance of this data")
+    results = {**errors.compute(), "iou": float(iou.compute()), "particles_on_object": None}
+    times = [row.seconds for row in best.values() if row.seconds >= 0]
+    results |= {"seconds_per_image": sum(times) / len(times) if times else None, "belief": None}
+    return {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}, {}
+
+
+def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictConfig:
+    """Return the settings of the data to test on.
+
+    Without `data=` they are those that the checkpoint was trained with: its held-out test split. With it, object and image
+    size are the checkpoint's unless typed; the split is the checkpoint's where it was trained on the same folder, and else
+    every frame is tested.
+    """
+    said = OmegaConf.to_container(job.cfg.data, resolve=False) if job.cfg.get("data") else {}
+    assert isinstance(said, dict)
+    own = trained.get("data") or {}
+    typed = {
+        o.split("=", 1)[0].lstrip("+~").removeprefix("data.") for o in job.overrides if o.lstrip("+~").startswith("data.")
+    }
+    chosen = "_target_" in said
+    settings = dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
+    tree = {**trained, "data": settings, "augment": {}, "seed": trained.get("seed", 0)}
+    if chosen and own:
+        before = OmegaConf.create(trained).data
+        for key in _OF_THE_CHECKPOINT:
+            if key not in typed:
+                settings[key] = name if key == "object" else before.get(key)
+        root = OmegaConf.create(tree).data.root
+        if root is None:
+            raise UserError("data.root: is missing; name the dataset's folder")
+        same = Path(root).resolve() == Path(before.root).resolve()
+        if not any(key.startswith("split") for key in typed):
+            settings["split"] = before.split if same else {"test": 1.0}
+            settings["split_seed"] = before.split_seed
+        if "limit_test" not in typed:
+            settings["limit_test"] = before.limit_test if same else None
+        if same and "min_visibility_test" not in typed:
+            settings["min_visibility_test"] = before.min_visibility_test
+    elif chosen and not any(key.startswith("split") for key in typed):
+        settings["split"] = {"test": 1.0}
+    data = OmegaConf.create({**tree, "data": settings}).data
+    OmegaConf.resolve(data)
+    return data
+
+
+def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
+    """Return the method's object with the points that the dataset defines ADD on, where the dataset's meshes have it.
+
+    Raises UserError where its mesh there is another one: poses of the two could not be compared.
+    """
+    if own.name not in data.meshes.names():
+        return own
+    theirs = data.object_model(0)
+    shift = float((theirs.center - own.center).norm())
+    if shift > _SAME_OBJECT or abs(theirs.radius - own.radius) > _SAME_OBJECT:
+        raise UserError(
+            f"data.meshes={data.meshes.root}: its {own.name} is not the mesh that the checkpoint was trained on "
+            f"(centre {1000 * shift:.1f} mm off, radius {1000 * theirs.radius:.1f} mm against {1000 * own.radius:.1f} mm)"
+        )
+    return own._replace(points=theirs.points, diameter=theirs.diameter, symmetries=theirs.symmetries)
+
+
+def keep_training_metrics(folder: Path) -> None:
+    """Set a run's own metrics aside before an evaluation in its folder writes others."""
+    path, kept = folder / "metrics.json", folder / "metrics_train.json"
+    if path.is_file() and not kept.is_file() and '"command"' not in path.read_text():
+        shutil.copy2(path, kept)
+
+
+def _chosen(job: Job) -> dict[str, str]:
+    return {group: choice for group, choice in job.choices.items() if choice not in ("None", "null")}

@@ -1,0 +1,42 @@
+"""Strip a checkpoint to what predicts: weights, recipe and object."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from posefilter.errors import UserError
+from posefilter.run.job import Job
+from posefilter.run.method import method_of, read_checkpoint
+
+_KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
+
+
+def export(job: Job) -> None:
+    """Write the stripped checkpoint; it works wherever the whole one did, but for going on with training."""
+    if job.cfg.out is None:
+        raise UserError("out: is missing; name the file to write, such as out=weights/carton.ckpt")
+    out = Path(job.cfg.out)
+    if out.suffix != ".ckpt":
+        raise UserError(f"out={out}: must end in .ckpt")
+    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points)
+    method_of(stripped)  # raises where it could not be used
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{out.name}.part")
+    torch.save(stripped, partial)
+    size = partial.stat().st_size / 1e6
+    if size > job.cfg.most_mb:
+        partial.unlink()
+        raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={job.cfg.most_mb}")
+    partial.replace(out)
+    print(f"{out}: {size:.2f} MB")
+
+
+def strip(checkpoint: dict[str, Any], points: int) -> dict[str, Any]:
+    """Return a checkpoint without optimizer, loops and callbacks, its object with so many surface points at most."""
+    kept = {key: checkpoint[key] for key in _KEPT if key in checkpoint}
+    model = dict(kept["object_model"])
+    every = max(1, -(-len(model["points"]) // points))
+    model["points"] = model["points"][::every].clone()
+    state = {key: value.clone() for key, value in kept["state_dict"].items()}  # views would save what they are views of
+    return {**kept, "state_dict": state, "object_model": model}
