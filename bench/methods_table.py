@@ -49,7 +49,8 @@ def key_of(run: dict[str, Any]) -> tuple[str, str, str]:
     """Return method, variant, and whatever else was chosen, but for the seed."""
     choices = run["choices"]
     rest = [f"{k}={v}" for k, v in choices.items() if k not in NAMES and k.split(".")[0] not in SILENT and k not in SILENT]
-    return choices.get("model", "pose_pf"), choices.get("variant", "working"), " ".join(rest)
+    name, variant = (run.get(key) or choices.get(key) or "?" for key in ("model", "variant"))
+    return name, variant, " ".join(rest)
 
 
 def cell(runs: list[dict[str, Any]], read: Callable[[dict[str, Any]], Any]) -> str:
@@ -77,7 +78,7 @@ def table(runs: list[dict[str, Any]]) -> str:
     shown = [name for name, read in COLUMNS.items() if any(cell([run], read) != "–" for run in runs)]
     lines = ["| method | variant | changed | seeds | " + " | ".join(shown) + " |", "|---" * (4 + len(shown)) + "|"]
     for (model, variant, rest), same in sorted(rows.items()):
-        seeds = len({run["choices"].get("seed", "0") for run in same})
+        seeds = len({str(run.get("seed", run["choices"].get("seed"))) for run in same})
         figures = [cell(same, COLUMNS[name]) for name in shown]
         lines.append(" | ".join([f"| {model}", variant, f"`{rest}`" if rest else "", str(seeds), *figures]) + " |")
     return "\n".join(lines)
