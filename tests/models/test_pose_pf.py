@@ -1,0 +1,151 @@
+"""The pose-space method end to end on a toy world, and the laws that its lessons must keep."""
+
+from functools import partial
+
+import pytest
+import torch
+from tests.models.toy import scenes, square
+
+from posefilter.errors import UserError
+from posefilter.filters.estimate import Best
+from posefilter.filters.initialise import FromDepth, FromProposals
+from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.propose import Gaussian
+from posefilter.filters.refine import Chain, Gradient, NoRefine, Rescore
+from posefilter.filters.resample import Systematic
+from posefilter.filters.reweigh import Annealed
+from posefilter.filters.schedule import Geometric
+from posefilter.geometry.pose import invert
+from posefilter.labels.paper_points import PaperPoints
+from posefilter.losses.contrast import Contrast
+from posefilter.losses.regression import Regression
+from posefilter.metrics.errors import add
+from posefilter.models.lessons import CandidatePoses, LabelledRays
+from posefilter.models.pose_pf import PosePF
+from posefilter.nets.likelihood import PoseLikelihood
+from posefilter.nets.paper_likelihood import PaperLikelihood
+from posefilter.nets.proposals import ObjectCoordinateNet
+
+SIGMA = (0.01, 0.2)
+
+
+def working(initialise: object = None, refine: object = None) -> PosePF:
+    torch.manual_seed(0)
+    start = initialise or FromProposals()
+    pieces = (start, Geometric(0.05, SIGMA[0]), Annealed(), Systematic(), Gaussian(0.4), Best(), refine or NoRefine())
+    return PosePF(
+        PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA),
+        CandidatePoses(each=6, proposed=4, particles=6, sigma=SIGMA),
+        ObjectCoordinateNet((16, 24, 32, 32)),
+        filter=ParticleFilter(100, 6, *pieces, first_particles=200),
+        loss=Contrast(),
+        optimizer=partial(torch.optim.AdamW, lr=3e-3),
+        object_model=square(),
+    )
+
+
+def error(method: PosePF, count: int = 16) -> torch.Tensor:
+    """Return the filter's ADD on scenes that no training saw [m]."""
+    method.eval()
+    batch = scenes(count, seed=10_000)
+    with torch.no_grad():
+        trace = method.filter(batch, method, torch.Generator().manual_seed(0))
+    return add(trace.belief.best, batch.camera_from_object, method.model.points)
+
+
+@pytest.fixture(scope="module")
+def trained() -> PosePF:
+    method = working()
+    optimizer = torch.optim.AdamW(method.parameters(), 3e-3)
+    method.train()
+    for step in range(100):
+        batch = scenes(8, seed=step)._replace(frame_id=torch.arange(8) + 8 * (step % 4))
+        losses = method.training_losses(batch, torch.Generator().manual_seed(step))
+        assert set(losses) == {"likelihood", "proposals"}
+        optimizer.zero_grad()
+        sum(value.mean() for value in losses.values()).backward()
+        torch.nn.utils.clip_grad_norm_(method.parameters(), 5.0)
+        optimizer.step()
+    return method
+
+
+def test_a_short_training_finds_the_pose(trained: PosePF) -> None:
+    after, before = error(trained), error(working())
+    assert after.median() < 0.02
+    assert before.median() > 0.1
+
+
+def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
+    plain = error(trained).median()
+    refined = working(refine=Chain([Rescore(10, 256, SIGMA[0]), Gradient(20, sigma=SIGMA[0], final_sigma=SIGMA[0])]))
+    refined.load_state_dict(trained.state_dict(), strict=True)
+    assert error(refined).median() < plain
+
+
+def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
+    trained.eval()
+    batch = scenes(16, seed=20_000)
+    scene = trained.observe(batch)
+    g = torch.Generator().manual_seed(0)
+    truth = batch.camera_from_object[:, None]
+    others = FromDepth()(batch, scene, trained, 60, g)
+    with torch.no_grad():
+        scores = trained.score_poses(scene, torch.cat([truth, others], 1), 0.02, g, 128)
+    assert (scores[:, :1] > scores[:, 1:]).float().mean() > 0.97
+
+
+def test_neither_mask_nor_truth_is_looked_at(trained: PosePF) -> None:
+    trained.eval()
+    batch = scenes(3, seed=30_000)
+    blind = batch._replace(mask=torch.zeros_like(batch.mask), camera_from_object=torch.eye(4).expand(3, 4, 4))
+    with torch.no_grad():
+        a, b = (trained.filter(x, trained, torch.Generator().manual_seed(0)).belief for x in (batch, blind))
+    assert torch.equal(a.best, b.best)
+
+
+def test_without_proposals_the_start_must_be_another(trained: PosePF) -> None:
+    method = working()
+    method.proposals = None
+    with pytest.raises(UserError, match="proposals=dense"):
+        error(method, 1)
+
+
+def test_the_papers_samples_lie_where_they_are_said_to() -> None:
+    method = PosePF(
+        PaperLikelihood(),
+        LabelledRays(rays=8),
+        filter=working().filter,
+        loss=Regression(PaperPoints()),
+        optimizer=torch.optim.Adam,
+        object_model=square(),
+    )
+    batch = scenes(2)
+    trace = method.lesson(method, method.observe(batch), batch, torch.Generator().manual_seed(0))
+    state, weight = trace.clouds[0].state, trace.clouds[0].log_weights.exp()
+    assert state.shape == (2, 8 * 30 * 2, 4)
+    first = state[0, :30]  # one ray, colours random: from 10 cm before the camera to 5 cm behind the surface
+    assert torch.equal(first[:, :2], first[:1, :2].expand(30, 2))
+    assert first[:, 2].diff().min() > 0
+    assert first[-1, 2] == pytest.approx(0.05, rel=0.2)
+    u, v = first[0, :2].long().tolist()
+    assert batch.mask[0, 0, v, u]
+    on = (weight[0] > 0) & (state[0, :, 3] > 0.5)
+    assert (state[0, on, 2].abs() <= 0.01).all()
+    loss = method.training_losses(batch, torch.Generator().manual_seed(0))["likelihood"]
+    assert loss.shape == (2,)
+    assert torch.isfinite(loss).all()
+
+
+def test_the_papers_lesson_refuses_another_likelihood() -> None:
+    method = working()
+    method.lesson = LabelledRays()
+    with pytest.raises(UserError, match="likelihood=paper"):
+        method.training_losses(scenes(1), torch.Generator().manual_seed(0))
+
+
+def test_candidates_hold_the_truth_whatever_the_camera() -> None:
+    method = working()
+    batch = scenes(2)
+    trace = method.lesson(method, method.observe(batch), batch, torch.Generator().manual_seed(0))
+    relative = invert(batch.camera_from_object)[:, None] @ trace.clouds[0].state
+    assert (relative[:, 0] - torch.eye(4)).abs().max() < 1e-5
