@@ -41,7 +41,7 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     register_resolvers()
     before = sys.argv
     try:
-        arguments = loosen(with_resumed(arguments), name)
+        arguments = loosen(with_resumed(bracketed(arguments)), name)
         sys.argv = [sys.argv[0], *arguments]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(_task(name))()
     except KeyboardInterrupt:
@@ -56,6 +56,11 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     finally:
         sys.argv = before
     return 0
+
+
+def bracketed(arguments: list[str]) -> list[str]:
+    """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four numbers, not a sweep."""
+    return [re.sub(r"^((?:\w+\.)*(?:intrinsics|camera|size))=([^\[\],]+(?:,[^\[\],]+)+)$", r"\1=[\2]", a) for a in arguments]
 
 
 def _task(name: str) -> Callable[[DictConfig], Any]:
@@ -89,7 +94,7 @@ def job_of(cfg: DictConfig) -> Job:
 
 
 def register_resolvers() -> None:
-    """Teach configurations `${first:a,b}` (the first not null), `${plain:text}` (fit for a folder), `${run_of:checkpoint}`."""
+    """Teach configurations `${first:a,b}` (not null), `${plain:text}` (fit for a folder), `${run_of:checkpoint}`."""
     OmegaConf.register_new_resolver("first", first, replace=True)
     OmegaConf.register_new_resolver("run_of", run_of, replace=True)
     OmegaConf.register_new_resolver("plain", plain_name, replace=True)
