@@ -23,7 +23,8 @@ def instantiate(node: Any, where: str, **given: Any) -> Any:
 
     Lists and dictionaries are built element by element; a dictionary without a `_target_` stays one, an empty one (the
     choice `none`) becomes None. `where`: the node's place in the configuration, for messages; given: arguments that no file
-    can hold. Raises UserError, naming the key, for a target outside the project, torch and lightning, and for arguments that are unknown, missing or of the wrong type.
+    can hold. Raises UserError, naming the key, for a target outside the project, torch and lightning, and for arguments
+    that are unknown, missing or of the wrong type.
     """
     if isinstance(node, DictConfig | ListConfig):
         node = OmegaConf.to_container(node, resolve=True)

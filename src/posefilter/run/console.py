@@ -4,12 +4,24 @@ import sys
 import time
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import RichProgressBar
+from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
 
 
 def progress(console: str) -> Callback:
     """Return the progress display: "rich" bars on a terminal, else ("plain", or no terminal) a line at each validation."""
-    return RichProgressBar(leave=True) if console == "rich" and sys.stdout.isatty() else PlainProgress()
+    return StepBar(leave=True) if console == "rich" and sys.stdout.isatty() else PlainProgress()
+
+
+def is_bar(shown: Callback) -> bool:
+    """Tell whether a display is a bar, as Lightning's trainer wants to know."""
+    return isinstance(shown, ProgressBar)
+
+
+class StepBar(RichProgressBar):
+    """Lightning's bar; runs are counted in steps here, and their number of epochs is nobody's choice."""
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return f"epoch {current_epoch}, step {self.trainer.global_step} of {self.trainer.max_steps}"
 
 
 class PlainProgress(Callback):

@@ -15,6 +15,7 @@ from posefilter.errors import UserError
 from posefilter.metrics.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.run.build import instantiate
+from posefilter.run.console import is_bar, progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
@@ -49,8 +50,10 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data = build_data(data_settings(job, checkpoint["recipe"]["settings"], method.model.name))
     data.setup("test")
     method.adopt(object_to_judge(data, method.model))
-    records = Records(beliefs=True)
-    trainer = instantiate(job.cfg.trainer, "trainer", callbacks=[records], logger=False)
+    records, shown = Records(beliefs=True), progress(job.cfg.console)
+    trainer = instantiate(
+        job.cfg.trainer, "trainer", callbacks=[records, shown], logger=False, enable_progress_bar=is_bar(shown)
+    )
     assert isinstance(trainer, Trainer)
     trainer.test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz"}

@@ -1,6 +1,5 @@
 """Threads, seeds, and what to remember of the machine and the code that made a result."""
 
-import os
 import platform
 import subprocess
 import sys
@@ -15,9 +14,8 @@ _PACKAGES = ("posefilter", "torch", "lightning", "hydra-core", "torchmetrics", "
 
 
 def settle(threads: int | None, seed: int) -> None:
-    """Use so many threads (null: as many as there are cores for this process, at most 8), and seed what is not explicit."""
-    count = threads or min(8, len(os.sched_getaffinity(0)))
-    torch.set_num_threads(count)
+    """Use so many threads (null: what torch finds, OMP_NUM_THREADS included, at most 8), and seed what is not explicit."""
+    torch.set_num_threads(threads or min(8, torch.get_num_threads()))
     cv2.setNumThreads(1)
     lightning.seed_everything(seed, workers=True, verbose=False)
 

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.run.build import instantiate
-from posefilter.run.console import progress
+from posefilter.run.console import is_bar, progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import build_method, check_loss, method_of, read_checkpoint, recipe
@@ -67,9 +67,12 @@ def build_trainer(job: Job) -> Trainer:
     cfg = job.cfg.copy()
     cfg.folder = str(job.folder)
     callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
-    callbacks.append(progress(cfg.console))
+    shown = progress(cfg.console)
+    callbacks.append(shown)
     loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]
-    trainer = instantiate(cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False)
+    trainer = instantiate(
+        cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=is_bar(shown)
+    )
     assert isinstance(trainer, Trainer)
     return trainer
 
