@@ -1,0 +1,47 @@
+# Everything a newcomer needs, each from a fresh clone: `make train`, `make test`. `make` alone prints this list.
+VENV ?= .venv
+PYTHON ?= python3
+PY := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train test check format smoke bench board clean
+
+help: ## print this list
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## make the virtual environment and install the project (once)
+
+$(STAMP): pyproject.toml
+	test -x $(PY) || $(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+train: $(STAMP) ## render scenes if there are none, train on them, test, print the table
+	$(PY) train.py
+
+test: $(STAMP) ## run the tests
+	$(PY) -m pytest
+
+check: $(STAMP) ## check format, lint, types and import floors
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports
+
+format: $(STAMP) ## put the code into its format
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+smoke: $(STAMP) ## run every method the whole way at toy size
+	for model in $(MODELS); do $(PY) train.py debug=smoke model=$$model console=plain out=outputs/smoke/$$model || exit 1; done
+
+bench: $(STAMP) ## measure: does training wait for the loader?
+	$(PY) bench/loader.py
+
+board: $(STAMP) ## show every run in TensorBoard
+	$(VENV)/bin/tensorboard --logdir outputs
+
+clean: ## remove the environment and caches; outputs stay
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
