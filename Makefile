@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format smoke bench board clean
+.PHONY: help setup train test check format smoke bench board weights clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -19,16 +19,13 @@ $(STAMP): pyproject.toml
 	touch $@
 
 train: $(STAMP) ## render scenes if there are none, train on them, test, print the table
-	$(PY) train.py
+	$(PY) train.py $(ARGS)
 
 test: $(STAMP) ## run the tests
-	$(PY) -m pytest
+	$(PY) -m pytest $(ARGS)
 
 check: $(STAMP) ## check format, lint, types and import floors
-	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/ruff check .
-	$(VENV)/bin/mypy
-	$(VENV)/bin/lint-imports
+	.ci/check $(VENV)/bin
 
 format: $(STAMP) ## put the code into its format
 	$(VENV)/bin/ruff format .
@@ -42,6 +39,10 @@ bench: $(STAMP) ## measure: does training wait for the loader?
 
 board: $(STAMP) ## show every run in TensorBoard
 	$(VENV)/bin/tensorboard --logdir outputs
+
+weights: $(STAMP) ## strip a run to what ships: make weights RUN=outputs/runs/... NAME=carton
+	@test -n "$(RUN)" -a -n "$(NAME)" || { echo "give RUN=outputs/runs/... and NAME=..."; exit 2; }
+	$(PY) export.py checkpoint=$(RUN)/checkpoints/best.ckpt out=weights/$(NAME).ckpt
 
 clean: ## remove the environment and caches; outputs stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis src/*.egg-info
