@@ -1,7 +1,7 @@
 """Measure how long training waits for its data: `python bench/loader.py ROOT --object NAME --meshes builtin`.
 
-A step of training is stood in for by `--step-ms` of computing on one core (give the step time of your method); between steps the
-next batch is asked for, and the time until it is there is what training waits. Augmentation is the strong one of training.
+A step of training is stood in for by `--step-ms` of computing on one core (give the step time of your method); between steps
+the next batch is asked for, and the time until it is there is what training waits. Augmentation is as strong as it gets.
 """
 
 import argparse

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from dataset_trees import HEIGHT, WIDTH, K, bop_scene, fat_folder, fat_frame, fat_tree, pose, truth, write_mesh
+from dataset_trees import HEIGHT, HIGH, LOW, WIDTH, K, bop_scene, fat_folder, fat_frame, fat_tree, pose, truth, write_mesh
 from torch.utils.data import default_collate
 
 from posefilter.data.meshes import MeshStore
@@ -66,6 +66,16 @@ def test_too_few_scenes_say_so(tmp_path):
     fat_tree(tmp_path, scenes=2)
     with pytest.raises(UserError, match="2 scenes cannot be divided into train, val, test"):
         PoseDataModule("fat", tmp_path, "toy").setup()
+
+
+def test_bops_own_models_are_in_millimetres(tmp_path):
+    path = write_mesh(tmp_path / "meshes", "obj_000002") / "obj_000002" / "google_16k" / "textured.obj"
+    lines = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("\n".join(" ".join([x[0], *(str(float(n) * 1000) for n in x[1:])] if x[0] == "v" else x) for x in lines))
+    bop_scene(tmp_path / "000048", [[(2, pose())]])
+    dm = PoseDataModule("bop", tmp_path, "obj_000002", tmp_path / "meshes", split={"test": 1.0})
+    np.testing.assert_allclose(dm.meshes.load("obj_000002").bounds, [LOW, HIGH], atol=1e-9)
+    assert float(dm.test_dataset[0].visibility) == pytest.approx(1.0, abs=0.01)
 
 
 def test_bop_targets_choose_frames(tmp_path):
@@ -296,6 +306,8 @@ def test_wrong_settings_are_named(root):
         module(root, source="fats").setup()
     with pytest.raises(UserError, match=r"data\.cache=ram"):
         module(root, cache="ram")
+    with pytest.raises(UserError, match=r"data\.root is not set"):
+        PoseDataModule("fat", None)
     with pytest.raises(UserError, match="'flavour'"):
         module(root, options={"flavour": 1}).setup()
     with pytest.raises(UserError, match=r"data\.on_error=ignore"):

@@ -15,6 +15,7 @@ import numpy as np
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 
+CACHES = ("memory", "disk", "none")
 _UNITS = 10_000.0  # a metre
 
 
@@ -161,6 +162,13 @@ class NoCache:
         """Return the sample, decoded anew."""
         one, sample = self._records[record.key], self._read(record)
         return unpack(pack_image(sample), one, frame_id)
+
+
+def open_cache(kind: str, folder: Path, version: str, read: Callable[[FrameRecord], Sample]) -> FrameCache:
+    """Return a cache: "memory", "disk" in a folder (see `DiskCache` for `version`), or "none", which reads anew."""
+    if kind == "disk":
+        return DiskCache(folder, version)
+    return MemoryCache() if kind == "memory" else NoCache(read)
 
 
 def prepare(sample: Sample) -> Prepared:

@@ -14,14 +14,14 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from posefilter.data.cache import DiskCache, FrameCache, MemoryCache, NoCache, Prepared
+from posefilter.data.cache import CACHES, FrameCache, Prepared, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.frames import BadData, FrameRecord, Reader, Sample
 from posefilter.data.generated import ensure_scenes
 from posefilter.data.meshes import BUILTIN, MeshStore, object_model
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
-from posefilter.data.readers import open_reader
+from posefilter.data.readers import default_mesh_scale, open_reader
 from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
@@ -41,9 +41,10 @@ class PoseDataModule(LightningDataModule):
     def __init__(
         self,
         source: str,
-        root: str | Path,
+        root: str | Path | None,
         object: str | Sequence[str] | None = None,
-        meshes: str | Path | MeshStore = "builtin",
+        meshes: str | Path | MeshStore = BUILTIN,
+        mesh_scale: float | None = None,
         image_width: int | None = None,
         image_height: int | None = None,
         split: Mapping[str, Share | None] | None = None,
@@ -70,19 +71,22 @@ class PoseDataModule(LightningDataModule):
         """Say what to read; nothing is opened before `setup`.
 
         source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all. meshes: "builtin", a folder
-        or a mesh store. image_width alone keeps the aspect. split: what part of the scenes train, val and test get, see
-        `splits.split_records`; by default 0.8, 0.1, 0.1; split_seed shuffles the scenes. min_visibility: of training frames;
-        min_visibility_test: of validation and test frames (unknown visibility passes). cache: "memory", "none", or "disk"
-        (in `cache_dir`, by default the dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them.
-        limit_*: the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a folder with
-        <class>/points.xyz in the dataset's own frame instead. generate: called with the root where scenes are yet to be
-        rendered. options: the reader's own.
+        or a mesh store; mesh_scale: metres a unit of its files (0.001 for BOP's models, else 1). image_width alone keeps the
+        aspect. split: what part of the scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
+        split_seed shuffles the scenes. min_visibility: of training frames; min_visibility_test: of val and test frames
+        (unknown visibility passes). cache: "memory", "none", or "disk" (in `cache_dir`, by default the dataset's own
+        `.cache`). on_error: "raise", or "skip" broken frames and count them. limit_*: the first so many frames of a fixed
+        shuffle. points: surface points for ADD; model_points: a folder with <class>/points.xyz in the dataset's own frame
+        instead. generate: called with the root where scenes are yet to be rendered. options: the reader's own.
         """
         super().__init__()
-        if cache not in ("memory", "disk", "none"):
-            raise UserError(f"data.cache={cache}: choose memory, disk or none")
+        if cache not in CACHES:
+            raise UserError(f"data.cache={cache}: choose {', '.join(CACHES)}")
+        if root is None:
+            raise UserError(f"data.root is not set: which folder holds the {source} dataset?")
         self.root, self.source = Path(root), source
-        self._object, self._meshes, self._options, self._generate = object, meshes, dict(options or {}), generate
+        self._object, self._meshes, self._mesh_scale = object, meshes, mesh_scale
+        self._options, self._generate = dict(options or {}), generate
         self._image_width, self._image_height = image_width, image_height
         self._split, self._split_seed = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}), split_seed
         self._least = {"train": min_visibility, "val": min_visibility_test, "test": min_visibility_test}
@@ -97,7 +101,9 @@ class PoseDataModule(LightningDataModule):
     @cached_property
     def meshes(self) -> MeshStore:
         """Return the mesh store."""
-        return self._meshes if isinstance(self._meshes, MeshStore) else MeshStore(self._meshes)
+        if isinstance(self._meshes, MeshStore):
+            return self._meshes
+        return MeshStore(self._meshes, scale=self._mesh_scale or default_mesh_scale(self.source, self._object))
 
     @cached_property
     def reader(self) -> Reader:
@@ -124,15 +130,9 @@ class PoseDataModule(LightningDataModule):
 
     @cached_property
     def _cache(self) -> FrameCache:
-        if self._cache_kind == "memory":
-            return MemoryCache()
-        if self._cache_kind == "none":
-            return NoCache(self._read)
         size = f"{self._image_width}x{self._image_height}"
-        version = (
-            f"1 {self.source} {self.root.resolve()} {self.objects} {self.meshes.root} {size} {sorted(self._options.items())}"
-        )
-        return DiskCache(Path(self._cache_dir or self.root / ".cache"), version)
+        content = (self.source, self.root.resolve(), self.objects, self.meshes.root, size, sorted(self._options.items()))
+        return open_cache(self._cache_kind, Path(self._cache_dir or self.root / ".cache"), f"1 {content}", self._read)
 
     def prepare_data(self) -> None:
         """Render the scenes where the source is our own and they are not there yet."""

@@ -41,3 +41,9 @@ def open_reader(
         if "unexpected keyword argument" not in str(error):
             raise
         raise UserError(f"data.options: {str(error).split('() ')[-1]} of the {source} reader") from error
+
+
+def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> float:
+    """Return metres a unit of the mesh files that belong to a dataset: BOP's own models are in millimetres."""
+    names = [objects] if isinstance(objects, str) else list(objects or [])
+    return 0.001 if source == "bop" and all(name.startswith("obj_") for name in names) else 1.0
