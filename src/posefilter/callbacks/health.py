@@ -5,12 +5,12 @@ from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
 
+from posefilter.callbacks.board import Budget, post
 from posefilter.contracts import Space
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
-from posefilter.pictures.canvas import rasterise, save_picture
+from posefilter.pictures.canvas import rasterise
 from posefilter.pictures.curves import draw_health
 from posefilter.types import Trace
 
@@ -18,18 +18,21 @@ from posefilter.types import Trace
 class FilterHealth(Callback):
     """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one figure.
 
-    folder: where the figure is written too (null: nowhere); most: iterations that become scalars, evenly chosen.
+    folder: where the figure is written too (null: nowhere); most: iterations that become scalars, evenly chosen;
+    share: of the validations' time that the figure may take (null: no limit), else it is left to a later validation.
     """
 
-    def __init__(self, folder: str | Path | None = None, most: int = 20) -> None:
+    def __init__(self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.02) -> None:
         self.folder = None if folder is None else Path(folder)
         self.most = most
+        self.budget = Budget(share)
         self._sums: dict[str, torch.Tensor] = {}
         self._images = 0
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Forget the last validation."""
         self._sums, self._images = {}, 0
+        self.budget.start()
 
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
@@ -45,17 +48,16 @@ class FilterHealth(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the means."""
+        self.budget.stop()
         curves = self.curves()
         if not curves or not trainer.is_global_zero:
             return
         for logger in trainer.loggers:
             logger.log_metrics(scalars(curves, self.most), trainer.global_step)
-        picture = rasterise(draw_health(curves, self._images, f"Filter health at step {trainer.global_step}"))
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_image("filter/health", picture, trainer.global_step, dataformats="HWC")
-        if self.folder is not None:
-            save_picture(picture, self.folder / "filter_health.png")
+        if self.budget.allows():
+            with self.budget.spend():
+                picture = rasterise(draw_health(curves, self._images, f"Filter health after {trainer.global_step} steps"))
+                post(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health.png")
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""

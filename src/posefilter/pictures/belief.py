@@ -43,19 +43,20 @@ def draw_belief(
     poses, weights, best = single(belief)
     true = None if truth is None else torch.as_tensor(np.asarray(truth), dtype=torch.float64)
     axis = longest_axis(model) if axis is None else axis
-    figure = new_figure(1100, 980)
-    layout = figure.add_gridspec(3, 6, height_ratios=[1.75, 1, 1])
+    figure = new_figure(1100, 1040)
+    layout = figure.add_gridspec(
+        3, 6, height_ratios=[2.3, 1, 1], left=0.065, right=0.975, bottom=0.06, top=0.91, hspace=0.45, wspace=0.9
+    )
     draw_centres(figure.add_subplot(layout[0, :2]), poses, weights, best, true, model, rgb, K)
     draw_rotations(figure.add_subplot(layout[0, 2:], projection="mollweide"), poses, weights, best, true, axis)
     draw_marginals(figure, layout, poses, weights, best, true, model)
     ess = float(1 / weights.square().sum())
-    figure.suptitle(title or f"Belief about {model.name}: {len(weights)} particles, {ess:.0f} effective", fontsize=14)
-    handles = [Line2D([], [], color=_BEST, linewidth=2, marker="s", markerfacecolor="none", label="estimate")]
+    title = title or f"Belief about {model.name}: {len(weights)} particles, {ess:.0f} of them effective"
+    figure.suptitle(title, fontsize=14, x=0.02, y=0.985, ha="left")
+    handles = [Line2D([], [], color=_BEST, linestyle="-", marker="s", mfc="none", markersize=9, label="estimate")]
     if true is not None:
-        handles.append(
-            Line2D([], [], color=_TRUE, linewidth=2, linestyle="--", marker="o", markerfacecolor="none", label="truth")
-        )
-    figure.legend(handles=handles, loc="upper right", fontsize=10, frameon=False)
+        handles.append(Line2D([], [], color=_TRUE, linestyle="--", marker="o", mfc="none", markersize=9, label="truth"))
+    figure.legend(handles=handles, loc="upper right", ncols=2, fontsize=11, frameon=False)
     return figure
 
 
@@ -98,20 +99,22 @@ def draw_rotations(
     area = 6 + 60 * weights.numpy() / weights.max().item()
     dots = axes.scatter(longitude[order], latitude[order], s=area[order], c=tilt[order], cmap=_TILT, linewidths=0)
     dots.set_clim(-math.pi, math.pi)
-    for pose, marker, size, colour, label in ((true, "o", 420, _TRUE, "truth"), (best, "s", 240, _BEST, "estimate")):
-        if pose is None:
-            continue
-        u, v, turn = (float(x) for x in sphere_map(rotation_of(pose), axis))
-        inner = _TILT((turn / math.pi + 1) / 2)
-        axes.scatter(u, v, s=size, marker=marker, facecolors="none", edgecolors=[inner], linewidths=5)
-        axes.scatter(u, v, s=size * 1.5, marker=marker, facecolors="none", edgecolors=[colour], linewidths=1.6, label=label)
+    for pose, marker, size in ((true, "o", 900), (best, "s", 500)):
+        if pose is not None:
+            u, v, turn = (float(x) for x in sphere_map(rotation_of(pose), axis))
+            inner = _TILT((turn / math.pi + 1) / 2)
+            edge = _TRUE if marker == "o" else _BEST
+            axes.scatter(u, v, s=size, marker=marker, facecolors="none", edgecolors=[edge], linewidths=5)
+            axes.scatter(u, v, s=size, marker=marker, facecolors="none", edgecolors=[inner], linewidths=2)
     axes.grid(alpha=0.3)
     axes.set_xticks(np.deg2rad([-90, 0, 90]), ["left", "to camera", "right"], fontsize=9)
     axes.set_yticks(np.deg2rad([-60, -30, 0, 30, 60]), ["60° down", "30° down", "0°", "30° up", "60° up"], fontsize=8)
-    axes.set_title(f"Rotation: place = where the object's {_NAMES[axis]} axis points, colour = turn about it", fontsize=11)
-    bar = axes.figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.55, aspect=36, pad=0.05)
+    axes.set_title(
+        f"Rotations: place = where the object's {_NAMES[axis]} axis points, colour = turn about it", fontsize=11, pad=10
+    )
+    bar = axes.figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.5, aspect=40, pad=0.06)
     bar.set_ticks([-math.pi, -math.pi / 2, 0, math.pi / 2, math.pi], labels=["-180°", "-90°", "0°", "90°", "180°"])
-    bar.set_label(f"{_NAMES[(axis + 1) % 3]} axis, clockwise from upwards", fontsize=9)
+    bar.set_label(f"the object's {_NAMES[(axis + 1) % 3]} axis, clockwise from upwards", fontsize=9)
 
 
 def draw_centres(
@@ -193,16 +196,24 @@ def draw_marginals(
                 axes.set_ylabel("share of the belief", fontsize=9)
 
 
-def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 31) -> None:
-    """Draw a weighted histogram; marks: the estimate's value, and the truth's where it is known."""
+def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 25) -> None:
+    """Draw a weighted histogram of the middle 95 % and a margin; what lies beyond is told in words.
+
+    marks: the estimate's value, and the truth's where it is known; both are always within the picture.
+    """
     order = np.argsort(values)
     mass = np.cumsum(weights[order])
-    low, high = (float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)]) for q in (0.005, 0.995))
-    low, high = min([low, *marks]), max([high, *marks])
-    pad = max(0.08 * (high - low), 1e-3)
+    low, high = (float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)]) for q in (0.025, 0.975))
+    margin = max(0.3 * (high - low), 1e-2)
+    low, high = min(low - margin, *marks), max(high + margin, *marks)
+    pad = 0.02 * (high - low)
     axes.hist(values, bins=np.linspace(low - pad, high + pad, bins + 1).tolist(), weights=weights, color=_MASS)
     for value, colour, style in zip(marks, (_BEST, _TRUE), ("-", "--"), strict=False):
         axes.axvline(value, color=colour, linestyle=style, linewidth=1.8)
+    beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
+    if beyond >= 5e-4:
+        axes.text(0.98, 0.96, f"{beyond:.1%} beyond", transform=axes.transAxes, ha="right", va="top", fontsize=8)
     axes.set_xlim(low - pad, high + pad)
+    axes.margins(y=0.15)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)

@@ -5,7 +5,9 @@ Pictures are (H, W, 3) uint8 RGB. Places are pixels (u, v) whose centres have in
 
 from collections.abc import Sequence
 from functools import cache
+from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import matplotlib
@@ -22,6 +24,7 @@ AXES: tuple[Colour, Colour, Colour] = ((235, 60, 50), (60, 190, 70), (70, 130, 2
 INK: Colour = (32, 36, 44)
 PAPER: Colour = (255, 255, 255)
 _HALO: Colour = (0, 0, 0)
+_BEYOND = (200, 200, 200)
 _SHIFT = 4  # OpenCV draws in sixteenths of a pixel
 _FARTHEST = 16_000  # [px] OpenCV's sixteenths overflow beyond
 
@@ -31,29 +34,54 @@ def to_picture(rgb: Tensor) -> np.ndarray:
     return (rgb.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
 
 
-def enlarge(rgb: np.ndarray, factor: int) -> np.ndarray:
-    """Enlarge a picture by a whole factor, smoothly."""
-    if factor == 1:
-        return np.ascontiguousarray(rgb)
-    return np.asarray(cv2.resize(rgb, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC))
+class View(NamedTuple):
+    """A part of a photograph, shown at some size."""
+
+    left: float  # edges in the photograph [px]; its own are -0.5
+    top: float
+    scale: float  # shown pixels for one of the photograph's
+    width: int  # of what is shown [px]
+    height: int
+
+    def show(self, rgb: np.ndarray) -> np.ndarray:
+        """Return what is seen, grey beyond the photograph's edges.  (H, W, 3) uint8 -> (height, width, 3) uint8."""
+        a = 1 / self.scale
+        back = np.array([[a, 0, self.left + a / 2], [0, a, self.top + a / 2]])
+        how = (cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
+        size = (self.width, self.height)
+        return np.asarray(cv2.warpAffine(rgb, back, size, flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=_BEYOND))
+
+    def place(self, pixels: np.ndarray) -> np.ndarray:
+        """Return where the photograph's pixels are shown.  (*, 2) [px] -> (*, 2) [px]."""
+        return (np.asarray(pixels, np.float64) - [self.left, self.top]) * self.scale - 0.5
+
+    def camera(self, K: np.ndarray) -> np.ndarray:
+        """Return the camera matrix of what is shown.  (3, 3) [px] -> (3, 3)."""
+        out = np.array(K, np.float64)
+        out[:2] *= self.scale
+        out[:2, 2] = self.place(np.asarray(K, np.float64)[:2, 2])
+        return out
+
+    def finer(self, factor: int) -> "View":
+        """Return the same part at a multiple of the size."""
+        return View(self.left, self.top, self.scale * factor, self.width * factor, self.height * factor)
 
 
-def enlarge_intrinsics(K: np.ndarray, factor: int) -> np.ndarray:
-    """Return the camera matrix of the enlarged picture, pixel centres at integers.  (3, 3) [px]."""
-    out = np.array(K, np.float64)
-    out[:2] *= factor
-    out[:2, 2] += (factor - 1) / 2
-    return out
+def whole(height: int, width: int, shown: int) -> View:
+    """Return the view of a whole photograph, `shown` pixels wide."""
+    scale = shown / width
+    return View(-0.5, -0.5, scale, shown, round(height * scale))
 
 
-def enlarge_pixels(pixels: np.ndarray, factor: int) -> np.ndarray:
-    """Return where places are in the enlarged picture.  (*, 2) [px] -> (*, 2) [px]."""
-    return np.asarray(pixels, np.float64) * factor + (factor - 1) / 2
-
-
-def factor_for(width: int, wanted: int) -> int:
-    """Return the whole factor that makes a picture at least `wanted` wide."""
-    return max(1, -(-wanted // width))
+def close_up(points: np.ndarray, height: int, width: int, shown: int, margin: float = 0.25) -> View:
+    """Return a view round places (P, 2) [px], as wide to high as the photograph, and no larger than it."""
+    low, high = points.min(0), points.max(0)
+    reach = float(max(1.0, *((high - low) / 2 * (1 + 2 * margin) / [width, height] * max(width, height))))
+    share = min(1.0, 2 * reach / max(width, height))
+    size = np.array([width, height]) * share
+    corner = np.clip((low + high) / 2 - size / 2, -0.5, np.array([width, height]) - 0.5 - size)
+    scale = shown / float(size[0])
+    return View(float(corner[0]), float(corner[1]), scale, shown, round(float(size[1]) * scale))
 
 
 def draw_lines(picture: np.ndarray, paths: Sequence[np.ndarray], colour: Colour, width: int, closed: bool = False) -> None:
@@ -100,20 +128,24 @@ def strip(width: int, text: str, entries: Sequence[tuple[str, Colour]] = (), siz
 
 
 def grid(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> np.ndarray:
-    """Lay tiles out in rows, each cell as large as the largest tile.  -> picture."""
-    height, width = max(t.shape[0] for t in tiles), max(t.shape[1] for t in tiles)
+    """Lay tiles out in rows, each row as high as its highest tile, each column as wide as the widest.  -> picture."""
     columns = min(columns, len(tiles))
-    rows = -(-len(tiles) // columns)
-    sheet = np.full((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), 255, np.uint8)
-    for i, tile in enumerate(tiles):
-        top, left = gap + i // columns * (height + gap), gap + i % columns * (width + gap)
-        sheet[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
-    return sheet
+    width = max(tile.shape[1] for tile in tiles)
+    rows = []
+    for i in range(0, len(tiles), columns):
+        row = np.full(
+            (max(t.shape[0] for t in tiles[i : i + columns]) + gap, columns * (width + gap) + gap, 3), 255, np.uint8
+        )
+        for k, tile in enumerate(tiles[i : i + columns]):
+            left = gap + k * (width + gap)
+            row[: tile.shape[0], left : left + tile.shape[1]] = tile
+        rows.append(row)
+    return np.concatenate(rows)
 
 
 def new_figure(width_px: int, height_px: int, dpi: int = 100) -> Figure:
     """Return an empty figure that draws itself with Agg, without matplotlib's global state."""
-    figure = Figure(figsize=(width_px / dpi, height_px / dpi), dpi=dpi, layout="constrained")
+    figure = Figure(figsize=(width_px / dpi, height_px / dpi), dpi=dpi)
     FigureCanvasAgg(figure)
     return figure
 
@@ -126,7 +158,14 @@ def rasterise(figure: Figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+def to_png(picture: np.ndarray) -> bytes:
+    """Return a picture as the bytes of a PNG, packed quickly rather than tightly."""
+    stream = BytesIO()
+    Image.fromarray(picture).save(stream, "PNG", compress_level=2)
+    return stream.getvalue()
+
+
 def save_picture(picture: np.ndarray, path: Path) -> None:
     """Write a picture as PNG, its folder made where it is missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(picture).save(path)
+    path.write_bytes(to_png(picture))

@@ -12,19 +12,9 @@ from posefilter.contracts import Space
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.pictures.canvas import (
-    AXES,
-    INK,
-    PAPER,
-    draw_dots,
-    enlarge,
-    enlarge_pixels,
-    factor_for,
-    font,
-    grid,
-    strip,
-)
-from posefilter.types import Trace
+from posefilter.pictures.canvas import AXES, Colour, View, close_up, draw_dots, font, grid, strip, whole
+from posefilter.pictures.overlay import axes_legend
+from posefilter.types import Cloud, Trace
 
 _WEIGHT = colormaps["plasma"]
 _REACH = 10.0  # the colours span weights from 1 / _REACH to _REACH times the mean
@@ -38,27 +28,22 @@ def weight_colours(weights: np.ndarray) -> np.ndarray:
 
 
 def draw_cloud(
-    rgb: np.ndarray,
-    pixels: np.ndarray,
-    weights: np.ndarray,
-    axes: np.ndarray | None = None,
-    caption: str = "",
-    width: int = 480,
-    fade: float = 0.45,
+    rgb: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View, axes: np.ndarray | None = None, fade: float = 0.4
 ) -> np.ndarray:
     """Draw particles on a faded photograph, the heaviest on top.
 
     rgb (H, W, 3) uint8; pixels (N, 2) [px]; weights (N,) summing to 1; axes (M, 4, 2) [px]: centre and the ends of x, y and
-    z of the poses whose axes are drawn.
+    z of the poses whose axes are drawn. -> (view.height, view.width, 3) uint8.
     """
-    factor = factor_for(rgb.shape[1], width)
-    picture = enlarge(faded(rgb, fade), factor)
+    fine = view.finer(2)  # drawn at twice the size and shrunk: OpenCV's smallest discs are no discs
+    picture = fine.show(faded(rgb, fade))
     if axes is not None:
-        draw_many_axes(picture, enlarge_pixels(axes, factor))
+        draw_many_axes(picture, fine.place(axes))
     order = np.argsort(weights, kind="stable")
-    radius = max(1.5, picture.shape[1] / 260)
-    draw_dots(picture, enlarge_pixels(pixels[order], factor), weight_colours(weights)[order], radius)
-    return np.concatenate([picture, strip(picture.shape[1], caption, size=14)]) if caption else picture
+    dots = fine.place(pixels[order])
+    radius = max(3.0, fine.width / 200)
+    draw_dots(picture, dots, weight_colours(weights)[order], radius)
+    return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA))
 
 
 def faded(rgb: np.ndarray, share: float) -> np.ndarray:
@@ -67,12 +52,13 @@ def faded(rgb: np.ndarray, share: float) -> np.ndarray:
     return np.asarray(((1 - share) * rgb + share * grey) * (1 - 0.5 * share)).round().astype(np.uint8)
 
 
-def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.55) -> None:
+def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.6) -> None:
     """Draw the axes of several poses, half transparent, in place.  (M, 4, 2) [px]."""
     layer = picture.copy()
     fixed = np.round(np.clip(axes, -16_000, 16_000) * 16).astype(np.int32)
     for k, colour in enumerate(AXES, start=1):
-        cv2.polylines(layer, [np.ascontiguousarray(one) for one in fixed[:, [0, k]]], False, colour, 1, cv2.LINE_AA, 4)
+        lines = [np.ascontiguousarray(one) for one in fixed[:, [0, k]]]
+        cv2.polylines(layer, lines, False, colour, 2, cv2.LINE_AA, 4)
     cv2.addWeighted(layer, opacity, picture, 1 - opacity, 0, picture)
 
 
@@ -83,41 +69,80 @@ def project_axes(poses: torch.Tensor, center: torch.Tensor, length: float, K: to
 
 
 def draw_strip(
-    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, tiles: int = 6, columns: int = 3, title: str = ""
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = "", width: int = 400
 ) -> np.ndarray:
-    """Draw the clouds of one image over the filter's run: `tiles` steps evenly chosen, the first and the last included.
+    """Draw the clouds of one image at several of the filter's steps, the first and the last included.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are dots; those in pose space
-    are dots at the object's centre, and the axes of a few drawn by weight. From the second half of the run on, a cloud of
-    poses is shown enlarged about its mean, since it has grown too small to see.
+    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's; width: of a tile [px]. Particles in pixel space are
+    dots, in eight tiles. Those in pose space are dots at the object's centre, with the axes of a few drawn by weight, in
+    four tiles above four close-ups of the object: the last clouds are too small to be seen on the whole photograph.
     """
-    drawn = [draw_step(rgb, K, trace, image, number, space) for number in steps_shown(len(trace.clouds), tiles)]
-    sheet = grid(drawn, columns)
-    head = strip(sheet.shape[1], title or "The particles' way over the iterations", size=18)
-    return np.concatenate([head, sheet, weight_scale(sheet.shape[1])])
+    height, wide = rgb.shape[:2]
+    frame = whole(height, wide, width)
+    if isinstance(space, PoseSpace):
+        steps = [PoseStep(K, trace, image, number, space) for number in steps_shown(len(trace.clouds), 4)]
+        near = close_up(steps[-1].extent(), height, wide, width, margin=0.1)
+        tiles = [headed(one.draw(rgb, frame), one.caption) for one in steps] + [one.draw(rgb, near) for one in steps]
+        legend = axes_legend()
+    else:
+        tiles = []
+        for number in steps_shown(len(trace.clouds), 8):
+            cloud = trace.clouds[number]
+            state, weights = cloud.state[image].detach().cpu().numpy(), weights_of(cloud, image).numpy()
+            off = ((state < -0.5) | (state > [wide - 0.5, height - 0.5])).any(1).mean()
+            caption = caption_of(trace, image, number, "px") + (f", {off:.0%} off the frame" if off else "")
+            tiles.append(headed(draw_cloud(rgb, state, weights, frame), caption))
+        legend = []
+    sheet = grid(tiles, 4)
+    head = strip(sheet.shape[1], title or "Particles over the filter's iterations", size=22)
+    return np.concatenate([head, sheet, weight_scale(sheet.shape[1], legend)])
+
+
+def headed(tile: np.ndarray, caption: str) -> np.ndarray:
+    """Put a caption above a tile."""
+    return np.concatenate([strip(tile.shape[1], caption, size=16), tile])
+
+
+def caption_of(trace: Trace, image: int, number: int, unit: str) -> str:
+    """Tell which step it is, its noise level, and how many particles are effective."""
+    sigma = trace.steps[number].sigma
+    level = float(sigma if sigma.ndim == 0 else sigma[image]) * (1000 if unit == "mm" else 1)
+    weights = weights_of(trace.clouds[number], image)
+    return f"step {number}: noise {level:.3g} {unit}, {float(1 / weights.square().sum() / len(weights)):.0%} effective"
+
+
+def weights_of(cloud: Cloud, image: int) -> torch.Tensor:
+    """Return one image's weights, summing to 1.  -> (N,) float64."""
+    return torch.softmax(cloud.log_weights[image].detach().cpu().double(), 0)
 
 
 def steps_shown(count: int, most: int) -> list[int]:
     """Return at most `most` of `count` steps, evenly spread, the first and the last among them."""
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(most, count))})
+    return sorted({round(x) for x in np.linspace(0, count - 1, min(most, count)).tolist()})
 
 
-def draw_step(rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, number: int, space: Space) -> np.ndarray:
-    """Draw one step of one image."""
-    cloud, step = trace.clouds[number], trace.steps[number]
-    state = cloud.state[image].detach().cpu().double()
-    weights = torch.softmax(cloud.log_weights[image].detach().cpu().double(), 0)
-    sigma = float(step.sigma if step.sigma.ndim == 0 else step.sigma[image])
-    ess = float(1 / weights.square().sum() / len(weights))
-    noise = f"{1000 * sigma:.3g} mm" if isinstance(space, PoseSpace) else f"{sigma:.3g} px"
-    caption = f"step {number + 1} of {len(trace.clouds)}: noise {noise}, {ess:.0%} effective"
-    if not isinstance(space, PoseSpace):
-        return draw_cloud(rgb, state.numpy(), weights.numpy(), caption=caption)
-    camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
-    center = torch.tensor(space.center, dtype=torch.float64)
-    pixels = project(origin_of(state, center), camera).numpy()
-    axes = project_axes(state[spread_choice(weights, 24)], center, 0.6 * space.radius, camera)
-    return draw_cloud(rgb, pixels, weights.numpy(), axes, caption)
+class PoseStep:
+    """One step of a filter whose particles are poses, projected."""
+
+    def __init__(self, K: np.ndarray, trace: Trace, image: int, number: int, space: PoseSpace) -> None:
+        camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
+        center = torch.tensor(space.center, dtype=torch.float64)
+        state = trace.clouds[number].state[image].detach().cpu().double()
+        weights = weights_of(trace.clouds[number], image)
+        self.weights = weights.numpy()
+        self.pixels = project(origin_of(state, center), camera).numpy()
+        self.axes = project_axes(state[spread_choice(weights, 24)], center, 0.6 * space.radius, camera)
+        self.reach = space.radius * float(camera[0, 0]) / max(float(weights @ origin_of(state, center)[:, 2]), 0.05)
+        self.caption = caption_of(trace, image, number, "mm")
+
+    def extent(self) -> np.ndarray:
+        """Return two corners that hold the object, as the mean of the cloud has it.  -> (2, 2) [px]."""
+        middle = self.weights @ self.pixels
+        return np.stack([middle - 0.7 * self.reach, middle + 0.7 * self.reach])
+
+    def draw(self, rgb: np.ndarray, view: View) -> np.ndarray:
+        """Draw it."""
+        return draw_cloud(rgb, self.pixels, self.weights, view, self.axes)
 
 
 def spread_choice(weights: torch.Tensor, count: int) -> torch.Tensor:
@@ -126,22 +151,12 @@ def spread_choice(weights: torch.Tensor, count: int) -> torch.Tensor:
     return torch.searchsorted(weights.cumsum(0), at).clamp(max=len(weights) - 1)
 
 
-def weight_scale(width: int, size: int = 14) -> np.ndarray:
+def weight_scale(width: int, legend: Sequence[tuple[str, Colour]], size: int = 18) -> np.ndarray:
     """Return a strip that explains the colours."""
-    from PIL import Image, ImageDraw
-
-    height, long = round(size * 2.6), 260
-    sheet = Image.new("RGB", (width, height), PAPER)
-    pen, letters = ImageDraw.Draw(sheet), font(size)
-    text = "weight of a particle, over the mean weight:   1/10"
-    pen.text((10, height / 2), text, fill=INK, font=letters, anchor="lm")
-    left = int(10 + letters.getlength(text) + 10)
-    ramp = (_WEIGHT(np.linspace(0, 1, long))[None, :, :3] * 255).astype(np.uint8).repeat(height // 2, 0)
-    sheet.paste(Image.fromarray(ramp), (left, height // 4))
-    pen.text((left + long + 10, height / 2), "10", fill=INK, font=letters, anchor="lm")
-    return np.asarray(sheet)
-
-
-def axes_legend() -> Sequence[tuple[str, tuple[int, int, int]]]:
-    """Return the legend of the axes' colours."""
-    return list(zip("xyz", AXES, strict=True))
+    sheet = strip(width, "weight over the mean weight:   1/10", legend, size).copy()
+    left = int(18 + font(size).getlength("weight over the mean weight:   1/10"))
+    ramp = (_WEIGHT(np.linspace(0, 1, 240))[None, :, :3] * 255).astype(np.uint8)
+    sheet[8:-8, left : left + 240] = ramp
+    end = strip(50, "10", size=size)
+    sheet[:, left + 240 : left + 290] = end
+    return sheet

@@ -27,7 +27,8 @@ def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str =
     figure = new_figure(1000, 560)
     columns = 3
     rows = -(-len(curves) // columns)
-    panels = figure.subplots(rows, columns, squeeze=False)
+    spacing = {"left": 0.07, "right": 0.98, "bottom": 0.1, "top": 0.86, "hspace": 0.55, "wspace": 0.3}
+    panels = figure.subplots(rows, columns, squeeze=False, gridspec_kw=spacing)
     for axes, (name, values) in zip(panels.flat, curves.items(), strict=False):
         label, unit = _TITLES.get(name, (name.replace("_", " "), ""))
         shown = np.asarray(values, float) * {"mm": 1000, "degrees": 180 / np.pi}.get(unit, 1)
@@ -42,5 +43,5 @@ def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str =
         axes.spines[["top", "right"]].set_visible(False)
     for axes in panels.flat[len(curves) :]:
         axes.set_axis_off()
-    figure.suptitle(f"{title}: means over {images} image{'s' * (images != 1)}", fontsize=13)
+    figure.suptitle(f"{title}: means over {images} image{'s' * (images != 1)}", fontsize=14, x=0.02, ha="left")
     return figure

@@ -14,11 +14,12 @@ from posefilter.pictures.canvas import (
     ESTIMATE,
     TRUTH,
     Colour,
+    View,
+    close_up,
+    draw_dots,
     draw_lines,
-    enlarge,
-    enlarge_intrinsics,
-    factor_for,
     strip,
+    whole,
 )
 
 Shape = Mesh | np.ndarray | Tensor  # a mesh, or the (V, 3) vertices of a convex hull [m]
@@ -37,21 +38,51 @@ def draw_overlay(
     label: str = "estimate",
     width: int = WIDTH,
 ) -> np.ndarray:
-    """Draw where a pose puts the object, and where the truth does; the legend is on a strip below the photograph.
+    """Draw where a pose puts the object, and where the truth does; caption and legend are on a strip below the photograph.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]. -> (s H + strip, s W, 3) uint8, s the
-    least whole factor that gives `width` pixels.
+    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]; width: of the result at least [px].
+    -> (s H + strip, s W, 3) uint8, enlarged by s = max(1, width / W).
     """
-    factor = factor_for(rgb.shape[1], width)
-    picture = enlarge(rgb, factor)
-    K = enlarge_intrinsics(K, factor)
-    entries: list[tuple[str, Colour]] = []
+    picture = overlay(rgb, K, pose, shape, whole(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1])), colour, truth)
+    entries = [(label, colour), *axes_legend()]
+    return np.concatenate(
+        [picture, strip(picture.shape[1], caption, entries if truth is None else [("truth", TRUTH), *entries])]
+    )
+
+
+def overlay(
+    rgb: np.ndarray,
+    K: np.ndarray,
+    pose: np.ndarray,
+    shape: Shape,
+    view: View,
+    colour: Colour = ESTIMATE,
+    truth: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the same without writing, of the part of the photograph that `view` shows."""
+    picture = view.show(rgb)
+    shown = view.camera(K)
     if truth is not None:
-        draw_pose(picture, K, np.asarray(truth), shape, TRUTH)
-        entries.append(("truth", TRUTH))
-    draw_pose(picture, K, np.asarray(pose), shape, colour)
-    entries += [(label, colour), *zip("xyz", AXES, strict=True)]
-    return np.concatenate([picture, strip(picture.shape[1], caption, entries)])
+        draw_pose(picture, shown, np.asarray(truth, np.float64), shape, TRUTH)
+    draw_pose(picture, shown, np.asarray(pose, np.float64), shape, colour)
+    return picture
+
+
+def view_of_poses(poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, height: int, width: int, shown: int) -> View:
+    """Return a close-up of where poses put the object; the whole frame where that is nowhere."""
+    bounds = np.stack([vertices_of(shape).min(0), vertices_of(shape).max(0)])
+    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    found = []
+    for pose in poses:
+        camera = corners @ pose[:3, :3].T + pose[:3, 3]
+        if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
+            found.append(np.clip(_project(camera, np.asarray(K, np.float64)), 0, [width - 1, height - 1]))
+    return close_up(np.concatenate(found), height, width, shown) if found else whole(height, width, shown)
+
+
+def axes_legend() -> list[tuple[str, Colour]]:
+    """Return what the axes' colours mean."""
+    return list(zip("xyz", AXES, strict=True))
 
 
 def draw_pose(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2) -> None:
@@ -59,11 +90,11 @@ def draw_pose(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape
     if not np.isfinite(pose).all():
         return
     draw_lines(picture, outlines_of(pose, shape, K, *picture.shape[:2]), colour, width, closed=True)
-    draw_axes(picture, K, pose, shape, width)
+    draw_axes(picture, K, pose, shape, colour, width)
 
 
-def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, width: int = 2) -> None:
-    """Draw the object's axes at the centre of its bounding box: x red, y green, z blue, the farthest first."""
+def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2) -> None:
+    """Draw the object's axes at the centre of its box: x red, y green, z blue, the farthest first; knobs in `colour`."""
     points = vertices_of(shape)
     low, high = points.min(0), points.max(0)
     length = 0.3 * float(np.linalg.norm(high - low))
@@ -74,6 +105,8 @@ def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape
     pixels = _project(camera, K)
     for axis in np.argsort(-camera[1:, 2]):
         draw_lines(picture, [pixels[[0, axis + 1]]], AXES[axis], width)
+        draw_dots(picture, pixels[[axis + 1]], np.array([[0, 0, 0]]), width + 2)
+        draw_dots(picture, pixels[[axis + 1]], np.array([colour]), width + 1)
 
 
 def outlines_of(pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, width: int) -> list[np.ndarray]:
