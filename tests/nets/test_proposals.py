@@ -94,10 +94,13 @@ def test_noisy_votes_scatter_round_the_pose() -> None:
     assert 1e-3 < shift.median() < 0.03
 
 
-def test_an_image_without_depth_is_refused() -> None:
-    said, cells, _ = world()
-    with pytest.raises(ValueError, match="no known depth"):
-        draw_poses(said, cells._replace(valid=torch.zeros_like(cells.valid)), CENTER, RADIUS, 4, torch.Generator())
+def test_an_image_without_depth_does_not_disturb_the_others() -> None:
+    said, cells, pose = world()
+    both = Coordinates(*(torch.cat([x, x]) for x in said))
+    blind = Cells(torch.cat([torch.zeros_like(cells.point), cells.point]), torch.cat([~cells.valid, cells.valid]))
+    got = draw_poses(both, blind, CENTER, RADIUS, 50, torch.Generator().manual_seed(1))
+    assert torch.isfinite(got).all()
+    assert ((got[1, :, :3, 3] - pose[0, :3, 3]).norm(dim=-1) < 3e-3).float().mean() > 0.9
 
 
 def test_the_loss_is_least_for_the_truth() -> None:

@@ -93,6 +93,8 @@ class PosePF(PoseEstimator):
         """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
         if scene.said is None or scene.cells is None:
             raise UserError("initialise=from_proposals needs the proposal network; choose proposals=dense")
+        if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
+            raise UserError("depth: not one pixel of an image has a known depth, so no pose can be proposed")
         said = Coordinates(*(x.detach() for x in scene.said))
         return draw_poses(said, scene.cells, self._center(), self.model.radius, particles, generator)
 

@@ -156,13 +156,12 @@ def draw_poses(
     """Draw poses from the cells' votes.  -> (B, count, 4, 4) camera_from_object [m].
 
     A seed cell is drawn by p(object) / scale, `votes` more by the same weight within 2 radii of it; their weighted Kabsch
-    fit is one pose. Images in which no depth is known raise ValueError: nothing can be said of them.
+    fit is one pose. Where no cell of an image has a known depth the poses mean nothing.
     """
     B = len(said.logit)
     weight = (torch.sigmoid(said.logit) + 1e-4) / (said.log_scale.exp() + 0.05) * cells.valid
     weight = weight.flatten(1)
-    if not bool((weight.sum(1) > 0).all()):
-        raise ValueError("an image has no known depth at all, so no pose can be proposed")
+    weight = torch.where((weight > 0).any(1, keepdim=True), weight, torch.ones_like(weight))
     point, thing = cells.point.flatten(1, 2), said.coordinate.flatten(1, 2) * radius + center
     seed = torch.multinomial(weight, count, replacement=True, generator=generator)
     pick = lambda x, index: x.gather(1, index.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, index.shape[1:])  # noqa: E731
