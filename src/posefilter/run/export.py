@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from posefilter.errors import UserError
+from posefilter.models.compact import pack, unpack
 from posefilter.run.job import Job
 from posefilter.run.method import method_of, read_checkpoint
 
@@ -19,7 +20,7 @@ def export(job: Job) -> None:
     out = Path(job.cfg.out)
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
-    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.half)
+    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
     method_of(stripped)  # raises where it could not be used
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.name}.part")
@@ -32,14 +33,14 @@ def export(job: Job) -> None:
     print(f"{out}: {size:.2f} MB")
 
 
-def strip(checkpoint: dict[str, Any], points: int, half: bool = False) -> dict[str, Any]:
+def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dict[str, Any]:
     """Return a checkpoint without optimizer, loops and callbacks, its object with so many surface points at most.
 
-    half: weights in 16 bits, which halves the file; they are read back into 32.
+    compact: kernels in 8 bits and the rest in 16, a quarter of the size (models/compact.py); they are read back into 32.
     """
     kept = {key: checkpoint[key] for key in _KEPT if key in checkpoint}
-    model, weights = dict(kept["object_model"]), kept["state_dict"]
+    model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
     every = max(1, -(-len(model["points"]) // points))
     model["points"] = model["points"][::every].clone()
-    state = {key: value.half() if half and value.is_floating_point() else value.clone() for key, value in weights.items()}
+    state = pack(weights) if compact else {key: value.clone() for key, value in weights.items()}
     return {**kept, "state_dict": state, "object_model": model}

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
+from posefilter.models.compact import unpack
 from posefilter.run.build import hint, instantiate, locate
 from posefilter.run.job import Job
 from posefilter.run.pieces import changed
@@ -75,7 +76,7 @@ def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) 
     recipe = checkpoint["recipe"]
     recipe = {**recipe, "settings": changed(recipe["settings"], wanted or {})}
     method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
-    missing, foreign = method.load_state_dict(checkpoint["state_dict"], strict=False)
+    missing, foreign = method.load_state_dict(unpack(checkpoint["state_dict"]), strict=False)
     lost = [key for key in missing if not key.startswith("scores.")]
     if lost or foreign:
         raise UserError(f"checkpoint: its weights do not fit the method ({len(lost)} missing, {len(foreign)} unknown)")
