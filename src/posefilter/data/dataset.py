@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from numpy.random import Generator
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from posefilter.data.cache import FrameCache
 from posefilter.data.frames import FrameRecord, Sample
@@ -75,6 +75,7 @@ class EpochShuffle(Sampler[int]):
         if length == 0:
             raise UserError("no training frames are left: see data.split, data.min_visibility and data.object")
         self._length, self._seed, self._tell, self._epoch = length, seed, tell, 0
+        self._skip = 0
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -82,9 +83,40 @@ class EpochShuffle(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         """Yield the epoch's order."""
-        return iter(np.random.default_rng([self._seed, self._epoch, 1 << 20]).permutation(self._length).tolist())
+        order = np.random.default_rng([self._seed, self._epoch, 1 << 20]).permutation(self._length).tolist()
+        skip, self._skip = self._skip, 0
+        return iter(order[skip:])
+
+    def skip(self, frames: int) -> None:
+        """Leave out the first frames of the next epoch: a run that was cut short has seen them."""
+        self._skip = frames
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch."""
         self._epoch = epoch
         self._tell(epoch)
+
+
+class ResumableLoader(DataLoader[Batch]):
+    """A loader that knows how many batches it has given; Lightning keeps that in checkpoints, and hands it back."""
+
+    _given = 0
+    _start = 0
+
+    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
+        """Yield the epoch's batches; those that follow the last one given, where the loader was handed its state."""
+        start, self._start = self._start, 0
+        if isinstance(self.sampler, EpochShuffle):
+            self.sampler.skip(start * int(self.batch_size or 1))
+            self._given = start
+        for batch in super().__iter__():
+            self._given += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        """Return how far the epoch is."""
+        return {"given": self._given}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on from there; after a whole epoch, from the start of the next."""
+        self._start = state["given"] % max(len(self), 1)

@@ -15,7 +15,7 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
 from posefilter.data.cache import CACHES, FrameCache, Prepared, open_cache
-from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.dataset import EpochShuffle, FrameDataset, ResumableLoader
 from posefilter.data.frames import BadData, FrameRecord, Reader, Sample
 from posefilter.data.generated import ensure_scenes
 from posefilter.data.meshes import BUILTIN, MeshStore, object_model
@@ -262,7 +262,7 @@ class PoseDataModule(LightningDataModule):
     def _loader(self, dataset: FrameDataset, batch_size: int, **how: Any) -> DataLoader[Batch]:
         if self._workers > 0:  # a forked worker would wait for ever for OpenCV threads that only its parent has
             cv2.setNumThreads(1)
-        return DataLoader(
+        return ResumableLoader(
             dataset,
             batch_size=batch_size,
             num_workers=self._workers,

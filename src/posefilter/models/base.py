@@ -116,6 +116,7 @@ class PoseEstimator(LightningModule):
         for name, value in means.items():
             self.watch(name, value.detach())
         self.log("train/total", total.detach(), prog_bar=True)
+        self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return total
 
     def watch(self, name: str, value: Tensor) -> None:

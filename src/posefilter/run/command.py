@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.errors import UserError
 from posefilter.run.build import hint
@@ -126,6 +126,8 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         if found:
             key = found[1]
             return f"{key}: there is no such setting{near(key, known_keys(name, conf, arguments, key))}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: is missing; give {error.full_key}=..."
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
         return f"{error.full_key}: {first_line(error)}"
     return first_line(error)
