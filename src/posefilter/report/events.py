@@ -1,0 +1,52 @@
+"""Read TensorBoard's event files: scalars as curves, and the latest picture of each tag."""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALARS, EventAccumulator
+
+from posefilter.report.pictures import Picture, words
+
+
+class Curve(NamedTuple):
+    """One scalar over a run; the three are as long as each other."""
+
+    steps: tuple[int, ...]
+    values: tuple[float, ...]
+    times: tuple[float, ...]  # [s] since the epoch, when it was logged
+
+
+def read_events(folder: Path) -> tuple[dict[str, Curve], list[Picture]]:
+    """Return the scalars by tag and the latest picture of each tag; both empty where nothing was logged.
+
+    A file that is still being written is read as far as it goes; steps that a resumed run took again count once.
+    """
+    if not any(event_files(folder)):
+        return {}, []
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of every step that was taken again
+    log = EventAccumulator(str(folder), size_guidance={SCALARS: 0, IMAGES: 1})
+    log.Reload()
+    tags = log.Tags()
+    curves = {}
+    for tag in tags["scalars"]:
+        events = log.Scalars(tag)
+        rows = zip(*((e.step, e.value, e.wall_time) for e in events), strict=True)
+        curves[tag] = Curve(*(tuple(row) for row in rows))
+    pictures = []
+    for tag in tags["images"]:
+        latest = log.Images(tag)[-1]
+        pictures.append(Picture(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
+    return curves, pictures
+
+
+def event_files(folder: Path) -> Iterator[Path]:
+    """Return the event files of a run."""
+    return folder.glob("events.out.tfevents.*")
+
+
+def not_yet_in(pictures: list[Picture], files: list[Picture]) -> list[Picture]:
+    """Return the logged pictures that no file shows: `filter/health` is what `filter_health.png` is."""
+    known = {words(picture.name) for picture in files}
+    return [picture for picture in pictures if words(picture.name) not in known]

@@ -1,0 +1,154 @@
+"""Draw small charts, each for light and for dark pages."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image
+
+from posefilter.pictures.canvas import new_figure, rasterise
+
+WIDTH_PX, HEIGHT_PX, FINER = 380, 250, 2  # as shown; drawn at twice that for sharp screens
+NOISY = 60  # points, from which on a line is drawn smoothed over its own faint self
+
+
+class Theme(NamedTuple):
+    """The colours of a page."""
+
+    name: str
+    paper: str
+    ink: str
+    soft: str
+    lines: tuple[str, ...]
+
+
+LIGHT = Theme("light", "#ffffff", "#1c2430", "#8a93a3", ("#2563c9", "#d9650d", "#0f8a5f", "#a03bb0", "#b58900", "#5b6675"))
+DARK = Theme("dark", "#171b23", "#e4e8ef", "#7d8797", ("#7aa8ff", "#ffa657", "#4fcf9d", "#d79be6", "#e6cf6a", "#a5afbf"))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line, or the dots of one kind."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] = ()  # of a band about the line, where there is one
+    high: Sequence[float] = ()
+    dots: Sequence[tuple[float, float]] = ()  # single runs, whose mean the line is
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart.  `categories`: names of 0, 1, ... along the side, instead of a horizontal axis of numbers."""
+
+    title: str
+    xlabel: str
+    unit: str
+    lines: Sequence[Line]
+    limits: tuple[float, float] | None = None  # of y
+    categories: Sequence[str] = ()
+    log_x: bool = False
+    joined: bool = True  # whether a line is one, or only its dots
+
+
+def draw(panel: Panel, theme: Theme) -> bytes:
+    """Return a chart as a PNG of few colours."""
+    tall = HEIGHT_PX if not panel.categories else 74 + 25 * max(len(panel.categories), 3)
+    figure = new_figure(WIDTH_PX * FINER, tall * FINER, dpi=100 * FINER)
+    figure.set_layout_engine("constrained")
+    figure.set_facecolor(theme.paper)
+    axes = figure.subplots()
+    for number, line in enumerate(panel.lines):
+        colour = theme.lines[number % len(theme.lines)]
+        if panel.categories:
+            draw_across(axes, line, colour)
+        else:
+            draw_line(axes, line, colour, panel.joined)
+    dress(axes, panel, theme)
+    return to_small_png(figure)
+
+
+def draw_line(axes: Axes, line: Line, colour: str, joined: bool) -> None:
+    """Draw one line over numbers."""
+    if len(line.x) > NOISY:
+        axes.plot(line.x, line.y, color=colour, linewidth=0.7, alpha=0.3)
+        axes.plot(line.x, smooth(line.y), color=colour, linewidth=1.7, label=line.label)
+        return
+    if len(line.low):
+        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.16, linewidth=0)
+    style = "o-" if joined else "o"
+    few = len(line.x) <= 20
+    axes.plot(line.x, line.y, style if few else "-", color=colour, linewidth=1.7, markersize=4.5, label=line.label)
+    if line.dots:
+        axes.plot(*zip(*line.dots, strict=True), "o", color=colour, alpha=0.45, markersize=3.5, linewidth=0)
+
+
+def draw_across(axes: Axes, line: Line, colour: str) -> None:
+    """Draw values to the right of named rows: range, single runs, mean."""
+    if len(line.low):
+        axes.hlines(line.x, line.low, line.high, color=colour, linewidth=5, alpha=0.25)
+    if line.dots:
+        rows, values = zip(*line.dots, strict=True)
+        axes.plot(values, rows, "o", color=colour, alpha=0.45, markersize=3.5)
+    axes.plot(line.y, line.x, "o", color=colour, markersize=6.5, label=line.label)
+
+
+def dress(axes: Axes, panel: Panel, theme: Theme) -> None:
+    """Give a chart its title, axes, legend and colours."""
+    axes.set_facecolor(theme.paper)
+    title = f"{panel.title} [{panel.unit}]" if panel.unit else panel.title
+    axes.set_title(title, fontsize=10, color=theme.ink, loc="left", fontweight="bold")
+    axes.tick_params(colors=theme.soft, labelcolor=theme.ink, labelsize=8.5, length=3)
+    axes.grid(color=theme.soft, alpha=0.25, linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(theme.soft)
+    if panel.categories:
+        axes.set_yticks(range(len(panel.categories)), [shortened(name) for name in panel.categories])
+        axes.set_ylim(len(panel.categories) - 0.5, -0.5)
+        if panel.limits:
+            axes.set_xlim(*panel.limits)
+    else:
+        axes.set_xlabel(panel.xlabel, fontsize=8.5, color=theme.ink)
+        if panel.log_x:
+            axes.set_xscale("log")
+            ticks = sorted({x for line in panel.lines for x in line.x})
+            axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+            axes.minorticks_off()
+        else:
+            axes.locator_params(axis="x", nbins=6)
+        if panel.limits:
+            axes.set_ylim(*panel.limits)
+    if len(panel.lines) > 1:
+        axes.legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2)
+
+
+def smooth(values: Sequence[float]) -> np.ndarray:
+    """Return a running mean over about a twelfth of a line, narrower at its ends; what is not finite does not count."""
+    y = np.asarray(values, float)
+    reach = max(1, len(y) // 24)
+    known = np.isfinite(y)
+    total = np.concatenate([[0.0], np.cumsum(np.where(known, y, 0))])
+    count = np.concatenate([[0], np.cumsum(known)])
+    at = np.arange(len(y))
+    room = np.minimum(reach, np.minimum(at, len(y) - 1 - at))
+    low, high = at - room, at + room + 1
+    n = count[high] - count[low]
+    return np.where(n > 0, (total[high] - total[low]) / np.maximum(n, 1), math.nan)
+
+
+def shortened(name: str, most: int = 22) -> str:
+    """Return a name that fits beside a chart."""
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def to_small_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG of 128 colours, a third of the plain one."""
+    stream = BytesIO()
+    Image.fromarray(rasterise(figure)).quantize(128, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()

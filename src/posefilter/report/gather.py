@@ -1,0 +1,113 @@
+"""Gather what a run's folder holds; what it lacks is written down rather than fatal."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from posefilter.errors import UserError
+from posefilter.report.events import Curve, event_files, not_yet_in, read_events
+from posefilter.report.pictures import Picture, read_pictures
+
+MARKS = ("metrics.json", ".hydra/config.yaml")
+SWEEP_MARKS = ("multirun.yaml", "summary.csv")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is known of one run."""
+
+    folder: Path
+    metrics: dict[str, Any]  # metrics.json; empty before the test
+    metrics_train: dict[str, Any]  # of its training, where an evaluation has since written its own; else empty
+    config: dict[str, Any]  # as composed, interpolations unresolved
+    choices: dict[str, str]  # which file of each group
+    overrides: list[str]  # as typed
+    data: dict[str, Any]  # data.json
+    curves: dict[str, Curve]
+    pictures: list[Picture]
+    missing: list[str] = field(default_factory=list)  # a sentence each
+
+    def named(self, key: str) -> str:
+        """Return the run's model, loss or variant; "?" where nothing tells it."""
+        return str(self.metrics.get(key) or self.choices.get(key) or "?")
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run's folder.  Raises UserError where it is none, or holds a file that cannot be read."""
+    check_run(folder)
+    metrics = read_json(folder / "metrics.json")
+    config, hydra = read_yaml(folder / ".hydra" / "config.yaml"), read_yaml(folder / ".hydra" / "hydra.yaml")
+    runtime = (hydra.get("hydra") or {}).get("runtime") or {}
+    choices = {str(k): str(v) for k, v in (runtime.get("choices") or {}).items() if v is not None}
+    said = (hydra.get("hydra") or {}).get("overrides") or {}
+    curves, logged = read_events(folder)
+    files = read_pictures(folder / "figures")
+    return Run(
+        folder=folder,
+        metrics=metrics,
+        metrics_train=read_json(folder / "metrics_train.json"),
+        config=config,
+        choices=choices,
+        overrides=[str(o) for o in said.get("task") or metrics.get("overrides") or []],
+        data=read_json(folder / "data.json"),
+        curves=curves,
+        pictures=[*files, *not_yet_in(logged, files)],
+        missing=missing(folder, bool(files or logged)),
+    )
+
+
+def check_run(folder: Path) -> None:
+    """Raise UserError unless a folder is a run's."""
+    if not folder.is_dir():
+        raise UserError(f"run={folder}: no such folder")
+    if any((folder / mark).is_file() for mark in MARKS) or any(event_files(folder)):
+        return
+    if is_sweep(folder):
+        raise UserError(f"run={folder}: is a sweep's folder; give it as sweep={folder}")
+    raise UserError(f"run={folder}: is no run's folder (it has no metrics.json, no .hydra/config.yaml and no events)")
+
+
+def is_sweep(folder: Path) -> bool:
+    """Tell whether a folder is a sweep's."""
+    return any((folder / mark).is_file() for mark in SWEEP_MARKS)
+
+
+def missing(folder: Path, pictures: bool) -> list[str]:
+    """Return what a run's folder lacks, and what that means."""
+    lacks = (
+        ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
+        ("No TensorBoard events, so no curves and no timings of the training.", not any(event_files(folder))),
+        ("No pictures in figures/ or in the events, so no gallery.", not pictures),
+        ("No .hydra folder: what was configured is not known.", not (folder / ".hydra" / "config.yaml").is_file()),
+        ("No data.json: how its data were split is not known.", not (folder / "data.json").is_file()),
+    )
+    return [sentence for sentence, true in lacks if true]
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON file's object, empty where there is no file.  Raises UserError where it is malformed."""
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is no JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: should hold one JSON object")
+    return content
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return a YAML file's mapping, empty where there is no file.  Raises UserError where it is malformed."""
+    if not path.is_file():
+        return {}
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is no YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: should hold one mapping")
+    return content

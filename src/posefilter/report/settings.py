@@ -1,0 +1,36 @@
+"""Tell in which settings a run differs from the defaults of its method."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+PASSING = ("out", "folder", "console", "threads", "resume", "debug")  # where and how a run was made, not what it was
+
+
+class Change(NamedTuple):
+    """One setting; an absent one is None."""
+
+    key: str
+    default: str | None
+    own: str | None
+
+
+def changes(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[Change]:
+    """Return the settings that differ, in the run's order, those that it lacks last."""
+    own, usual = leaves(config), leaves(default)
+    keys = [key for key in (*own, *(k for k in usual if k not in own)) if key.split(".")[0] not in PASSING]
+    return [Change(key, usual.get(key), own.get(key)) for key in keys if own.get(key) != usual.get(key)]
+
+
+def leaves(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return a configuration's settings by dotted key; a list is one setting, unless it holds sections."""
+    out: dict[str, str] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+            value = {str(i): item for i, item in enumerate(value)}
+        if isinstance(value, Mapping):
+            out |= leaves(value, f"{name}.")
+        else:
+            out[name] = value if isinstance(value, str) else json.dumps(value)
+    return out

@@ -1,0 +1,169 @@
+"""Gather a sweep: its runs, the settings in which they differ, and runs that differ in nothing but the seed as one."""
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from posefilter.errors import UserError
+from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
+from posefilter.report.signs import flatten
+
+SILENT = ("out", "resume", "console", "threads")
+CSV_NAMES = {
+    "add_auc": "add/auc",
+    "add_recall_01d": "add/recall_01d",
+    "add_median_mm": "add/median_mm",
+    "add_s_auc": "add_s/auc",
+}
+CSV_SAME = ("iou", "particles_on_object", "seconds_per_image")
+Value = int | float | str
+
+
+class Job(NamedTuple):
+    """One run that ended."""
+
+    place: dict[str, Value]  # its value on each axis
+    numbers: dict[str, float]
+    folder: str  # within the sweep's
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is known of a sweep."""
+
+    folder: Path
+    axes: list[str]  # swept settings
+    jobs: list[Job]
+    unfinished: list[str]  # folders of runs without a result
+
+    @property
+    def shown(self) -> list[str]:
+        """Return the axes other than the seed; the seed where there is no other."""
+        return [axis for axis in self.axes if axis != "seed"] or self.axes
+
+    def values(self, axis: str) -> list[Value]:
+        """Return the values of an axis, in its order."""
+        return list(dict.fromkeys(job.place[axis] for job in self.jobs))
+
+
+class Group(NamedTuple):
+    """Runs that differ in nothing but the seed."""
+
+    place: dict[str, Value]
+    jobs: list[Job]
+
+    def of(self, name: str) -> list[float]:
+        """Return a figure of each of its runs that has it."""
+        return [job.numbers[name] for job in self.jobs if name in job.numbers]
+
+
+def read_sweep(folder: Path) -> Sweep:
+    """Read a sweep's folder: its runs' metrics, or where they are not there its summary.csv.
+
+    Raises UserError where the folder is no sweep's, or nothing in it has ended.
+    """
+    if not folder.is_dir():
+        raise UserError(f"sweep={folder}: no such folder")
+    found = sorted(path.parent for path in folder.rglob("metrics.json") if path.parent != folder)
+    if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
+        kind = "is a run's folder; give it as run=" + str(folder) if (folder / ".hydra").is_dir() else "is no sweep's folder"
+        raise UserError(f"sweep={folder}: {kind} (no run with a metrics.json below it, no multirun.yaml, no summary.csv)")
+    started = sorted(path.parent.parent for path in folder.rglob(".hydra/overrides.yaml"))
+    unfinished = [str(path.relative_to(folder)) for path in started if path not in found and path != folder]
+    if found:
+        axes, jobs = jobs_of_runs(folder, found)
+    elif (folder / "summary.csv").is_file():
+        axes, jobs = jobs_of_csv(folder / "summary.csv")
+    else:
+        raise UserError(f"sweep={folder}: none of its {len(started)} runs has ended yet")
+    keys = [key_of(declared(folder).get(axis, [])) for axis in axes]
+    jobs.sort(key=lambda job: [key(job.place[axis]) for axis, key in zip(axes, keys, strict=True)])
+    return Sweep(folder, axes, jobs, unfinished)
+
+
+def jobs_of_runs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
+    """Return the settings in which runs differ, and the runs."""
+    metrics = [read_json(path / "metrics.json") for path in found]
+    said = [dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o) for own in metrics]
+    keys = dict.fromkeys(key for pairs in said for key in pairs)
+    axes = [key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in said}) > 1]
+    jobs = [
+        Job({axis: number(pairs.get(axis, "default")) for axis in axes}, flatten(own), str(path.relative_to(folder)))
+        for path, own, pairs in zip(found, metrics, said, strict=True)
+    ]
+    return axes, jobs
+
+
+def jobs_of_csv(path: Path) -> tuple[list[str], list[Job]]:
+    """Return the same of a summary: columns of no known figure are axes."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    known = {**CSV_NAMES, **{name: name for name in CSV_SAME}}
+    axes = [name for name in (rows[0] if rows else {}) if name not in known and name != "folder"]
+    if not rows:
+        raise UserError(f"{path}: has no row")
+    jobs = []
+    for row in rows:
+        figures = {name: number(row[column]) for column, name in known.items() if row.get(column)}
+        numbers = {name: float(value) for name, value in figures.items() if not isinstance(value, str)}
+        jobs.append(Job({axis: number(row[axis]) for axis in axes}, numbers, row.get("folder") or ""))
+    return axes, jobs
+
+
+def declared(folder: Path) -> dict[str, list[Value]]:
+    """Return the values of each axis in the order in which they were asked for, as far as that is told."""
+    hydra: dict[str, Any] = read_yaml(folder / "multirun.yaml").get("hydra") or {}
+    asked = dict((hydra.get("sweeper") or {}).get("params") or {})
+    for typed in (hydra.get("overrides") or {}).get("task") or []:
+        key, _, values = str(typed).lstrip("+~").partition("=")
+        asked[key] = values
+    return {str(key): [number(value.strip()) for value in str(values).split(",")] for key, values in asked.items()}
+
+
+def key_of(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
+    """Return a sorting key: numbers by size, names as they were asked for."""
+    places = {str(value): i for i, value in enumerate(order)}
+
+    def key(value: Value) -> tuple[int, float, str]:
+        if not isinstance(value, str):
+            return 0, float(value), ""
+        return 1, float(places.get(value, len(places))), value
+
+    return key
+
+
+def number(text: str) -> Value:
+    """Return a text as the number that it is, else as it is."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def groups(sweep: Sweep) -> list[Group]:
+    """Return the runs grouped by all axes but the seed, in the axes' order."""
+    out: dict[tuple[Value, ...], Group] = {}
+    for job in sweep.jobs:
+        place = {axis: job.place[axis] for axis in sweep.shown}
+        out.setdefault(tuple(place.values()), Group(place, [])).jobs.append(job)
+    return list(out.values())
+
+
+def score(numbers: dict[str, float]) -> float:
+    """Return what sweeps maximise: ADD AUC, or the share of particles on the object where no pose is told [%]."""
+    return numbers["add/auc"] if "add/auc" in numbers else 100 * numbers.get("particles_on_object", float("-inf"))
+
+
+def best_job(sweep: Sweep) -> Job:
+    """Return the run with the highest score."""
+    return max(sweep.jobs, key=lambda job: score(job.numbers))
+
+
+def best_group(found: Sequence[Group]) -> int:
+    """Return which group has the highest mean score."""
+    means = [sum(score(job.numbers) for job in group.jobs) / len(group.jobs) for group in found]
+    return means.index(max(means))

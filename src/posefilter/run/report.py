@@ -1,0 +1,68 @@
+"""Explain a run or a sweep on one HTML page."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from posefilter.errors import UserError
+from posefilter.report.gather import Run, read_run
+from posefilter.report.run_page import run_page
+from posefilter.report.settings import Change, changes
+from posefilter.report.sweep_page import sweep_page
+from posefilter.report.sweeps import best_job, read_sweep
+from posefilter.run.job import Job
+from posefilter.run.machine import command_line
+
+FOLDERS = ("run", "sweep", "out")
+
+
+def spelled(arguments: Sequence[str]) -> list[str]:
+    """Return the command line as Hydra reads it: `sweep` is a group of its own, and folders may have `=` and `,` in them."""
+    out = []
+    for argument in arguments:
+        key, found, value = argument.partition("=")
+        if found and key in FOLDERS and value and value[0] not in "'\"" and value != "null":
+            value = "'" + value.replace("'", "\\'") + "'"
+        out.append(f"{'sweep_folder' if key == 'sweep' else key}{found}{value}")
+    return out
+
+
+def report(job: Job) -> None:
+    """Write report.html and its charts as PNGs into `out`, or into a folder `report` of the run or sweep."""
+    run, sweep = job.cfg.run, job.cfg.sweep_folder
+    if (run is None) == (sweep is None):
+        raise UserError("give either run=RUN, a run's folder, or sweep=DIR, a sweep's")
+    folder = Path(str(run if sweep is None else sweep))
+    if sweep is None:
+        record = read_run(folder)
+        page, files = run_page(record, compared(record), command_line())
+    else:
+        found = read_sweep(folder)
+        winner = folder / best_job(found).folder
+        best = read_run(winner) if (winner / "metrics.json").is_file() else None
+        page, files = sweep_page(found, best, compared(best) if best else None, command_line())
+    out = Path(job.cfg.out) if job.cfg.out else folder / "report"
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "report.html").write_text(page)
+    for name, png in files.items():
+        (out / name).write_bytes(png)
+    print(f"report: {out / 'report.html'} ({len(page) / 1e6:.1f} MB, {len(files)} charts beside it)")
+
+
+def compared(run: Run) -> list[Change] | None:
+    """Return how a run's settings differ from its method's defaults; None where these can no longer be composed."""
+    said = [f"{key}={run.choices[key]}" for key in ("model", "variant") if key in run.choices]
+    if not run.config:
+        return None
+    loader = GlobalHydra.instance().config_loader()
+    try:
+        default = OmegaConf.to_container(loader.load_configuration("train", said, RunMode.RUN), resolve=False)
+    except (HydraException, OmegaConfBaseException):  # the run is of another version, whose choices are gone
+        return None
+    assert isinstance(default, dict)
+    return changes(run.config, {str(key): value for key, value in default.items() if key != "hydra"})
