@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from posefilter.errors import UserError
 from posefilter.types import Batch, ObjectModel, Trace
 
 
@@ -18,6 +19,10 @@ class PaperPoints:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return labels (1, B, N)."""
+        if trace.clouds[-1].state.dim() != 3:
+            raise UserError(
+                "loss=regression judges points along rays, not poses: choose lesson=labelled_rays, or loss=contrast"
+            )
         offset, own_colour = trace.clouds[-1].state[..., 2], trace.clouds[-1].state[..., 3] > 0.5
         label = torch.where(offset > self.tolerance, self.behind, 0.0)
         return torch.where((offset.abs() <= self.tolerance) & own_colour, self.on, label)[None]

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from posefilter.errors import UserError
 from posefilter.geometry.pose import transform
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -31,6 +32,8 @@ class Contrast:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return the divergence an image, (B,) >= 0."""
+        if trace.clouds[-1].state.dim() != 4:
+            raise UserError("loss=contrast judges candidate poses, not points: choose lesson=candidates, or loss=regression")
         poses, scores, sigma = trace.readings[-1].pose, trace.readings[-1].log_likelihood, trace.steps[-1].sigma
         distance = pose_distance(poses, batch.camera_from_object, model)
         target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)

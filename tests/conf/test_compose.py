@@ -1,0 +1,158 @@
+"""Every choice that conf/ offers composes and builds; every experiment and sweep does; mistakes end in one good line."""
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from posefilter.errors import UserError
+from posefilter.models.pose_pf import PosePF
+from posefilter.run import run_command
+from posefilter.run.build import instantiate
+from posefilter.run.command import compose_job
+from posefilter.run.job import Job
+from posefilter.run.method import build_method, check_loss, recipe
+
+HOME = Path(__file__).parents[2]
+CONF = HOME / "conf"
+MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
+VARIANTS = sorted(path.stem for path in (CONF / "variant").glob("*.yaml"))
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
+BUILT = ("initialise", "schedule", "reweigh", "resample", "propose", "estimate", "refine", "loss", "lesson", "likelihood")
+
+
+def compose(tmp_path: Path, *overrides: str, name: str = "train") -> Job:
+    return compose_job(name, CONF, list(overrides), tmp_path)
+
+
+@pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
+def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, variant: str, tmp_path: Path) -> None:
+    job = compose(tmp_path, f"model={model}", f"variant={variant}")
+    check_loss(job)
+    method = build_method(recipe(job))
+    assert any(p.requires_grad for p in method.parameters())
+    assert method.filter.particles == job.cfg.filter.particles
+
+
+def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:
+    method = build_method(recipe(compose(tmp_path, "variant=paper")))
+    assert isinstance(method, PosePF)
+    assert (method.filter.particles, method.filter.steps, method.proposals) == (1000, 100, None)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("model", MODELS)
+def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) -> None:
+    chosen = [] if "override /model" in (CONF / "experiment" / f"{experiment}.yaml").read_text() else [f"model={model}"]
+    job = compose(tmp_path, *chosen, f"experiment={experiment}", "data.meshes=somewhere")
+    build_method(recipe(job))
+    job.cfg.folder = str(tmp_path)
+    assert OmegaConf.to_container(job.cfg.data, resolve=True)
+
+
+@pytest.mark.parametrize("sweep", SWEEPS)
+def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None:
+    params = OmegaConf.load(CONF / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
+    model = "cnn_patch" if "detect" in sweep else "patch_pf"
+    points = [f"{key}={value}" for key, values in params.items() for value in str(values).split(",")]
+    assert points
+    for point in points:
+        check_loss(compose(tmp_path, f"model={model}", point))
+
+
+@pytest.mark.parametrize("group", BUILT)
+def test_every_piece_builds_by_itself(group: str, tmp_path: Path) -> None:
+    for path in sorted((CONF / group).glob("*.yaml")):
+        cfg = OmegaConf.load(path)
+        if "${" not in path.read_text():
+            assert instantiate(cfg, group) is not None, path
+
+
+@pytest.mark.parametrize("data", sorted(path.stem for path in (CONF / "data").glob("*.yaml")))
+def test_every_data_choice_builds(data: str, tmp_path: Path) -> None:
+    module = instantiate(compose(tmp_path, f"data={data}", "data.root=somewhere").cfg.data, "data")
+    assert module.source == data
+
+
+def test_callbacks_loggers_and_trainer_build(tmp_path: Path) -> None:
+    cfg = compose(tmp_path).cfg
+    cfg.folder = str(tmp_path)
+    assert "best" in instantiate(cfg.callbacks, "callbacks")
+    assert instantiate(cfg.trainer, "trainer", logger=False).max_steps == cfg.trainer.max_steps
+
+
+MISTAKES = {
+    "model=pose_fp": ("model=pose_fp", "pose_pf"),
+    "modle=pose_pf": ("modle", "model"),
+    "filter.partcles=5": ("filter.partcles", "filter.particles"),
+    "data=scene": ("data=scene", "scenes"),
+    "trainer.max_step=3": ("trainer.max_step", "trainer.max_steps"),
+    "experiment=memorize": ("experiment=memorize", "memorise"),
+    "loss=add": ("loss=add", "contrast, regression"),
+    "filter.particles=many": ("filter.particles='many'", "whole number"),
+    "filter.particles=0": ("particles=0", "1 or more"),
+    "optimizer.lr=fast": ("optimizer.lr='fast'", "number"),
+    "+filter.foo=1": ("filter.foo", "no such setting"),
+    "seed=x": ("seed=x", "whole number"),
+    "console=loud": ("console=loud", "plain"),
+    "resume=nowhere": ("resume=nowhere", "not a run's folder"),
+    "initialise.x=1": ("initialise.x", "no such setting"),
+    "x=[1": ("[1",),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_ends_in_one_line_that_names_the_key_and_the_nearest(
+    mistake: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    status = run_command("train", HOME, [f"out={tmp_path}", "console=plain", mistake])
+    said = capfd.readouterr().err.strip().splitlines()
+    assert status == 2
+    assert len(said) == 1, said
+    assert said[0].startswith("train: ")
+    for part in MISTAKES[mistake]:
+        assert part in said[0]
+
+
+def test_what_is_required_is_asked_for(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for name, words in {"evaluate": "checkpoint=", "predict": "checkpoint", "generate": "out", "export": "out"}.items():
+        assert run_command(name, HOME, [] if name != "predict" else [f"out={tmp_path}"]) == 2
+        assert words in capfd.readouterr().err
+
+
+def test_a_trace_is_shown_only_when_asked_for(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_command("train", HOME, [f"out={tmp_path}", "loss=add", "debug=trace"]) == 2
+    assert "Traceback" in capfd.readouterr().err
+
+
+class TestBuilding:
+    """The one place that turns names into objects."""
+
+    @pytest.mark.parametrize("name", ["os.system", "builtins.eval", "subprocess.run", "posefilterx.y"])
+    def test_only_names_of_ours_torch_and_lightning(self, name: str) -> None:
+        with pytest.raises(UserError, match="only names within"):
+            instantiate({"_target_": name}, "x")
+
+    def test_misspelt_names_are_told(self) -> None:
+        with pytest.raises(UserError, match="did you mean 'Adam'"):
+            instantiate({"_target_": "torch.optim.AdamV"}, "optimizer")
+        node = {"_target_": "posefilter.filters.resample.BelowESS", "resampler": {}, "threshhold": 1}
+        with pytest.raises(UserError, match=r"resample.threshhold.*did you mean 'threshold'"):
+            instantiate(node, "resample")
+
+    def test_missing_and_wrong_arguments_are_told(self) -> None:
+        with pytest.raises(UserError, match=r"schedule.sigma: is missing"):
+            instantiate({"_target_": "posefilter.filters.schedule.Constant"}, "schedule")
+        with pytest.raises(UserError, match=r"schedule.sigma=True: must be a number"):
+            instantiate({"_target_": "posefilter.filters.schedule.Constant", "sigma": True}, "schedule")
+
+    def test_partial_lists_nesting_and_nothing(self) -> None:
+        node = {"a": [{"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}], "none": {}}
+        made = instantiate(node, "x")
+        assert made["none"] is None
+        assert made["a"][0](torch.zeros(1, 2)).shape == (1, 3)
+        later = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5}, "optimizer")
+        assert later([torch.nn.Parameter(torch.zeros(1))]).param_groups[0]["lr"] == 0.5

@@ -1,0 +1,147 @@
+"""The commands, the whole way at toy size: what one writes the next one reads, and they agree."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter.errors import UserError
+from posefilter.run import run_command
+from posefilter.run.evaluate import evaluate
+from posefilter.run.train import train
+
+HOME = Path(__file__).parents[2]
+TIMES = ("seconds_per_image",)
+
+
+def numbers(metrics: dict) -> dict:
+    """Return what must agree between a training's test and an evaluation."""
+    keys = ("instances", "missed", "add", "add_s", "iou", "particles_on_object", "belief")
+    return {key: metrics[key] for key in keys}
+
+
+def read(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run of the pose-space method, trained by its command."""
+    run = tmp_path_factory.mktemp("runs") / "pose"
+    typed = ["debug=smoke", "console=plain", "threads=1", "data.progress=false", f"data.root={tiny_scenes}", f"out={run}"]
+    assert run_command("train", HOME, typed) == 0
+    return run
+
+
+def test_a_run_leaves_what_was_promised(trained: Path) -> None:
+    for name in (".hydra/config.yaml", "checkpoints/best.ckpt", "checkpoints/last.ckpt", "metrics.json"):
+        assert (trained / name).is_file(), name
+    assert list(trained.glob("events.out.tfevents.*"))
+    assert list((trained / "figures").rglob("*.png"))
+    metrics = read(trained)
+    assert metrics["instances"] > 0
+    assert set(metrics["add"]) == set(metrics["add_s"]) == {"auc", "recall_01d", "recall_2cm", "median_mm"}
+    assert {"iou", "particles_on_object", "seconds_per_image", "belief", "data", "git", "versions"} <= set(metrics)
+    assert "debug=smoke" in metrics["overrides"]
+
+
+def test_checkpoints_are_plain_data(trained: Path) -> None:
+    checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
+    assert checkpoint["object_model"]["name"] == "carton"
+    assert checkpoint["recipe"]["choices"]["model"] == "pose_pf"
+
+
+def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
+    trained: Path, tmp_path: Path, tiny_scenes: Path
+) -> None:
+    checkpoint = trained / "checkpoints" / "best.ckpt"
+    common = ["console=plain", "threads=1"]
+    assert run_command("evaluate", HOME, [*common, f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}"]) == 0
+    assert numbers(read(tmp_path / "a")) == numbers(read(trained))
+    with (tmp_path / "a" / "poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == read(trained)["instances"]
+    beliefs = np.load(tmp_path / "a" / "beliefs.npz")
+    assert beliefs["poses"].shape[0] == len(rows)
+    assert np.allclose(beliefs["weights"].sum(1), 1, atol=1e-4)
+
+    data = ["data=scenes", f"data.root={tiny_scenes}", "data.image_width=160", "data.progress=false"]
+    data += ["data.split={train: 0.6, val: 0.2, test: 0.2}", "data.min_visibility_test=0.3", "data.points=500"]
+    typed = [*common, *data, f"estimates={tmp_path / 'a' / 'poses.csv'}", f"out={tmp_path / 'b'}"]
+    assert run_command("evaluate", HOME, typed) == 0
+    again, before = read(tmp_path / "b"), read(trained)
+    assert again["instances"] == before["instances"]
+    for key in ("add", "add_s"):
+        assert again[key]["median_mm"] == pytest.approx(before[key]["median_mm"], rel=1e-3)
+    assert again["iou"] == pytest.approx(before["iou"], abs=1e-3)
+
+
+def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tmp_path: Path) -> None:
+    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", "refine=none", "filter.particles=4,8", "-m"]
+    assert run_command("evaluate", HOME, [*typed, f"out={tmp_path}", "console=plain", "threads=1"]) == 0
+    with (tmp_path / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["filter.particles"] for row in rows] == ["4", "8"]
+    assert (tmp_path / "summary.png").is_file()
+    assert "| filter.particles |" in (tmp_path / "summary.md").read_text()
+    for row in rows:
+        beliefs = np.load(tmp_path / row["folder"] / "beliefs.npz")
+        assert beliefs["poses"].shape[1] == int(row["filter.particles"])
+
+
+def test_unknown_pieces_are_told(trained: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", f"out={tmp_path}", "filter.partcles=4"]
+    assert run_command("evaluate", HOME, typed) == 2
+    assert "did you mean 'particles'" in capfd.readouterr().err
+
+
+def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_scenes: Path) -> None:
+    weights = tmp_path / "carton.ckpt"
+    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", f"out={weights}"]
+    assert run_command("export", HOME, typed) == 0
+    assert weights.stat().st_size < 5e6
+    rgb = min(tiny_scenes.rglob("*.left.jpg"))
+    depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
+    out = tmp_path / "prediction"
+    typed = [f"checkpoint={weights}", f"rgb={rgb}", f"depth={depth}", "intrinsics=266,266,78,60", f"out={out}", "threads=1"]
+    assert run_command("predict", HOME, [*typed, "meshes=builtin"]) == 0
+    told = json.loads((out / "pose.json").read_text())
+    R = np.array(told["camera_from_object"])[:3, :3]
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-4)
+    assert told["object"] == "carton"
+    belief = np.load(out / "belief.npz")
+    assert belief["poses"].shape[1:] == (4, 4)
+    assert belief["weights"].sum() == pytest.approx(1, abs=1e-4)
+    assert (out / "overlay.png").is_file()
+    assert (out / "belief.png").is_file()
+
+
+@pytest.mark.parametrize("model", ["pixel_pf", "patch_pf", "cnn_patch", "downsized"])
+def test_every_image_space_method_goes_the_whole_way(model: str, tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train(tiny_job(tmp_path, f"model={model}", "trainer.max_steps=4"))
+    metrics = read(tmp_path)
+    assert (metrics["add"] is None) == (model in ("cnn_patch", "downsized"))
+    assert 0 <= metrics["particles_on_object"] <= 1
+
+
+def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    found = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(tiny_job(tmp_path / name, "model=cnn_patch", f"seed={seed}", "trainer.max_steps=4"))
+        found.append(numbers(read(tmp_path / name)))
+    assert found[0] == found[1]
+    assert found[0] != found[2]
+
+
+def test_a_mesh_of_another_kind_is_refused(trained: Path, tmp_path: Path, tiny_scenes: Path) -> None:
+    from posefilter.run.command import compose_job
+
+    checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
+    checkpoint["object_model"]["center"] = checkpoint["object_model"]["center"] + 0.05
+    torch.save(checkpoint, tmp_path / "moved.ckpt")
+    typed = [f"checkpoint={tmp_path / 'moved.ckpt'}", "console=plain", "threads=1"]
+    with pytest.raises(UserError, match="is not the mesh"):
+        evaluate(compose_job("evaluate", HOME / "conf", typed, tmp_path))
