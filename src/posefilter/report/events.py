@@ -9,6 +9,8 @@ from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALA
 
 from posefilter.report.pictures import Picture, words
 
+PLACES = {"figures", "validation"}  # words of a picture's name that tell where it is, not what it shows
+
 
 class Curve(NamedTuple):
     """One scalar over a run; the three are as long as each other."""
@@ -47,6 +49,6 @@ def event_files(folder: Path) -> Iterator[Path]:
 
 
 def not_yet_in(pictures: list[Picture], files: list[Picture]) -> list[Picture]:
-    """Return the logged pictures that no file shows: `filter/health` is what `filter_health.png` is."""
-    known = {words(picture.name) for picture in files}
-    return [picture for picture in pictures if words(picture.name) not in known]
+    """Return the logged pictures that no file shows: `figures/belief` is what `validation_belief.png` is."""
+    known = {words(picture.name) - PLACES for picture in files}
+    return [picture for picture in pictures if words(picture.name) - PLACES not in known]

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from posefilter.pictures.canvas import new_figure, rasterise
@@ -59,7 +60,7 @@ class Panel:
 
 def draw(panel: Panel, theme: Theme) -> bytes:
     """Return a chart as a PNG of few colours."""
-    tall = HEIGHT_PX if not panel.categories else 74 + 25 * max(len(panel.categories), 3)
+    tall = height(panel)
     figure = new_figure(WIDTH_PX * FINER, tall * FINER, dpi=100 * FINER)
     figure.set_layout_engine("constrained")
     figure.set_facecolor(theme.paper)
@@ -71,7 +72,22 @@ def draw(panel: Panel, theme: Theme) -> bytes:
         else:
             draw_line(axes, line, colour, panel.joined)
     dress(axes, panel, theme)
+    if len(panel.lines) > 1:
+        place = {"loc": "outside lower center", "ncols": 2} if below(panel) else {"loc": "best"}
+        legend = figure.legend if below(panel) else axes.legend
+        legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2, **place)
     return to_small_png(figure)
+
+
+def below(panel: Panel) -> bool:
+    """Tell whether a chart's legend stands below it, since it would hide what is drawn."""
+    return len(panel.lines) > 1 and (bool(panel.categories) or len(panel.lines) > 4 or not panel.joined)
+
+
+def height(panel: Panel) -> int:
+    """Return a chart's height [px]."""
+    legend = 17 * -(-len(panel.lines) // 2) if below(panel) else 0
+    return legend + (74 + 25 * max(len(panel.categories), 3) if panel.categories else HEIGHT_PX)
 
 
 def draw_line(axes: Axes, line: Line, colour: str, joined: bool) -> None:
@@ -121,11 +137,11 @@ def dress(axes: Axes, panel: Panel, theme: Theme) -> None:
             axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
             axes.minorticks_off()
         else:
-            axes.locator_params(axis="x", nbins=6)
+            axes.xaxis.set_major_locator(
+                MaxNLocator(6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x))
+            )
         if panel.limits:
             axes.set_ylim(*panel.limits)
-    if len(panel.lines) > 1:
-        axes.legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2)
 
 
 def smooth(values: Sequence[float]) -> np.ndarray:

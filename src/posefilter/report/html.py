@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from html import escape
 from importlib import resources
 
-from posefilter.report.figures import DARK, HEIGHT_PX, LIGHT, WIDTH_PX, Panel, draw
-from posefilter.report.pictures import Picture, data_uri
+from posefilter.report.figures import DARK, LIGHT, WIDTH_PX, Panel, draw, height
+from posefilter.report.pictures import SHEET_PX, Picture, data_uri
 
 Parts = list[tuple[str, str]]  # title and content of each section
 
@@ -56,10 +56,16 @@ def tiles(entries: Sequence[tuple[str, str, str]]) -> str:
     return f'<div class="tiles">{cells}</div>' if cells else ""
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[int] = (), marked: int | None = None) -> str:
+def table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: Sequence[int] = (),
+    marked: int | None = None,
+    kind: str = "",
+) -> str:
     """Return a table that scrolls within itself where it is too wide.  Cells are HTML.
 
-    numeric: columns of numbers; marked: a row that stands out.
+    numeric: columns of numbers; marked: a row that stands out; kind: how it folds on a phone, or `narrow`, see page.css.
     """
     if not rows:
         return ""
@@ -71,7 +77,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[
     marks = [' class="marked"' if i == marked else "" for i in range(len(rows))]
     top = f"<thead><tr>{cells(head, 'th')}</tr></thead>" if any(head) else ""
     body = "".join(f"<tr{mark}>{cells(row, 'td')}</tr>" for mark, row in zip(marks, rows, strict=True))
-    return f'<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div>'
+    return f'<div class="scroll {kind}"><table>{top}<tbody>{body}</tbody></table></div>'
 
 
 def charts(panels: Sequence[Panel]) -> tuple[str, dict[str, bytes]]:
@@ -80,10 +86,9 @@ def charts(panels: Sequence[Panel]) -> tuple[str, dict[str, bytes]]:
     for panel in panels:
         light, dark = draw(panel, LIGHT), draw(panel, DARK)
         files[f"{slug(panel.title)}-{slug(panel.xlabel)}.png"] = light
-        tall = "" if panel.categories else f' height="{HEIGHT_PX}"'
         out.append(
             f'<picture class="chart"><source media="(prefers-color-scheme: dark)" srcset="{uri(dark)}">'
-            f'<img src="{uri(light)}" width="{WIDTH_PX}"{tall} alt="{escape(describe(panel))}"></picture>'
+            f'<img src="{uri(light)}" width="{WIDTH_PX}" height="{height(panel)}" alt="{escape(describe(panel))}"></picture>'
         )
     return (f'<div class="charts">{"".join(out)}</div>' if out else ""), files
 
@@ -109,10 +114,9 @@ def gallery(pictures: Sequence[Picture], wide: bool = False) -> str:
             out.append(f'<figure><p class="gone">{escape(picture.name)}: {escape(str(error))}</p></figure>')
             continue
         caption = escape(picture.caption)
-        out.append(
-            f'<figure><img src="{source}" width="{width}" height="{height}" alt="{caption}">'
-            f"<figcaption>{caption}</figcaption></figure>"
-        )
+        kind = ' class="sheet"' if width >= SHEET_PX else ""
+        shown = f'<img src="{source}" width="{width}" height="{height}" alt="{caption}">'
+        out.append(f'<figure{kind}><div class="scroll">{shown}</div><figcaption>{caption}</figcaption></figure>')
     kind = "gallery wide" if wide else "gallery"
     return f'<div class="{kind}">{"".join(out)}</div>' if out else ""
 

@@ -80,7 +80,8 @@ def chosen(curves: Mapping[str, Curve], choices: Sequence[Choice]) -> list[Panel
 
 def training(curves: Mapping[str, Curve]) -> list[Panel]:
     """Return the charts of the training: losses together, what has a unit and the learning rate alone."""
-    own = {tag.removeprefix("train/"): curve for tag, curve in curves.items() if tag.startswith("train/")}
+    rate = [tag for tag in curves if tag.startswith("lr-") or tag == "train/learning_rate"][:1]
+    own = {tag[6:]: curve for tag, curve in curves.items() if tag.startswith("train/") and tag not in rate}
     units = {name: name.rpartition("_")[2] for name in own if name.endswith(("_mm", "_px", "_m", "_rad"))}
     names = [name for name in sorted(own, key=lambda name: name != "total") if name not in units]
     if len(names) == 2:  # the total of one loss is that loss
@@ -90,8 +91,8 @@ def training(curves: Mapping[str, Curve]) -> list[Panel]:
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)
         out.append(Panel(name.removesuffix(f"_{unit}").replace("_", " ").capitalize(), "training step", unit, [line]))
-    rates = [Line(tag, curve.steps, curve.values) for tag, curve in curves.items() if tag.startswith("lr-")]
-    return [*out, Panel("Learning rate", "training step", "", rates)] if rates else out
+    lines = [Line("learning rate", curves[tag].steps, curves[tag].values) for tag in rate]
+    return [*out, Panel("Learning rate", "training step", "", lines)] if lines else out
 
 
 def health(curves: Mapping[str, Curve]) -> list[Panel]:

@@ -16,7 +16,8 @@ SECTIONS = {  # the first whose words a picture's name has; what is in none is "
     "belief": {"belief", "beliefs", "so3", "rotations", "likelihood", "field", "proposals", "relevance", "marginals"},
     "particles": {"journeys", "particles", "cloud", "clouds", "film", "video", "strip", "signs", "health", "filter"},
 }
-LARGEST_PX = 1400  # what a phone or a page's column can show, twice over
+LARGEST_PX = 2000
+SHEET_PX = 1100  # from which width on a picture is a sheet of several, which a phone scrolls
 KEPT_BYTES = 60_000
 
 

@@ -124,12 +124,14 @@ def signs(run: Run) -> str:
             '<span class="bad">✗ yes</span>' if bad else '<span class="good">✓ no</span>',
             escape(sign.label),
             f"{value:.3g}",
-            f"{'above' if sign.above else 'below'} {sign.limit:g}",
+            f'<span class="soft">bad {"above" if sign.above else "below"} {sign.limit:g}</span>',
             escape(sign.meaning) if bad else f'<span class="soft">{escape(sign.meaning)}</span>',
         )
         for sign, value, bad in found
     ]
-    return f"<p>{say}</p>" + html.table(("there?", "measured", "value", "bad if", "it would mean"), rows, numeric=(2, 3))
+    return f"<p>{say}</p>" + html.table(
+        ("there?", "measured", "value", "", "it would mean"), rows, numeric=(2, 3), kind="signs"
+    )
 
 
 def worst_and_best(shown: dict[str, list[Any]]) -> str:
@@ -151,7 +153,7 @@ def results(run: Run) -> str:
         for key, label, form in ROWS
         if any(key in own for own in known)
     ]
-    out = html.table(("", *(name for name, _ in columns)), rows, numeric=range(1, len(columns) + 1))
+    out = html.table(("", *(name for name, _ in columns)), rows, numeric=range(1, len(columns) + 1), kind="narrow")
     by_visibility = run.metrics.get("by_visibility") or {}
     rows = [
         (
@@ -181,7 +183,7 @@ def belief(run: Run) -> str:
         for key, label, form, meaning in BELIEF
         if f"belief/{key}" in known
     ]
-    return html.table(("mean over the images", "", ""), rows, numeric=(1,))
+    return html.table(("mean over the images", "", ""), rows, numeric=(1,), kind="meanings")
 
 
 def settings(run: Run, changed: Sequence[Change] | None) -> str:
@@ -198,7 +200,7 @@ def settings(run: Run, changed: Sequence[Change] | None) -> str:
         name = f"model={run.named('model')} variant={run.named('variant')}"
         say = f"Settings that differ from the defaults of {html.code(name)} in this version of the code:"
         out += f"<p>{say if rows else say.replace('Settings that', 'No settings')}</p>" + html.table(
-            ("setting", "this run", "default"), rows
+            ("setting", "this run", "default"), rows, kind="settings"
         )
     own = [
         (html.code(k), html.code(v)) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"
@@ -227,7 +229,7 @@ def machine(run: Run) -> str:
         rows.append(("data", f"{escape(str(data.get('source')))}, {html.code(str(data['root']))}"))
     for name, split in (data.get("splits") or {}).items():
         rows.append((f"data, {escape(name)}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"))
-    return html.table(("", ""), rows)
+    return html.table(("", ""), rows, kind="pairs")
 
 
 def foot(run: Run, command: str) -> str:

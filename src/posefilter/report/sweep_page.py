@@ -21,7 +21,7 @@ FIGURES = (  # name, title, unit, limits, format
     ("particles_on_object", "Particles on the object", "share", SHARE, "{:.3f}"),
     ("seconds_per_image", "Time an image", "s", None, "{:.3g}"),
 )
-MOST_LINES, MOST_ROWS = 6, 4  # values of a second axis that become lines; names that would fit below a chart
+MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
 
 
 def sweep_page(
@@ -33,9 +33,11 @@ def sweep_page(
     """
     found = groups(sweep)
     names = [name for name, *_ in FIGURES if any(name in job.numbers for job in sweep.jobs)]
-    drawn = [panel for axis in sweep.shown for panel in over(axis, sweep, found, names)]
-    plots, files = html.charts(drawn)
-    cost, more = html.charts(against_time(sweep, found))
+    plots, files = "", dict[str, bytes]()
+    for axis in sweep.shown:
+        content, pngs = html.charts(over(axis, sweep, found, names))
+        plots, files = plots + (f"<h3>{escape(axis)}</h3>{content}" if content else ""), files | pngs
+    cost, more = html.charts(against_time(found))
     winner = best_job(sweep)
     sections = [
         ("Table", table(sweep, found, names)),
@@ -56,9 +58,7 @@ def sweep_page(
 def head(sweep: Sweep, winner: Job, best: Run | None) -> str:
     """Return what is read first."""
     over_what = ", ".join(f"{axis} ({len(sweep.values(axis))})" for axis in sweep.axes) or "nothing"
-    left = (
-        [f"{len(sweep.unfinished)} of the runs have no result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
-    )
+    left = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
     if best is None:
         left.append("The runs themselves are not there: figures are those of summary.csv.")
     badge = f'<span class="badge {"bad" if sweep.unfinished else "done"}">{len(sweep.jobs)} runs</span>'
@@ -91,7 +91,7 @@ def table(sweep: Sweep, found: Sequence[Group], names: Sequence[str]) -> str:
     ]
     start = len(sweep.shown)
     say = "<p>The best is marked. Where there are several seeds: mean ± half the range from the worst to the best.</p>"
-    return say + html.table(titles, rows, numeric=range(start, len(titles)), marked=best_group(found))
+    return say + html.table(titles, rows, numeric=range(start, len(titles)), marked=best_group(found), kind="sweep")
 
 
 def mean_and_half_range(values: Sequence[float], form: str) -> str:
@@ -148,27 +148,23 @@ def line_over(
     )
 
 
-def against_time(sweep: Sweep, found: Sequence[Group]) -> list[Panel]:
+def against_time(found: Sequence[Group]) -> list[Panel]:
     """Return quality against what it costs, a dot a setting."""
     if len(found) < 2:
         return []
-    out = []
-    for name, title, unit, limits, _ in FIGURES[:1] + FIGURES[4:6]:
-        lines = []
-        for group in found:
-            x, y = group.of("seconds_per_image"), group.of(name)
-            if x and y:
-                lines.append(Line(told(group.place), [sum(x) / len(x)], [sum(y) / len(y)]))
+    for name, title, unit, limits, _ in (FIGURES[0], FIGURES[5]):  # what sweeps maximise: the one, or else the other
+        pairs = [(group, group.of("seconds_per_image"), group.of(name)) for group in found]
+        lines = [Line(told(g.place), [sum(x) / len(x)], [sum(y) / len(y)]) for g, x, y in pairs if x and y]
         if len(lines) > MOST_LINES:  # too many for a legend: the table tells them apart
             lines = [Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])]
         if lines:
-            out.append(Panel(title, "time an image [s]", unit, lines, limits, joined=False))
-    return out
+            return [Panel(title, "time an image [s]", unit, lines, limits, joined=False)]
+    return []
 
 
 def seeds(found: Sequence[Group], names: Sequence[str]) -> str:
     """Return how far seeds lie apart, setting by setting; nothing where there is one seed each."""
-    shown = [entry for entry in FIGURES[:-1] if entry[0] in names]
+    shown = [entry for entry in FIGURES[:-1] if entry[0] in names][:4]
     several = [group for group in found if len(group.jobs) > 1]
     if not several and len(found) > 1 and list(found[0].place) == ["seed"]:
         several = [Group({}, [job for group in found for job in group.jobs])]
@@ -181,7 +177,7 @@ def seeds(found: Sequence[Group], names: Sequence[str]) -> str:
         for group in several
     ]
     titles = ("setting", "runs", *(escape(title) for _, title, *_ in shown))
-    return html.table(titles, rows, numeric=range(1, len(titles)))
+    return html.table(titles, rows, numeric=range(1, len(titles)), kind="sweep")
 
 
 def spread(values: Sequence[float], form: str) -> str:
@@ -212,4 +208,6 @@ def singles(sweep: Sweep, names: Sequence[str]) -> str:
         for job in sweep.jobs
     ]
     titles = [*map(escape, sweep.axes), *(escape(title) for _, title, *_ in shown)]
-    return html.fold(f"All {len(rows)} runs", html.table(titles, rows, numeric=range(len(sweep.axes), len(titles))))
+    return html.fold(
+        f"All {len(rows)} runs", html.table(titles, rows, numeric=range(len(sweep.axes), len(titles)), kind="sweep")
+    )

@@ -1,0 +1,97 @@
+"""What is read from a run's folder, and what is said where something is not there."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.report.gather import read_run
+from posefilter.report.pictures import by_number, by_section
+from posefilter.report.settings import Change, changes
+from posefilter.report.signs import duration, findings, numbers, timings
+
+
+def test_scalars_and_pictures_are_read(run: Path) -> None:
+    """Every scalar at its step; a logged picture only where no file shows it; 2 before 10."""
+    record = read_run(run)
+    assert record.curves["val/score"].steps == (49, 99)
+    assert record.curves["val/score"].values == (60.0, 40.0)
+    assert len(record.curves["train/total"].values) == 10
+    shown = by_section(record.pictures)
+    assert [p.name for p in shown["worst"]] == ["worst_2", "worst_10"]
+    assert [p.name for p in shown["overlays"]] == ["validation_overlays"]
+    assert [p.name for p in shown["belief"]] == ["figures/belief"]
+    assert record.missing == []
+    assert sorted(["a10", "a9", "b1"], key=by_number) == ["a9", "a10", "b1"]
+
+
+def test_signs_of_failure_are_found(run: Path) -> None:
+    """Those beyond their limits, and no others."""
+    found = {finding.sign.key: (finding.value, finding.bad) for finding in findings(read_run(run))}
+    assert found["signs/pairwise_cosine"] == (0.95, True)
+    assert found["signs/off_frame/last"] == (0.625, True)  # the last step's
+    assert found["signs/offset_r2"] == (0.5, False)
+    assert found["missed_share"] == (0.25, True)
+    assert found["belief/coverage_90"] == (41.0, True)
+    assert found["fallen"] == (20.0, True)
+    assert found["particles_on_object"] == (0.75, False)
+    assert "signs/auroc" not in found
+
+
+def test_timings(run: Path) -> None:
+    """Two steps a second, as the events' times have it."""
+    told = dict(timings(read_run(run)))
+    assert told["training steps a second (median)"] == "2.00"
+    assert told["training, validations included"] == "45 s"
+    assert [duration(s) for s in (59.6, 61, 3700)] == ["1 min 0 s", "1 min 1 s", "1 h 1 min"]
+
+
+def test_without_a_test_the_last_validation_counts(run: Path) -> None:
+    """Numbers are then of the last validation, and it is said."""
+    (run / "metrics.json").unlink()
+    record = read_run(run)
+    assert numbers(record)["add/auc"] == 40.0
+    assert any("metrics.json" in sentence for sentence in record.missing)
+
+
+@pytest.mark.parametrize(
+    ("gone", "said"), [("figures", "pictures"), ("events", "events"), (".hydra", ".hydra"), ("data.json", "data.json")]
+)
+def test_missing_pieces_are_named(run: Path, gone: str, said: str) -> None:
+    """A run that lacks a piece is read none the less."""
+    for path in [*run.glob("events.*")] if gone in ("events", "figures") else [run / gone]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    if gone == "figures":
+        shutil.rmtree(run / "figures")
+    assert any(said in sentence for sentence in read_run(run).missing)
+
+
+def test_mistakes_are_one_line(run: Path, sweep: Path, tmp_path: Path) -> None:
+    """No folder, no run, a sweep, a broken file: each names the folder and the cause."""
+    (tmp_path / "empty").mkdir()
+    for folder, cause in (
+        (tmp_path / "nowhere", "no such folder"),
+        (tmp_path / "empty", "no run's folder"),
+        (sweep, "sweep="),
+    ):
+        with pytest.raises(UserError, match=cause) as caught:
+            read_run(folder)
+        assert str(folder) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    (run / "metrics.json").write_text('{"add": ')
+    with pytest.raises(UserError, match=r"metrics\.json: is no JSON"):
+        read_run(run)
+
+
+def test_settings_that_differ() -> None:
+    """By dotted key, lists of sections item by item; where a run was made does not count."""
+    default = {"seed": 0, "a": {"b": 1, "gone": 2}, "steps": [{"x": 1}, {"x": 2}], "out": None}
+    own = {"seed": 0, "a": {"b": 1.5, "new": "text"}, "steps": [{"x": 1}, {"x": 3}], "out": "there"}
+    assert changes(own, default) == [
+        Change("a.b", "1", "1.5"),
+        Change("a.new", None, "text"),
+        Change("steps.1.x", "2", "3"),
+        Change("a.gone", "2", None),
+    ]
+    assert changes(default, default) == []

@@ -1,0 +1,193 @@
+"""The page holds what it should, holds all of it itself, and shows in a real browser."""
+
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tests.report.conftest import MARK
+
+from posefilter.report.figures import DARK, LIGHT, Line, Panel, draw, smooth
+from posefilter.report.gather import read_run
+from posefilter.report.html import gallery
+from posefilter.report.pictures import Picture
+from posefilter.report.run_page import run_page
+from posefilter.report.settings import Change
+from posefilter.report.sweep_page import sweep_page
+from posefilter.report.sweeps import read_sweep
+
+HOME = Path(__file__).parents[2]
+BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+
+
+class Outside(HTMLParser):
+    """Collects what a page would fetch, and how many pictures it holds."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.pictures = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Take in one element."""
+        self.pictures += tag == "img"
+        for name, value in attrs:
+            if name in ("src", "srcset", "href", "data", "poster") and not (value or "").startswith(("data:", "#")):
+                self.fetched.append(f"{tag} {name}={value}")
+        if tag in ("script", "link", "iframe", "object"):
+            self.fetched.append(tag)
+
+
+def outside(page: str) -> Outside:
+    """Return what a page would fetch."""
+    parser = Outside()
+    parser.feed(page)
+    return parser
+
+
+def test_the_page_tells_the_run(run: Path) -> None:
+    """Figures, signs, settings, by their values; names are escaped; nothing is fetched."""
+    page, files = run_page(read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x")
+    for text in (
+        "87.5",
+        "ADD AUC",
+        "0.3 to 0.5",
+        "33.2",
+        "All particles move in one direction",
+        "4.2 mm",
+        "contrast",
+        "48 %",
+    ):
+        assert text in page, text
+    row = re.search(r"<tr><td><code>filter.particles</code></td>.*?</tr>", page)
+    assert row
+    assert row[0].index("9") < row[0].index("400")
+    assert "run &lt;1&gt;" in page
+    assert "<1>" not in page
+    parts = outside(page)
+    assert parts.fetched == []
+    assert parts.pictures == 5 + len(files)  # four files, one logged picture, and the charts
+    assert {"training-loss-training-step.png", "effective-particles-by-iteration-iteration.png"} <= set(files)
+    assert outside('<img src="https://x.y/z.png"><script></script>').fetched  # the check can fail
+
+
+def test_a_bare_run_still_has_a_page(tmp_path: Path) -> None:
+    """Only metrics.json: the page says what is missing."""
+    (tmp_path / "metrics.json").write_text(
+        '{"instances": 2, "missed": 0, "add": null, "iou": 0.25, "particles_on_object": 0.5}'
+    )
+    page, files = run_page(read_run(tmp_path), None, "x")
+    assert "0.250" in page
+    assert "No TensorBoard events" in page
+    assert "No pictures" in page
+    assert files == {}
+    assert "ADD AUC" not in page
+
+
+def test_a_broken_picture_is_named() -> None:
+    """It does not end the report."""
+    assert "worst_3" in gallery([Picture("worst_3", "worst 3", b"nothing")])
+    assert 'class="gone"' in gallery([Picture("worst_3", "worst 3", b"nothing")])
+
+
+def test_charts_have_both_themes() -> None:
+    """The same chart on light and dark paper, at twice the size it is shown."""
+    panel = Panel("Loss", "step", "mm", [Line("a", [0, 1, 2], [3, 2, 1]), Line("b", [0, 1, 2], [1, 2, 3])])
+    for theme in (LIGHT, DARK):
+        image = np.asarray(Image.open(BytesIO(draw(panel, theme))).convert("RGB"))
+        assert image.shape == (500, 760, 3)
+        paper = [int(theme.paper[i : i + 2], 16) for i in (1, 3, 5)]
+        assert (np.abs(image[3, 3].astype(int) - paper) < 6).all()
+        ink = [int(theme.lines[0][i : i + 2], 16) for i in (1, 3, 5)]
+        assert (np.abs(image.astype(int) - ink).max(2) < 24).sum() > 200
+
+
+def test_smoothing_keeps_lines_and_skips_gaps() -> None:
+    """A straight line stays one, up to its ends; what is not finite does not count."""
+    line = np.linspace(2, 9, 100)
+    assert np.allclose(smooth(line), line)
+    line[50] = np.nan
+    assert np.isfinite(smooth(line)).all()
+
+
+def shoot(page: Path, out: Path, width: int, *options: str) -> np.ndarray:
+    """Return what a browser shows of a page."""
+    command = [
+        str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
+        "--disable-background-networking", "--disable-component-update", "--disable-sync",
+        f"--user-data-dir={out / 'profile'}", f"--screenshot={out / 'shot.png'}", f"--window-size={width},3000", *options, page.resolve().as_uri(),
+    ]  # fmt: skip
+    subprocess.run(command, check=True, capture_output=True, timeout=200)
+    return np.asarray(Image.open(out / "shot.png").convert("RGB"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed (apt-get install chromium)")
+def test_a_browser_shows_it(run: Path, tmp_path: Path) -> None:
+    """Pictures appear, on a phone's width nothing is cut off, and dark mode is dark."""
+    text, _ = run_page(read_run(run), [Change("a.long.key." * 9, "1", "x" * 150)], "x")
+    page = tmp_path / "report.html"
+    page.write_text(text)
+    light = shoot(page, tmp_path, 1200)
+    assert (np.abs(light.astype(int) - MARK).max(2) < 12).sum() > 30_000  # the gallery
+    assert light[5, 5].min() > 230
+    dark = shoot(page, tmp_path, 390, "--blink-settings=preferredColorScheme=0")
+    assert dark[5, 5].max() < 40
+    assert np.median(dark) < 60  # the charts too
+    assert (np.abs(dark.astype(int) - MARK).max(2) < 12).sum() > 30_000
+    # The page has no script of its own; this one tells how wide it is, and which pictures do not show.
+    probe = "<script>onload=()=>{document.title=[innerWidth,document.documentElement.scrollWidth,"
+    probe += "[...document.images].filter(i=>!i.naturalWidth).length].join(' ')}</script></head>"
+    page.write_text(re.sub(r"<meta http-equiv[^\n]*\n", "", text).replace("</head>", probe))
+    profile = f"--user-data-dir={tmp_path / 'other'}"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", profile, "--window-size=390,2000", "--dump-dom"]
+    done = subprocess.run([str(BROWSER), *options, page.as_uri()], capture_output=True, text=True, timeout=200, check=True)
+    told = re.search(r"<title>(\d+) (\d+) (\d+)</title>", done.stdout)
+    assert told, done.stdout[:300]
+    width, needed, broken = map(int, told.groups())
+    assert needed <= width <= 500
+    assert broken == 0
+
+
+def test_the_command(run: Path, sweep: Path) -> None:
+    """`report.py` writes the page beside the run; a mistake is one line, and leaves nothing behind."""
+
+    def call(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(HOME / "report.py"), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, cwd=run.parent, timeout=250, check=False)
+
+    done = call(f"run={run}")
+    assert done.returncode == 0, done.stderr
+    page = (run / "report" / "report.html").read_text()
+    assert "filter.particles" in page
+    assert "differ from the defaults" in page  # the defaults were composed
+    assert (run / "report" / "training-loss-training-step.png").is_file()
+    wrong = call("run=missing")
+    assert wrong.returncode == 2
+    assert wrong.stderr.strip() == "report: run=missing: no such folder"
+    assert not (run.parent / "missing").exists()
+    own = next(path.parent for path in sweep.rglob("metrics.json"))  # a folder with `=` and `,` in its name
+    assert call(f"run={own}").returncode == 0
+    done = call(f"sweep={sweep}", f"out={run.parent / 'there'}")
+    assert done.returncode == 0, done.stderr
+    assert "Sweep over filter.particles (2)" in (run.parent / "there" / "report.html").read_text()
+
+
+def test_the_sweep_page(sweep: Path) -> None:
+    """Means over seeds, the best marked, what is unfinished named; nothing is fetched."""
+    found = read_sweep(sweep)
+    best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
+    page, files = sweep_page(found, best, [], "x")
+    marked = re.search(r'<tr class="marked">.*?</tr>', page)
+    assert marked
+    assert "80.3 ± 2.5" in marked[0]
+    assert "Without a result: filter.particles=1000,refine=none,seed=2" in page
+    assert "78.0 to 83.0 (sd 2.5)" in page
+    assert outside(page).fetched == []
+    assert {"add-auc-filter-particles.png", "add-auc-refine.png", "add-auc-time-an-image-s.png"} <= set(files)

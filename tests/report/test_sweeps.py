@@ -1,0 +1,79 @@
+"""How a sweep's runs are grouped, ordered and summed up."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.report.sweep_page import mean_and_half_range, over, spread, sweep_page
+from posefilter.report.sweeps import best_group, best_job, groups, read_sweep
+
+
+def test_axes_groups_and_best(sweep: Path) -> None:
+    """Runs that differ in their seed are one group; numbers are sorted by size, names as they were asked for."""
+    found = read_sweep(sweep)
+    assert found.axes == ["filter.particles", "refine", "seed"]  # `out` differs too, and is none
+    assert found.shown == ["filter.particles", "refine"]
+    assert [tuple(group.place.values()) for group in groups(found)] == [
+        (50, "none"),
+        (50, "gradient"),
+        (1000, "none"),
+        (1000, "gradient"),
+    ]
+    assert [len(group.jobs) for group in groups(found)] == [3, 3, 2, 3]
+    assert found.unfinished == ["filter.particles=1000,refine=none,seed=2"]
+    assert best_job(found).place == {"filter.particles": 1000, "refine": "gradient", "seed": 2}
+    assert best_group(groups(found)) == 3
+
+
+def test_panels_hold_means_and_ranges(sweep: Path) -> None:
+    """Over the particles, a line a refinement, with the seeds' range about it."""
+    found = read_sweep(sweep)
+    panel = over("filter.particles", found, groups(found), ["add/auc"])[0]
+    none, gradient = panel.lines
+    assert none.label == "refine=none"
+    assert list(gradient.x) == [50.0, 1000.0]
+    assert list(gradient.y) == pytest.approx([70.5 + 1 / 3, 80 + 1 / 3])
+    assert list(gradient.low) == pytest.approx([68.5, 78.0])
+    assert list(gradient.high) == pytest.approx([73.5, 83.0])
+    assert panel.log_x
+    assert over("refine", found, groups(found), ["add/auc"])[0].categories == ["none", "gradient"]
+
+
+def test_cells() -> None:
+    """Means with half the range; extremes with the standard deviation."""
+    assert mean_and_half_range([1.0, 2.0, 6.0], "{:.1f}") == "3.0 ± 2.5"
+    assert mean_and_half_range([2.0], "{:.1f}") == "2.0"
+    assert mean_and_half_range([], "{:.1f}") == "–"
+    assert spread([1.0, 3.0], "{:.2f}") == "1.00 to 3.00 (sd 1.41)"
+
+
+def test_summary_alone_is_enough(tmp_path: Path) -> None:
+    """Where the runs are gone, summary.csv is read, and the page says so."""
+    rows = "filter.particles,add_auc,seconds_per_image,folder\n1000,80.5,2,b\n50,70,1,a\n"
+    (tmp_path / "summary.csv").write_text(rows)
+    found = read_sweep(tmp_path)
+    assert found.axes == ["filter.particles"]
+    assert [job.place["filter.particles"] for job in found.jobs] == [50, 1000]
+    assert best_job(found).numbers == {"add/auc": 80.5, "seconds_per_image": 2.0}
+    page, files = sweep_page(found, None, None, "x")
+    assert "those of summary.csv" in page
+    assert "add-auc-filter-particles.png" in files
+
+
+def test_mistakes_are_one_line(sweep: Path, run: Path, tmp_path: Path) -> None:
+    """No folder, no sweep, a run, nothing finished."""
+    (tmp_path / "empty").mkdir()
+    for folder, cause in (
+        (tmp_path / "nowhere", "no such folder"),
+        (tmp_path / "empty", "no sweep's folder"),
+        (run, "run="),
+    ):
+        with pytest.raises(UserError, match=cause):
+            read_sweep(folder)
+    for path in sweep.rglob("metrics.json"):
+        path.unlink()
+    with pytest.raises(UserError, match="none of its 12 runs has ended"):
+        read_sweep(sweep)
+    shutil.rmtree(sweep)
