@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from posefilter.errors import UserError
+from posefilter.report.events import once
 from posefilter.report.gather import read_run
 from posefilter.report.pictures import by_number, by_section
 from posefilter.report.settings import Change, changes
@@ -24,6 +25,14 @@ def test_scalars_and_pictures_are_read(run: Path) -> None:
     assert [p.name for p in shown["belief"]] == ["figures/belief"]
     assert record.missing == []
     assert sorted(["a10", "a9", "b1"], key=by_number) == ["a9", "a10", "b1"]
+
+
+def test_a_resumed_run_is_one_curve() -> None:
+    """What was logged beyond the checkpoint that a run went on from is void, in whatever order the files are read."""
+    first = [(step, 1.0, 10.0 + step) for step in (0, 10, 20, 30)]
+    resumed = [(step, 2.0, 100.0 + step) for step in (15, 25)]
+    assert once([*resumed, *first]).steps == (0, 10, 15, 25)
+    assert once([*first, *resumed]).values == (1.0, 1.0, 2.0, 2.0)
 
 
 def test_signs_of_failure_are_found(run: Path) -> None:

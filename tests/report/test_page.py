@@ -109,9 +109,10 @@ def test_charts_have_both_themes() -> None:
 
 
 def test_smoothing_keeps_lines_and_skips_gaps() -> None:
-    """A straight line stays one, up to its ends; what is not finite does not count."""
+    """A straight line stays one, but for its end, which lags; what is not finite does not count."""
     line = np.linspace(2, 9, 100)
-    assert np.allclose(smooth(line), line)
+    assert np.allclose(smooth(line)[:-4], line[:-4])
+    assert smooth(line)[-1] == pytest.approx(line[-5:].mean())
     line[50] = np.nan
     assert np.isfinite(smooth(line)).all()
 
@@ -121,7 +122,8 @@ def shoot(page: Path, out: Path, width: int, *options: str) -> np.ndarray:
     command = [
         str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
         "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        f"--user-data-dir={out / 'profile'}", f"--screenshot={out / 'shot.png'}", f"--window-size={width},3000", *options, page.resolve().as_uri(),
+        f"--user-data-dir={out / 'profile'}", f"--screenshot={out / 'shot.png'}",
+        f"--window-size={width},3000", *options, page.resolve().as_uri(),
     ]  # fmt: skip
     subprocess.run(command, check=True, capture_output=True, timeout=200)
     return np.asarray(Image.open(out / "shot.png").convert("RGB"))
@@ -155,12 +157,13 @@ def test_a_browser_shows_it(run: Path, tmp_path: Path) -> None:
     assert broken == 0
 
 
+@pytest.mark.slow
 def test_the_command(run: Path, sweep: Path) -> None:
     """`report.py` writes the page beside the run; a mistake is one line, and leaves nothing behind."""
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(HOME / "report.py"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, cwd=run.parent, timeout=250, check=False)
+        return subprocess.run(command, capture_output=True, text=True, cwd=run.parent, timeout=280, check=False)
 
     done = call(f"run={run}")
     assert done.returncode == 0, done.stderr
@@ -172,11 +175,10 @@ def test_the_command(run: Path, sweep: Path) -> None:
     assert wrong.returncode == 2
     assert wrong.stderr.strip() == "report: run=missing: no such folder"
     assert not (run.parent / "missing").exists()
-    own = next(path.parent for path in sweep.rglob("metrics.json"))  # a folder with `=` and `,` in its name
-    assert call(f"run={own}").returncode == 0
-    done = call(f"sweep={sweep}", f"out={run.parent / 'there'}")
+    there = sweep.rename(sweep.parent / "a=1,b=2")  # as the folders of a sweep's runs are named
+    done = call(f"sweep={there}", f"out={there / 'elsewhere'}")
     assert done.returncode == 0, done.stderr
-    assert "Sweep over filter.particles (2)" in (run.parent / "there" / "report.html").read_text()
+    assert "Sweep over filter.particles (2)" in (there / "elsewhere" / "report.html").read_text()
 
 
 def test_the_sweep_page(sweep: Path) -> None:

@@ -33,14 +33,26 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[Picture]]:
     tags = log.Tags()
     curves = {}
     for tag in tags["scalars"]:
-        events = log.Scalars(tag)
-        rows = zip(*((e.step, e.value, e.wall_time) for e in events), strict=True)
-        curves[tag] = Curve(*(tuple(row) for row in rows))
+        curves[tag] = once([(e.step, e.value, e.wall_time) for e in log.Scalars(tag)])
     pictures = []
     for tag in tags["images"]:
         latest = log.Images(tag)[-1]
         pictures.append(Picture(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
     return curves, pictures
+
+
+def once(events: list[tuple[int, float, float]]) -> Curve:
+    """Return a curve of (step, value, time) in which steps only grow: what was logged last of a step is what counts.
+
+    A run that goes on from a checkpoint goes back to its step; what it had logged beyond that is void.
+    """
+    kept: list[tuple[int, float, float]] = []
+    for event in sorted(events, key=lambda event: event[2]):
+        while kept and kept[-1][0] >= event[0]:
+            kept.pop()
+        kept.append(event)
+    steps, values, times = zip(*kept, strict=True)
+    return Curve(steps, values, times)
 
 
 def event_files(folder: Path) -> Iterator[Path]:

@@ -145,15 +145,19 @@ def dress(axes: Axes, panel: Panel, theme: Theme) -> None:
 
 
 def smooth(values: Sequence[float]) -> np.ndarray:
-    """Return a running mean over about a twelfth of a line, narrower at its ends; what is not finite does not count."""
+    """Return a running mean over about a twelfth of a line; what is not finite does not count.
+
+    Narrower at the start, where losses fall steeply; at the end one-sided, since a narrow mean would show a last jump as a
+    trend.
+    """
     y = np.asarray(values, float)
     reach = max(1, len(y) // 24)
     known = np.isfinite(y)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, y, 0))])
     count = np.concatenate([[0], np.cumsum(known)])
     at = np.arange(len(y))
-    room = np.minimum(reach, np.minimum(at, len(y) - 1 - at))
-    low, high = at - room, at + room + 1
+    back = np.minimum(reach, at)
+    low, high = at - back, at + np.minimum(back, len(y) - 1 - at) + 1
     n = count[high] - count[low]
     return np.where(n > 0, (total[high] - total[low]) / np.maximum(n, 1), math.nan)
 

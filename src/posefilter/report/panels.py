@@ -80,7 +80,7 @@ def chosen(curves: Mapping[str, Curve], choices: Sequence[Choice]) -> list[Panel
 
 def training(curves: Mapping[str, Curve]) -> list[Panel]:
     """Return the charts of the training: losses together, what has a unit and the learning rate alone."""
-    rate = [tag for tag in curves if tag.startswith("lr-") or tag == "train/learning_rate"][:1]
+    rate = [tag for tag in curves if tag.startswith("lr-") or tag == "train/learning_rate"]
     own = {tag[6:]: curve for tag, curve in curves.items() if tag.startswith("train/") and tag not in rate}
     units = {name: name.rpartition("_")[2] for name in own if name.endswith(("_mm", "_px", "_m", "_rad"))}
     names = [name for name in sorted(own, key=lambda name: name != "total") if name not in units]
@@ -91,8 +91,11 @@ def training(curves: Mapping[str, Curve]) -> list[Panel]:
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)
         out.append(Panel(name.removesuffix(f"_{unit}").replace("_", " ").capitalize(), "training step", unit, [line]))
-    lines = [Line("learning rate", curves[tag].steps, curves[tag].values) for tag in rate]
-    return [*out, Panel("Learning rate", "training step", "", lines)] if lines else out
+    if rate:
+        newest = max((curves[tag] for tag in rate), key=lambda curve: curve.times[-1])
+        line = Line("learning rate", newest.steps, newest.values)
+        out.append(Panel("Learning rate", "training step", "", [line]))
+    return out
 
 
 def health(curves: Mapping[str, Curve]) -> list[Panel]:

@@ -16,7 +16,6 @@ from posefilter.report.settings import Change, changes
 from posefilter.report.sweep_page import sweep_page
 from posefilter.report.sweeps import best_job, read_sweep
 from posefilter.run.job import Job
-from posefilter.run.machine import command_line
 
 FOLDERS = ("run", "sweep", "out")
 
@@ -38,14 +37,15 @@ def report(job: Job) -> None:
     if (run is None) == (sweep is None):
         raise UserError("give either run=RUN, a run's folder, or sweep=DIR, a sweep's")
     folder = Path(str(run if sweep is None else sweep))
+    command = f"python report.py {'run' if sweep is None else 'sweep'}={folder}"
     if sweep is None:
         record = read_run(folder)
-        page, files = run_page(record, compared(record), command_line())
+        page, files = run_page(record, compared(record), command)
     else:
         found = read_sweep(folder)
         winner = folder / best_job(found).folder
         best = read_run(winner) if (winner / "metrics.json").is_file() else None
-        page, files = sweep_page(found, best, compared(best) if best else None, command_line())
+        page, files = sweep_page(found, best, compared(best) if best else None, command)
     out = Path(job.cfg.out) if job.cfg.out else folder / "report"
     out.mkdir(parents=True, exist_ok=True)
     (out / "report.html").write_text(page)
