@@ -48,8 +48,11 @@ class View(NamedTuple):
         a = 1 / self.scale
         back = np.array([[a, 0, self.left + a / 2], [0, a, self.top + a / 2]])
         how = (cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
-        size = (self.width, self.height)
-        return np.asarray(cv2.warpAffine(rgb, back, size, flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=_BEYOND))
+        out = cv2.warpAffine(rgb, back, (self.width, self.height), flags=how, borderMode=cv2.BORDER_REPLICATE)
+        for line, start, size in ((out, self.top, rgb.shape[0]), (out.swapaxes(0, 1), self.left, rgb.shape[1])):
+            at = start + (np.arange(len(line)) + 0.5) / self.scale
+            line[(at < -0.5) | (at > size - 0.5)] = _BEYOND
+        return np.asarray(out)
 
     def place(self, pixels: np.ndarray) -> np.ndarray:
         """Return where the photograph's pixels are shown.  (*, 2) [px] -> (*, 2) [px]."""

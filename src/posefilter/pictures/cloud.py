@@ -155,8 +155,9 @@ def weight_scale(width: int, legend: Sequence[tuple[str, Colour]], size: int = 1
     """Return a strip that explains the colours."""
     sheet = strip(width, "weight over the mean weight:   1/10", legend, size).copy()
     left = int(18 + font(size).getlength("weight over the mean weight:   1/10"))
-    ramp = (_WEIGHT(np.linspace(0, 1, 240))[None, :, :3] * 255).astype(np.uint8)
-    sheet[8:-8, left : left + 240] = ramp
+    long = max(10, min(240, width - left - 60))
     end = strip(50, "10", size=size)
-    sheet[:, left + 240 : left + 290] = end
+    ramp = (_WEIGHT(np.linspace(0, 1, long))[None, :, :3] * 255).astype(np.uint8)
+    sheet[8 : len(end) - 8, left : left + long] = ramp
+    sheet[: len(end), left + long : left + long + 50] = end
     return sheet

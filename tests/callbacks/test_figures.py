@@ -1,0 +1,204 @@
+"""Figures and health of a real validation, run by a filter that is told the truth."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import DataLoader
+
+from posefilter.callbacks.board import Budget
+from posefilter.callbacks.figures import Figures, errors_of
+from posefilter.callbacks.health import FilterHealth
+from posefilter.filters.estimate import Mean
+from posefilter.filters.initialise import FromProposals
+from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.propose import Gaussian
+from posefilter.filters.refine import NoRefine
+from posefilter.filters.resample import Systematic
+from posefilter.filters.reweigh import Annealed
+from posefilter.filters.schedule import Geometric
+from posefilter.geometry.camera import intrinsics
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+
+H, W, IMAGES = 48, 64, 8
+
+
+def model() -> ObjectModel:
+    hull = torch.tensor([[x, y, z] for x in (-0.05, 0.05) for y in (-0.08, 0.08) for z in (-0.1, 0.1)])
+    return ObjectModel("box", hull, torch.zeros(3), 0.14, 0.28, torch.eye(4)[None], hull)
+
+
+def scenes() -> list[Batch]:
+    out = []
+    for i in range(IMAGES):
+        pose = make_pose(torch.eye(3), torch.tensor([0.02 * i - 0.08, 0.0, 0.8]))
+        mask = torch.zeros(1, H, W, dtype=torch.bool)
+        mask[:, 16:32, 20:44] = True
+        K, one = intrinsics(60.0, 60.0, (W - 1) / 2, (H - 1) / 2), torch.tensor(1.0)
+        out.append(
+            Batch(torch.full((3, H, W), 0.5), torch.ones(1, H, W), mask, K, pose, torch.tensor(0), torch.tensor(i), one)
+        )
+    return out
+
+
+class Told(PoseEstimator):
+    """Knows the truth, but believes the object of image i to be i cm to the right."""
+
+    def __init__(self) -> None:
+        pieces = (FromProposals(), Geometric(0.03, 0.005), Annealed(), Systematic(), Gaussian(0.4), Mean(), NoRefine())
+        loss: Any = None
+        super().__init__(ParticleFilter(100, 4, *pieces), loss, partial(torch.optim.SGD, lr=0.1), object_model=model())
+        self.weight = torch.nn.Parameter(torch.ones(1))
+
+    @property
+    def space(self) -> PoseSpace:
+        return PoseSpace((0.0, 0.0, 0.0), 0.14)
+
+    def observe(self, batch: Batch) -> torch.Tensor:
+        shift = torch.zeros(len(batch.rgb), 6)
+        shift[:, 0] = 0.01 * batch.frame_id
+        return move_about(batch.camera_from_object, shift, torch.zeros(3))
+
+    def read(self, scene: torch.Tensor, cloud: Cloud, step: Step, generator: torch.Generator) -> Reading:
+        likely = -0.5 * (self.space.distance(cloud.state, scene[:, None]) / step.sigma).square()
+        still = torch.zeros(*cloud.state.shape[:2], 6)
+        return Reading(likely, still, cloud.state, cloud.memory)
+
+    def propose(self, scene: torch.Tensor, particles: int, generator: torch.Generator) -> torch.Tensor:
+        tangent = torch.randn(len(scene), particles, 6, generator=generator) * torch.tensor([0.03] * 3 + [0.2] * 3)
+        return move_about(scene[:, None].expand(-1, particles, 4, 4), tangent, torch.zeros(3))
+
+
+def validate(folder: Path, *callbacks: Any) -> None:
+    trainer = Trainer(
+        accelerator="cpu", logger=TensorBoardLogger(folder, name="", version=""), callbacks=list(callbacks),
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+    )  # fmt: skip
+    trainer.validate(Told(), DataLoader(scenes(), batch_size=3), verbose=False)  # type: ignore[arg-type]
+    for logger in trainer.loggers:
+        logger.finalize("success")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures, FilterHealth]:
+    folder = tmp_path_factory.mktemp("run")
+    figures, health = Figures(folder / "figures"), FilterHealth(folder / "figures")
+    validate(folder, figures, health)
+    return folder, figures, health
+
+
+def test_best_and_worst_are_the_best_and_the_worst(run: tuple[Path, Figures, FilterHealth]) -> None:
+    kept = run[1]._kept
+    assert [one.frame_id for one in kept["first"]] == [0, 1, 2, 3]
+    assert [one.frame_id for one in kept["best"]] == [0, 1]
+    assert [one.frame_id for one in kept["worst"]] == [7, 6]
+    assert kept["worst"][0].error == pytest.approx(0.07, abs=0.01)
+
+
+def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, FilterHealth]) -> None:
+    folder = run[0]
+    board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
+    board.Reload()
+    names = {"figures/overlays", "figures/particles", "figures/belief", "figures/filter_health"}
+    assert set(board.Tags()["images"]) == names
+    for tag, file in (("figures/overlays", "validation_overlays"), ("figures/filter_health", "filter_health")):
+        written = (folder / "figures" / f"{file}.png").read_bytes()
+        assert board.Images(tag)[0].encoded_image_string == written
+    with Image.open(folder / "figures" / "validation_overlays.png") as overlays:
+        picture = np.asarray(overlays.convert("RGB"))
+    assert picture.shape[1] > 4 * 480
+    assert (picture == 128).all(-1).mean() > 0.3  # the grey photographs
+    assert board.Scalars("filter/sigma_m/step_00")[0].value == pytest.approx(0.03)
+    assert board.Scalars("filter/sigma_m/step_03")[0].value == pytest.approx(0.005)
+
+
+def test_health_is_the_mean_over_all_images(run: tuple[Path, Figures, FilterHealth]) -> None:
+    curves, health = run[2].curves(), run[2]
+    assert health._images == IMAGES
+    assert curves["spread_m"][0] == pytest.approx(0.03 * 3**0.5, rel=0.5)
+    assert curves["spread_m"][-1] < curves["spread_m"][0]
+    assert all(0 < share <= 1 for share in curves["ess"])
+
+
+def test_looking_changes_nothing(tmp_path: Path) -> None:
+    torch.manual_seed(3)
+    np.random.seed(3)  # noqa: NPY002
+    before, other = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index, union-attr]  # noqa: NPY002
+    method, figures = Told(), Figures(tmp_path, share=None)
+    state = {name: value.clone() for name, value in method.state_dict().items()}
+    torch.set_rng_state(before)
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    batch = torch.utils.data.default_collate(scenes()[:2])
+    trace = method.filter(batch, method, torch.Generator().manual_seed(0))
+    figures.on_validation_epoch_start(trainer, method)
+    figures.on_validation_batch_end(trainer, method, trace, batch, 0)
+    figures.on_validation_epoch_end(trainer, method)
+    assert len(list(tmp_path.glob("*.png"))) == 3
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (np.random.get_state()[1] == other).all()  # type: ignore[index]  # noqa: NPY002
+    assert all(torch.equal(value, state[name]) for name, value in method.state_dict().items())
+
+
+def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, figures = Told(), Figures(tmp_path, every=2, share=None)
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    batch = torch.utils.data.default_collate(scenes()[:2])
+    trace = method.filter(batch, method, torch.Generator().manual_seed(0))
+    drawn: list[int] = []
+    monkeypatch.setattr(Figures, "draw", lambda self, trainer, method: drawn.append(validation))
+    for validation in range(5):
+        figures.on_validation_epoch_start(trainer, method)
+        figures.on_validation_batch_end(trainer, method, trace, batch, 0)
+        figures.on_validation_epoch_end(trainer, method)
+    assert drawn == [0, 2, 4]
+
+
+def test_drawing_that_costs_too_much_is_put_off_until_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, figures = Told(), Figures(tmp_path, share=0.05)
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    drawn: list[int] = []
+    now = [0]
+
+    def draw(self: Figures, trainer: Trainer, method: PoseEstimator) -> None:
+        drawn.append(now[0])
+        figures.budget.last = 1.0
+        figures.budget.drawn += 1.0
+
+    monkeypatch.setattr(Figures, "draw", draw)
+    batch = torch.utils.data.default_collate(scenes()[:2])
+    trace = method.filter(batch, method, torch.Generator().manual_seed(0))
+    for validation in range(11):
+        now[0] = validation
+        figures.on_validation_epoch_start(trainer, method)
+        figures.on_validation_batch_end(trainer, method, trace, batch, 0)
+        figures.budget._start -= 5.0  # a validation of five seconds pays for a quarter of a drawing
+        figures.on_validation_epoch_end(trainer, method)
+    assert drawn == [0, 7]  # the eighth has paid for two
+    figures.on_fit_end(trainer, method)
+    figures.on_fit_end(trainer, method)
+    assert drawn == [0, 7, 10]
+
+
+def test_budget_without_limit_always_allows() -> None:
+    budget = Budget(None)
+    budget.last = budget.drawn = 100.0
+    assert budget.allows()
+
+
+def test_estimates_that_are_no_numbers_are_the_worst() -> None:
+    method, batch = Told(), torch.utils.data.default_collate(scenes()[:2])
+    trace: Trace = method.filter(batch, method, torch.Generator().manual_seed(0))
+    trace.belief.best[0] = torch.nan
+    errors = errors_of(trace, batch, method, model().points)
+    assert errors[0] == torch.inf
+    assert errors[1] < 0.05

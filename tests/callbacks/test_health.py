@@ -1,0 +1,71 @@
+"""Filter health against clouds made by hand."""
+
+import math
+
+import pytest
+import torch
+
+from posefilter.callbacks.health import evenly, health, scalars
+from posefilter.geometry.pose import move_about
+from posefilter.geometry.spaces import PixelSpace, PoseSpace
+from posefilter.pictures.curves import draw_health
+from posefilter.types import Belief, Cloud, Reading, Step, Trace
+
+
+def trace_of(states: list[torch.Tensor], weights: list[torch.Tensor], sigmas: list[torch.Tensor]) -> Trace:
+    clouds, readings, steps = [], [], []
+    for t, (state, w, sigma) in enumerate(zip(states, weights, sigmas, strict=True)):
+        B, N = w.shape
+        clouds.append(Cloud(state, torch.zeros(B, N, 0), w.log(), torch.zeros(B, N).long()))
+        likely = torch.arange(N).float().expand(B, N) * (t + 1)
+        readings.append(Reading(likely, torch.zeros(B, N, 2), torch.eye(4).expand(B, N, 4, 4), torch.zeros(B, N, 0)))
+        steps.append(Step(t, len(states), sigma))
+    poses = torch.eye(4).expand(len(weights[0]), 1, 4, 4)
+    belief = Belief(poses, torch.zeros(len(weights[0]), 1), poses[:, 0], torch.zeros(len(weights[0])))
+    return Trace(tuple(clouds), tuple(readings), tuple(steps), belief)
+
+
+def test_pixels_by_hand() -> None:
+    states = [torch.tensor([[[0.0, 0.0], [4.0, 0.0]], [[0.0, 0.0], [0.0, 6.0]]])] * 2
+    even, one = torch.full((2, 2), 0.5), torch.tensor([[1.0, 0.0], [0.75, 0.25]])
+    found = health(trace_of(states, [even, one], [torch.tensor(8.0), torch.tensor([4.0, 2.0])]), PixelSpace())
+    assert list(found) == ["ess", "spread_px", "sigma_px", "best_log_likelihood"]
+    assert found["ess"].tolist() == [[1.0, 0.5], [1.0, pytest.approx(1 / 0.625 / 2)]]
+    # weights 3/4 and 1/4 six apart: the variance is 3/16 x 36
+    assert found["spread_px"][0].tolist() == [2.0, 0.0]
+    assert found["spread_px"][1].tolist() == [3.0, pytest.approx(math.sqrt(6.75))]
+    assert found["sigma_px"].tolist() == [[8.0, 4.0], [8.0, 2.0]]
+    assert found["best_log_likelihood"].tolist() == [[1.0, 2.0], [1.0, 2.0]]
+
+
+def test_poses_by_hand() -> None:
+    center = torch.tensor([0.1, 0.0, 0.0])
+    tangent = torch.tensor([[0.03, 0, 0, 0, 0, 0.2], [-0.03, 0, 0, 0, 0, -0.2]])
+    state = move_about(torch.eye(4).expand(2, 4, 4), tangent, center)[None]
+    found = health(trace_of([state], [torch.full((1, 2), 0.5)], [torch.tensor(0.04)]), PoseSpace((0.1, 0.0, 0.0), 0.12))
+    assert found["spread_m"].item() == pytest.approx(0.03, rel=1e-4)  # about the object's centre, whatever the turn
+    assert found["spread_rad"].item() == pytest.approx(0.2, rel=1e-4)
+    assert found["sigma_m"].item() == pytest.approx(0.04)
+
+
+def test_scalars_are_named_by_step() -> None:
+    found = scalars({"ess": [0.1 * i for i in range(101)], "sigma_m": [1.0, 0.5]}, most=11)
+    assert [name for name in found if "ess" in name][:3] == [
+        "filter/ess/step_00",
+        "filter/ess/step_10",
+        "filter/ess/step_20",
+    ]
+    assert found["filter/ess/step_100"] == pytest.approx(10.0)
+    assert found["filter/sigma_m/step_01"] == 0.5
+    assert len(found) == 13
+    assert evenly(5, 1) == [4]
+
+
+def test_figure_shows_the_numbers_in_the_units_it_says() -> None:
+    figure = draw_health({"spread_m": [0.1, 0.02], "spread_rad": [math.pi, 0.0], "ess": [0.25, 0.5]}, images=3)
+    panels = {axes.get_title(): axes for axes in figure.axes}
+    assert panels["spread of the centres"].get_ylabel() == "mm"
+    assert panels["spread of the centres"].lines[0].get_ydata().tolist() == [100.0, 20.0]
+    assert panels["spread of the rotations"].lines[0].get_ydata().tolist() == pytest.approx([180.0, 0.0])
+    assert panels["effective particles"].get_ylim() == (0, 1)
+    assert figure.get_suptitle().endswith("means over 3 images")
