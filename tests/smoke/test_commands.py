@@ -80,7 +80,7 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
 
 
 def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tmp_path: Path) -> None:
-    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", "refine=none", "filter.particles=4,8", "-m"]
+    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", "refine=none", "-m", "filter.particles=4,8"]
     assert run_command("evaluate", HOME, [*typed, f"out={tmp_path}", "console=plain", "threads=1"]) == 0
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))

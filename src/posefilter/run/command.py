@@ -26,6 +26,7 @@ from posefilter.run.resume import with_resumed
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
+_MULTIRUN = ("-m", "--multirun")
 
 
 def run_command(name: str, home: Path, arguments: list[str] | None = None) -> int:
@@ -35,6 +36,7 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     A mistake ends in one line on stderr and status 2; `debug=trace` shows where it came from.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)  # Hydra's parser wants it before or after all the rest
     trace = "debug=trace" in arguments
     conf = home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer

@@ -71,8 +71,8 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
             row[name] = value
         rows.append(row)
         said.append(pairs)
-    keys = list(dict.fromkeys(key for pairs in said for key in pairs))
-    axes = [key for key in keys if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
+    typed = dict.fromkeys(key for pairs in said for key in pairs)
+    axes = [key for key in typed if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
     for row, pairs in zip(rows, said, strict=True):
         row.update({key: _number(pairs.get(key, "")) for key in axes})
     rows.sort(key=lambda row: [(isinstance(row[key], str), row[key]) for key in axes])
