@@ -18,7 +18,7 @@ FIGURES = (  # name, title, unit, limits, format
     ("add/recall_01d", "ADD < 0.1 diameter", "%", PERCENT, "{:.1f}"),
     ("add/median_mm", "Median ADD", "mm", None, "{:.1f}"),
     ("iou", "Box IoU", "", SHARE, "{:.3f}"),
-    ("particles_on_object", "Particles on the object", "share", SHARE, "{:.3f}"),
+    ("particles_on_object", "On the object", "share", SHARE, "{:.3f}"),
     ("seconds_per_image", "Time an image", "s", None, "{:.3g}"),
 )
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
@@ -61,7 +61,8 @@ def head(sweep: Sweep, winner: Job, best: Run | None) -> str:
     left = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
     if best is None:
         left.append("The runs themselves are not there: figures are those of summary.csv.")
-    badge = f'<span class="badge {"bad" if sweep.unfinished else "done"}">{len(sweep.jobs)} runs</span>'
+    count = f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}" if sweep.unfinished else str(len(sweep.jobs))
+    badge = f'<span class="badge {"bad" if sweep.unfinished else "done"}">{count} runs</span>'
     return (
         f"<h1>Sweep over {escape(over_what)}</h1><p>{badge} best: {html.code(told(winner.place) or winner.folder)}<br>"
         f"{html.code(str(sweep.folder))}</p>" + (tiles(best) if best else "") + html.notes(left)
