@@ -155,8 +155,10 @@ def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.Monkey
     batch = torch.utils.data.default_collate(scenes()[:2])
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     drawn: list[int] = []
-    monkeypatch.setattr(Figures, "draw", lambda self, trainer, method: drawn.append(validation))
+    now = [0]
+    monkeypatch.setattr(Figures, "draw", lambda self, trainer, method: drawn.append(now[0]))
     for validation in range(5):
+        now[0] = validation
         figures.on_validation_epoch_start(trainer, method)
         figures.on_validation_batch_end(trainer, method, trace, batch, 0)
         figures.on_validation_epoch_end(trainer, method)

@@ -44,12 +44,11 @@ def draw_belief(
     true = None if truth is None else torch.as_tensor(np.asarray(truth), dtype=torch.float64)
     axis = longest_axis(model) if axis is None else axis
     figure = new_figure(1100, 1040)
-    layout = figure.add_gridspec(
-        3, 6, height_ratios=[2.3, 1, 1], left=0.065, right=0.975, bottom=0.06, top=0.91, hspace=0.45, wspace=0.9
-    )
-    draw_centres(figure.add_subplot(layout[0, :2]), poses, weights, best, true, model, rgb, K)
-    draw_rotations(figure.add_subplot(layout[0, 2:], projection="mollweide"), poses, weights, best, true, axis)
-    draw_marginals(figure, layout, poses, weights, best, true, model)
+    top = figure.add_gridspec(1, 6, left=0.065, right=0.975, bottom=0.55, top=0.91, wspace=0.9)
+    below = figure.add_gridspec(2, 6, left=0.065, right=0.975, bottom=0.06, top=0.47, hspace=0.55, wspace=0.9)
+    draw_centres(figure.add_subplot(top[0, :2]), poses, weights, best, true, model, rgb, K)
+    draw_rotations(figure.add_subplot(top[0, 2:], projection="mollweide"), poses, weights, best, true, axis)
+    draw_marginals(figure, below, poses, weights, best, true, model)
     ess = float(1 / weights.square().sum())
     title = title or f"Belief about {model.name}: {len(weights)} particles, {ess:.0f} of them effective"
     figure.suptitle(title, fontsize=14, x=0.02, y=0.985, ha="left")
@@ -136,8 +135,8 @@ def draw_centres(
     axes.imshow(rgb)
     axes.scatter(dots[order, 0], dots[order, 1], s=8, c=weights[order], cmap="plasma", linewidths=0, alpha=0.9)
     if true is not None:
-        axes.scatter([at(true)[0]], [at(true)[1]], s=160, marker="o", facecolors="none", edgecolors=[_TRUE], linewidths=2)
-    axes.scatter([at(best)[0]], [at(best)[1]], s=90, marker="s", facecolors="none", edgecolors=[_BEST], linewidths=2)
+        axes.scatter([at(true)[0]], [at(true)[1]], s=300, marker="o", facecolors="none", edgecolors=[_TRUE], linewidths=2)
+    axes.scatter([at(best)[0]], [at(best)[1]], s=180, marker="s", facecolors="none", edgecolors=[_BEST], linewidths=2)
     left, top, right, bottom = window(dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2])
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u [px]", ylabel="v [px]")
     axes.set_title("Centres on the photograph", fontsize=11)
@@ -183,7 +182,7 @@ def draw_marginals(
     labels = ("right", "down", "away")
     for row, (scale, unit) in enumerate(((1000.0, "mm"), (180 / math.pi, "degrees"))):
         for i in range(3):
-            axes = figure.add_subplot(layout[1 + row, 2 * i : 2 * i + 2])
+            axes = figure.add_subplot(layout[row, 2 * i : 2 * i + 2])
             marks = [float(part[row][i]) * scale for part in parts[1:]]
             histogram(axes, parts[0][row][:, i].numpy() * scale, weights.numpy(), marks)
             if row == 0:
@@ -212,7 +211,8 @@ def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[f
         axes.axvline(value, color=colour, linestyle=style, linewidth=1.8)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
     if beyond >= 5e-4:
-        axes.text(0.98, 0.96, f"{beyond:.1%} beyond", transform=axes.transAxes, ha="right", va="top", fontsize=8)
+        said = axes.text(0.98, 0.96, f"{beyond:.1%} beyond", transform=axes.transAxes, ha="right", va="top", fontsize=8)
+        said.set_bbox({"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1})
     axes.set_xlim(low - pad, high + pad)
     axes.margins(y=0.15)
     axes.tick_params(labelsize=8)

@@ -77,7 +77,7 @@ def view_of_poses(poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, heig
         camera = corners @ pose[:3, :3].T + pose[:3, 3]
         if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
             found.append(np.clip(_project(camera, np.asarray(K, np.float64)), 0, [width - 1, height - 1]))
-    return close_up(np.concatenate(found), height, width, shown) if found else whole(height, width, shown)
+    return close_up(np.concatenate(found), height, width, shown, margin=0.12) if found else whole(height, width, shown)
 
 
 def axes_legend() -> list[tuple[str, Colour]]:
