@@ -115,8 +115,9 @@ class PoseEstimator(LightningModule):
             raise FloatingPointError(f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }")
         for name, value in means.items():
             self.watch(name, value.detach())
-        self.log("train/total", total.detach(), prog_bar=True)
-        self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
+        if self._trainer is not None:
+            self.log("train/total", total.detach(), prog_bar=True)
+            self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return total
 
     def watch(self, name: str, value: Tensor) -> None:

@@ -101,15 +101,13 @@ def check_arguments(
 ) -> None:
     """Raise UserError unless a callable takes these arguments."""
     known, others = accepted(target)
-    for name, value in arguments.items():
-        if name not in known:
-            if others:
-                continue
+    for name in arguments:  # before any value: a misspelt name often leaves a wrong value elsewhere
+        if name not in known and not others:
             label = getattr(target, "__name__", str(target))
             raise UserError(f"{where}.{name}: {label} takes no such setting{hint(name, known)}")
-        wanted = known[name].annotation
-        if not fits(value, wanted):
-            raise UserError(f"{where}.{name}={value!r}: must be {describe(wanted)}")
+    for name, value in arguments.items():
+        if name in known and not fits(value, known[name].annotation):
+            raise UserError(f"{where}.{name}={value!r}: must be {describe(known[name].annotation)}")
     if partial or not target.__module__.startswith("posefilter."):  # others' parents may be given what the child works out
         return
     for name, parameter in known.items():
