@@ -24,7 +24,7 @@ from posefilter.run.results import record, show, write_json
 from posefilter.run.train import build_data, quiet, score
 from posefilter.types import ObjectModel
 
-_OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
+OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
 _SAME_OBJECT = 0.003  # [m] by which the centre and radius of two meshes of one object may differ
 
 
@@ -116,20 +116,22 @@ def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictCo
         o.split("=", 1)[0].lstrip("+~").removeprefix("data.") for o in job.overrides if o.lstrip("+~").startswith("data.")
     }
     chosen = "_target_" in said
+    if own and not chosen and "_target_" not in own:
+        raise UserError("data: exported weights carry no dataset; give data=fat|ycb_video|bop|scenes and data.root=DIR")
     settings = dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
     tree = {**trained, "data": settings, "augment": {}, "seed": trained.get("seed", 0)}
     if chosen and own:
         before = OmegaConf.create(trained).data
-        for key in _OF_THE_CHECKPOINT:
+        for key in OF_THE_CHECKPOINT:
             if key not in typed:
                 settings[key] = name if key == "object" else before.get(key)
         root = OmegaConf.create(tree).data.root
         if root is None:
             raise UserError("data.root: is missing; name the dataset's folder")
-        same = Path(root).resolve() == Path(before.root).resolve()
+        same = "root" in before and Path(root).resolve() == Path(before.root).resolve()
         if not any(key.startswith("split") for key in typed):
             settings["split"] = before.split if same else {"test": 1.0}
-            settings["split_seed"] = before.split_seed
+            settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
         if "limit_test" not in typed:
             settings["limit_test"] = before.limit_test if same else None
         if same and "min_visibility_test" not in typed:

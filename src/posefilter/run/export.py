@@ -7,6 +7,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.models.compact import pack, unpack
+from posefilter.run.evaluate import OF_THE_CHECKPOINT
 from posefilter.run.job import Job
 from posefilter.run.method import method_of, read_checkpoint
 
@@ -42,5 +43,9 @@ def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dic
     model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
     every = max(1, -(-len(model["points"]) // points))
     model["points"] = model["points"][::every].clone()
+    settings = dict(kept["recipe"]["settings"])
+    data = settings.get("data") or {}
+    settings["data"] = {key: data[key] for key in OF_THE_CHECKPOINT if key in data}  # no folders of the trainer's machine
+    kept["recipe"] = {**kept["recipe"], "settings": settings}
     state = pack(weights) if compact else {key: value.clone() for key, value in weights.items()}
     return {**kept, "state_dict": state, "object_model": model}
