@@ -11,6 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
+from posefilter.report.sweeps import number
+
 COLUMNS = {
     "add_auc": ("add", "auc"),
     "add_recall_01d": ("add", "recall_01d"),
@@ -74,7 +76,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     typed = dict.fromkeys(key for pairs in said for key in pairs)
     axes = [key for key in typed if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
     for row, pairs in zip(rows, said, strict=True):
-        row.update({key: _number(pairs.get(key, "")) for key in axes})
+        row.update({key: number(pairs.get(key, "")) for key in axes})
     rows.sort(key=lambda row: [(isinstance(row[key], str), row[key]) for key in axes])
     return rows, axes
 
@@ -107,15 +109,6 @@ def draw(rows: list[Row], axes: list[str]) -> Figure:
                 panel.set_xticks(list(places.values()), [str(value)[:24] for value in values], rotation=45, ha="right")
     panels[0, 0].legend()
     return figure
-
-
-def _number(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 def _cell(value: Any) -> str:
