@@ -6,7 +6,7 @@ import torch
 from posefilter.errors import UserError
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject
-from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides, outline_box, overlap
+from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides, overlap
 
 W = 20
 
@@ -73,10 +73,6 @@ def test_sides_are_zero_for_the_true_box(batch, model, make_trace) -> None:
     wide = f64([[[1.5, 1.5, 6.5, 2.5], [0.0, 0.0, 0.0, 0.0]]]) / W
     want = 4 / W + 1 - 4 * 4 / (8 * 4)
     assert sides(make_trace(state, memory=wide), batch, small).item() == pytest.approx(want)
-
-
-def test_outline_is_cut_at_the_frame(batch, model) -> None:
-    assert outline_box(batch, model)[0].tolist() == [-0.5, -0.5, 16.5, 9.5]  # 10 px about (6.5, 3.5), in 20 x 10
 
 
 def test_overlap_of_disjoint_boxes_is_zero() -> None:

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from posefilter.errors import UserError
+from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose
-from posefilter.metrics.boxes import box_iou, box_of_pose
 from posefilter.metrics.collect import BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.scores import auc, median_mm, recall, summary
 from posefilter.types import ObjectModel

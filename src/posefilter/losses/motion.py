@@ -4,9 +4,8 @@ import torch
 from torch import Tensor
 
 from posefilter.contracts import Label
-from posefilter.geometry.camera import project
+from posefilter.geometry.boxes import box_of_pose
 from posefilter.geometry.lookup import nearest_true, true_pixels, window
-from posefilter.geometry.pose import transform
 from posefilter.types import Batch, ObjectModel, Trace
 
 
@@ -84,7 +83,7 @@ class Sides:
     """How far the box's four sides lie from the particle, told in its memory: L1 plus 1 - IoU, on the object.
 
     The memory's four numbers are the distances to the left, top, right and bottom side, in frame widths (as in FCOS, Tian
-    et al. 2019). The box is the whole object's, hidden parts too, as far as it lies in the frame.
+    et al. 2019). The box is the one that `iou` is measured against: the whole object's, hidden parts too, within the frame.
     """
 
     def __init__(self, label: Label) -> None:
@@ -92,7 +91,9 @@ class Sides:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        box = (outline_box(batch, model) / batch.rgb.shape[-1])[:, None]
+        height, width = batch.rgb.shape[-2:]
+        whole = box_of_pose(batch.camera_from_object, model.hull, batch.intrinsics, height, width)
+        box = (whole / width)[:, None]
         on = self.label(trace, batch, model) > 0
         total = batch.rgb.new_zeros(len(batch.rgb))
         for cloud, reading, inside in zip(trace.clouds, trace.readings, on, strict=True):
@@ -102,14 +103,6 @@ class Sides:
             lost = (guess - true).abs().sum(-1) + 1 - overlap(guess, true)
             total = total + (lost * inside).sum(1) / inside.sum(1).clamp_min(1)
         return total / len(trace.readings)
-
-
-def outline_box(batch: Batch, model: ObjectModel) -> Tensor:
-    """Return the box of the object's outline at the true pose, cut at the frame.  -> (B, 4) [px]."""
-    height, width = batch.rgb.shape[-2:]
-    pixels = project(transform(batch.camera_from_object, model.hull.to(batch.rgb)), batch.intrinsics)
-    frame = pixels.new_tensor([width - 0.5, height - 0.5])
-    return torch.cat([pixels.amin(1).clamp_min(-0.5), torch.minimum(pixels.amax(1), frame)], dim=-1)
 
 
 def overlap(a: Tensor, b: Tensor) -> Tensor:

@@ -8,10 +8,10 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
+from posefilter.geometry.boxes import box_iou
 from posefilter.geometry.deviation import thin
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
-from posefilter.metrics.boxes import box_iou
 from posefilter.metrics.errors import NearestPoint, add, add_s
 from posefilter.metrics.scores import summary
 from posefilter.types import Belief, ObjectModel

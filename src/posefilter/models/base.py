@@ -13,10 +13,10 @@ from torch.optim.lr_scheduler import LRScheduler
 from posefilter.contracts import Loss, Space
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
+from posefilter.geometry.boxes import box_of_pose
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.boxes import box_of_pose
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace

@@ -5,7 +5,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from posefilter.metrics.boxes import box_of_pose
+from posefilter.geometry.boxes import box_of_pose
 from posefilter.types import Batch, ObjectModel, Trace
 
 

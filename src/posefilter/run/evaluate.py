@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
-from posefilter.metrics.boxes import box_of_pose
+from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.run.build import instantiate
 from posefilter.run.console import is_bar, progress

@@ -1,4 +1,8 @@
-"""Bounding boxes as (left, top, right, bottom) [px]: the outer edges, so that one pixel is a box of area 1."""
+"""Bounding boxes as (left, top, right, bottom) [px]: the outer edges, so that one pixel is a box of area 1.
+
+An object's box is the whole object's, hidden parts too, as far as it lies in the frame. Metrics and losses share this page,
+so that a box is taught as it is judged.
+"""
 
 import torch
 from torch import Tensor
