@@ -57,13 +57,13 @@ SIGNS = (
     ("Likelihood, AUROC", "", SHARE, 1.0, {"val/signs/auroc": "AUROC"}),
 )
 HEALTH = {  # quantity: title, unit, factor, limits
-    "ess": ("Effective particles, by iteration", "share of all", 1.0, SHARE),
-    "spread_m": ("Spread of the centres, by iteration", "mm", 1000.0, None),
-    "spread_rad": ("Spread of the rotations, by iteration", "degrees", 57.29578, None),
-    "spread_px": ("Spread, by iteration", "px", 1.0, None),
-    "sigma_m": ("Noise level, by iteration", "mm", 1000.0, None),
-    "sigma_px": ("Noise level, by iteration", "px", 1.0, None),
-    "best_log_likelihood": ("Best log-likelihood, by iteration", "nat", 1.0, None),
+    "ess": ("Effective particles", "share of all", 1.0, SHARE),
+    "spread_m": ("Spread of the centres", "mm", 1000.0, None),
+    "spread_rad": ("Spread of the rotations", "degrees", 57.29578, None),
+    "spread_px": ("Spread", "px", 1.0, None),
+    "sigma_m": ("Noise level", "mm", 1000.0, None),
+    "sigma_px": ("Noise level", "px", 1.0, None),
+    "best_log_likelihood": ("Best log-likelihood", "nat", 1.0, None),
 }
 Choice = tuple[str, str, tuple[float, float] | None, float, dict[str, str]]
 
