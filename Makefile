@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format smoke bench board weights clean
+.PHONY: help setup train test check format smoke bench methods board weights clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,6 +36,9 @@ smoke: $(STAMP) ## run every method the whole way at toy size
 
 bench: $(STAMP) ## measure: does training wait for the loader?
 	$(PY) bench/loader.py
+
+methods: $(STAMP) ## run (or go on with) every run behind docs/methods.md, and write its tables
+	$(PY) bench/methods.py $(ARGS)
 
 board: $(STAMP) ## show every run in TensorBoard
 	$(VENV)/bin/tensorboard --logdir outputs

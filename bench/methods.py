@@ -1,0 +1,103 @@
+"""Run every run behind docs/methods.md, the most telling first, and bring its tables up to date after each line of the plan.
+
+    python bench/methods.py [--only NAME ...] [--list] [--root outputs/methods] [PATTERN=VALUE ...]
+
+Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines, and is printed as it could
+be typed. Started again, it goes on: train.py skips the jobs that are done and resumes the one that was cut short. What is
+typed beyond the options, such as threads=1, is handed to every command.
+"""
+
+import argparse
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+HOME = Path(__file__).parents[1]
+FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
+WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
+
+
+class Line(NamedTuple):
+    """A sweep: the table (and folder) that it belongs to, its words, and the run whose checkpoint it evaluates, if any."""
+
+    table: str
+    words: str
+    of: str | None = None
+    into: str = ""  # a folder of its own below the table's
+
+
+def plan() -> list[Line]:
+    """Return all lines, in order of what they tell."""
+    memorise = f"{FOUR} experiment=memorise"
+    lines = [
+        Line("memorise", f"{memorise} variant=working seed=0"),
+        Line("memorise", f"{memorise} variant=paper seed=0"),
+        Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
+    ]
+    lines += [ablation("particles", "50,100,1000", model) for model in (*DETECTORS, *WITH_POSE)]
+    lines += [ablation("steps", "10,30,100", model) for model in (*DETECTORS, *WITH_POSE)]
+    lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
+    lines += [Line("held_out", f"{FOUR} seed=0")]
+    lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
+    lines += [
+        Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
+        Line("held_out", f"{FOUR} seed=1,2"),
+        Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
+        Line("paper_longer", f"{memorise} variant=paper trainer.max_steps=2000 trainer.val_check_interval=500 seed=0"),
+    ]
+    return lines
+
+
+def ablation(setting: str, values: str, model: str) -> Line:
+    """Return a sweep at test time over a setting of the filter, on the working variant's first run."""
+    run = f"memorise/experiment=memorise,model={model},seed=0,variant=working"
+    table = {"particles": "particles", "steps": "iterations"}[setting]
+    return Line(table, f"filter.{setting}={values}", run, model)
+
+
+def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
+    """Return what to run, from the project's folder."""
+    out = root / line.table / line.into
+    if line.of is None:
+        return ["train.py", "-m", *line.words.split(), f"out={out}", "console=plain", *more]
+    checkpoint = root / line.of / "checkpoints" / "best.ckpt"
+    quoted = str(checkpoint).replace("=", r"\=").replace(",", r"\,")  # Hydra's grammar
+    return ["evaluate.py", "-m", f"checkpoint={quoted}", *line.words.split(), f"out={out}", "console=plain", *more]
+
+
+def waits(line: Line, root: Path) -> bool:
+    """Tell whether an evaluation has no checkpoint yet, or was done after that was made."""
+    if line.of is None:
+        return False
+    checkpoint, summary = root / line.of / "checkpoints" / "best.ckpt", root / line.table / line.into / "summary.csv"
+    if not (root / line.of / "metrics.json").is_file():
+        return True
+    return summary.is_file() and summary.stat().st_mtime > checkpoint.stat().st_mtime
+
+
+def main() -> int:
+    """Run the plan; the status is that of the worst line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("more", nargs="*")
+    parser.add_argument("--only", nargs="+", choices=sorted({line.table for line in plan()}), default=None)
+    parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
+    parser.add_argument("--root", type=Path, default=Path("outputs/methods"))
+    options = parser.parse_args()
+    worst = 0
+    for line in plan():
+        if options.only and line.table not in options.only:
+            continue
+        words = command(line, options.root, options.more)
+        print(f"$ python {shlex.join(words)}", flush=True)
+        if options.list or waits(line, options.root):
+            continue
+        worst = max(worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode)
+        subprocess.run([sys.executable, "bench/methods_table.py", str(options.root)], cwd=HOME, check=False)
+    return worst
+
+
+if __name__ == "__main__":
+    sys.exit(main())
