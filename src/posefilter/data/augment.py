@@ -121,24 +121,25 @@ class PasteOccluder:
         at = rng.integers(len(rows))
         half_w, half_h = rng.uniform(*self.size, 2) * width
         angle = rng.uniform(0, np.pi)
-        down, right = np.mgrid[:height, :width].astype(np.float32)
+        reach = int(np.hypot(half_w, half_h)) + 1  # only so much of the image can change
+        top, left = max(rows[at] - reach, 0), max(cols[at] - reach, 0)
+        cut = np.s_[top : min(rows[at] + reach + 1, height), left : min(cols[at] + reach + 1, width)]
+        down, right = np.mgrid[cut].astype(np.float32)
         right, down = right - cols[at], down - rows[at]
         a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
         b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
-        mask = sample.mask & ~patch
+        mask = sample.mask.copy()
+        mask[cut] &= ~patch
         if mask.sum() < self.keep * sample.mask.sum():
             return sample
         distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
         surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
-        other = jitter_color(draw(rng).rgb, rng, 1.0)  # drawn samples have the size of whole images, as this one
-        return dataclasses.replace(
-            sample,
-            rgb=np.where(patch[..., None], other, sample.rgb),
-            depth=np.where(patch, surface, sample.depth).astype(np.float32),
-            mask=mask,
-            visibility=float(sample.visibility * mask.sum() / sample.mask.sum()),
-        )
+        other = jitter_color(draw(rng).rgb[cut], rng, 1.0)  # drawn samples have the size of whole images, as this one
+        rgb, depth = sample.rgb.copy(), sample.depth.copy()
+        rgb[cut][patch], depth[cut][patch] = other[patch], surface[patch]
+        visibility = float(sample.visibility * mask.sum() / sample.mask.sum())
+        return dataclasses.replace(sample, rgb=rgb, depth=depth, mask=mask, visibility=visibility)
 
 
 @dataclasses.dataclass(frozen=True)
