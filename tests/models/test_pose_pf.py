@@ -33,15 +33,16 @@ def working(initialise: object = None, refine: object = None) -> PosePF:
     torch.manual_seed(0)
     start = initialise or FromProposals()
     pieces = (start, Geometric(0.05, SIGMA[0]), Annealed(), Systematic(), Gaussian(0.4), Best(), refine or NoRefine())
-    return PosePF(
-        PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA),
+    method = PosePF(
+        PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
         CandidatePoses(each=6, proposed=4, particles=6, sigma=SIGMA),
-        ObjectCoordinateNet((16, 24, 32, 32)),
+        ObjectCoordinateNet((16, 24, 32, 32), fragments=16, features=4),
         filter=ParticleFilter(100, 6, *pieces, first_particles=200),
         loss=Contrast(),
         optimizer=partial(torch.optim.AdamW, lr=3e-3),
-        object_model=square(),
     )
+    method.adopt(square())
+    return method
 
 
 def error(method: PosePF, count: int = 16) -> torch.Tensor:
@@ -117,8 +118,8 @@ def test_the_papers_samples_lie_where_they_are_said_to() -> None:
         filter=working().filter,
         loss=Regression(PaperPoints()),
         optimizer=torch.optim.Adam,
-        object_model=square(),
     )
+    method.adopt(square())
     batch = scenes(2)
     trace = method.lesson(method, method.observe(batch), batch, torch.Generator().manual_seed(0))
     state, weight = trace.clouds[0].state, trace.clouds[0].log_weights.exp()

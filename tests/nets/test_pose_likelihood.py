@@ -3,9 +3,11 @@
 import pytest
 import torch
 
+from posefilter.errors import UserError
 from posefilter.geometry.camera import intrinsics, project, rays
 from posefilter.geometry.pose import invert, make_pose, origin_of, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.likelihood import PoseLikelihood, lay_out, look
 from posefilter.nets.paper_likelihood import PaperLikelihood
 
@@ -88,6 +90,67 @@ def test_gradients_reach_the_pose() -> None:
     net(scene, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)).sum().backward()
     assert shift.grad is not None
     assert shift.grad.abs().max() > 0
+
+
+def said(features: int = 2, wrong: float = 0.0) -> Coordinates:
+    """Return what a network might say of a wall at 0.8 m: coordinates true at the pose above but for a shift, in radii.
+
+    Two fragments, of equal share; the second's place is nonsense.
+    """
+    g = torch.Generator().manual_seed(2)
+    h, w = H // 8, W // 8
+    pixel = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1) * 8.0 + 3.5
+    ray = rays(pixel.reshape(1, -1, 2), K)
+    there = (transform(invert(pose()[0, 0]), (ray * 0.8)[0]) - CENTER).reshape(1, h, w, 1, 3)
+    place = torch.cat([there / RADIUS + wrong, torch.full((1, h, w, 1, 3), 99.0)], dim=3)
+    centers = torch.tensor([[[0.0, 0.0, 0.0], [50.0, 50.0, 50.0]]])
+    chatter = torch.randn(1, h, w, features, generator=g)
+    return Coordinates(torch.zeros(1, h, w), torch.full((1, h, w, 2), 0.5).log(), place, centers, chatter)
+
+
+def test_context_is_read_where_the_point_is() -> None:
+    rgb, _ = image()
+    flat = torch.full((1, 1, H, W), 0.8)
+    noise = 0.3 * torch.randn(1, 1, 40, 2, generator=torch.Generator().manual_seed(1))
+    points = look(lay_out(rgb, flat, K, said()), pose(), CENTER, RADIUS, noise)
+    assert points.context is not None
+    assert points.context.shape == (1, 1, 40, 5 + 2)
+    torch.testing.assert_close(points.context[..., 0].exp(), torch.full((1, 1, 40), 0.5))
+    middle = (points.position / RADIUS).norm(dim=-1) < 1.2  # away from the border, where interpolation has to hold
+    assert middle.sum() > 10
+    off = (points.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle]
+    assert off.max() < 1e-3  # on a wall the true coordinates are linear in the pixel
+    moved = look(lay_out(rgb, flat, K, said(wrong=0.5)), pose(), CENTER, RADIUS, noise)
+    assert moved.context is not None
+    assert (moved.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle].min() > 0.7
+
+
+def test_gradients_reach_the_features_but_not_what_is_said_of_the_object() -> None:
+    told = Coordinates(*(x.requires_grad_() for x in said()))
+    net = PoseLikelihood(width=32, blocks=1, context=2)
+    scene = lay_out(*image(), K, told)
+    net(scene, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)).sum().backward()
+    assert told.features.grad is not None
+    assert told.features.grad.abs().max() > 0
+    assert told.place.grad is None
+    assert told.log_share.grad is None
+    assert told.logit.grad is None
+
+
+def test_what_the_context_says_changes_the_score() -> None:
+    net = PoseLikelihood(width=32, blocks=1, context=2)
+    g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
+    right, wrong = (
+        net(lay_out(*image(), K, told), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, g())
+        for told in (said(), said(wrong=1.0))
+    )
+    assert (right - wrong).abs().item() > 1e-4
+
+
+def test_context_without_a_proposal_network_is_refused() -> None:
+    net = PoseLikelihood(width=32, blocks=1, context=2)
+    with pytest.raises(UserError, match="proposals=dense"):
+        net(lay_out(*image(), K), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator())
 
 
 def test_the_papers_likelihood_is_a_sum_over_points() -> None:

@@ -63,31 +63,26 @@ def around_truth(
 
 
 class PersistentParticles(nn.Module):
-    """A few particles a training frame, kept between visits; a frame's noise level falls with each of them.
+    """A few particles a training frame, kept between visits; a frame's noise level falls to `sharpest` with each of them.
 
     They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera was rolled or zoomed by
     augmentation finds them where they were. Kept out of checkpoints' state dict: a resumed run starts them anew.
     """
 
-    def __init__(
-        self, particles: int = 16, levels: int = 12, sigma: tuple[float, float] = (0.004, 0.25), step: float = 0.4
-    ) -> None:
+    def __init__(self, particles: int = 16, levels: int = 12, sharpest: float = 0.004, step: float = 0.4) -> None:
         super().__init__()
-        self.particles, self.levels, self.step = particles, levels, step
-        self.low, self.high = math.log(sigma[0]), math.log(sigma[1])
+        self.particles, self.levels, self.sharpest, self.step = particles, levels, sharpest, step
         self._poses: dict[int, Tensor] = {}
         self._level: dict[int, int] = {}
 
-    def recall(self, batch: Batch, space: PoseSpace, generator: Generator) -> tuple[Tensor, Tensor]:
-        """Return each frame's particles (B, M, 4, 4) and its noise level (B,) [m]; new frames start from depth, broad."""
-        fresh = from_depth(batch, space, self.particles, generator)
+    def recall(self, batch: Batch, fresh: Tensor, start: float) -> tuple[Tensor, Tensor]:
+        """Return each frame's particles (B, M, 4, 4) and noise level (B,) [m]; new frames take the fresh ones, at start."""
         rows = []
         for row, frame in enumerate(batch.frame_id.tolist()):
             kept = self._poses.get(frame)
             rows.append(fresh[row] if kept is None else batch.camera_from_object[row] @ kept.to(fresh.device))
         level = torch.tensor([self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device)
-        share = level / (self.levels - 1)
-        return torch.stack(rows), torch.exp(self.high + (self.low - self.high) * share)
+        return torch.stack(rows), start * (self.sharpest / start) ** (level / (self.levels - 1))
 
     @torch.no_grad()
     def advance(

@@ -28,9 +28,9 @@ class PoseEstimator(LightningModule):
     """A method, the filter that runs it, and the loss it learns from.
 
     filter: run at validation and test; train_filter: rolled out in training where that differs; loss: judges a training
-    trace, one value an image; optimizer: given parameters; scheduler: given the optimizer and the number of steps, advanced
-    each step; seed: with the epoch and the batch's number it decides every random draw; object_model: set by `adopt` or read
-    from a checkpoint.
+    trace, one value an image; optimizer: given (name, parameter) pairs; scheduler: given the optimizer and the number of
+    steps, advanced each step; seed: with the epoch and the batch's number it decides every random draw. Which object it is
+    about, `adopt` tells.
     """
 
     legal_losses: ClassVar[tuple[str, ...]] = ()
@@ -40,11 +40,10 @@ class PoseEstimator(LightningModule):
         self,
         filter: ParticleFilter,
         loss: Loss,
-        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer],
+        optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
         scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
         train_filter: ParticleFilter | None = None,
         seed: int = 0,
-        object_model: ObjectModel | None = None,
     ) -> None:
         super().__init__()
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
@@ -53,8 +52,6 @@ class PoseEstimator(LightningModule):
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
-        if object_model is not None:
-            self.adopt(object_model)
 
     @property
     def space(self) -> Space:
@@ -127,7 +124,7 @@ class PoseEstimator(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Build the optimizer and its schedule over the run's steps."""
-        optimizer = self.make_optimizer(p for p in self.parameters() if p.requires_grad)
+        optimizer = self.make_optimizer((name, p) for name, p in self.named_parameters() if p.requires_grad)
         if self.make_scheduler is None:
             return optimizer
         scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))

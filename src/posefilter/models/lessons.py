@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from posefilter.contracts import Scene
 from posefilter.errors import UserError
-from posefilter.filters.candidates import PersistentParticles, around_truth
+from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.nets.paper_likelihood import PaperLikelihood
@@ -47,20 +47,23 @@ class CandidatePoses:
 
     each: candidates of each kind around the truth; proposed: poses from the proposal network, where there is one; particles:
     the filter's own persistent particles (0 puts self-generated negatives back to none); sigma: range of noise levels [m];
-    levels: filter steps from the broadest to the sharpest; own_level: share of images read at their particles' level.
+    start: level at which those particles leave proposals, as they do at test time [m] (without proposals they leave from
+    depth, at the broadest); levels: their steps from there to the sharpest; own_level: share of images read at their level.
     """
 
     def __init__(
         self,
         each: int = 8,
-        proposed: int = 8,
+        proposed: int = 16,
         particles: int = 16,
         sigma: tuple[float, float] = (0.004, 0.25),
+        start: float = 0.05,
         levels: int = 12,
         own_level: float = 0.5,
     ) -> None:
         self.each, self.proposed, self.sigma, self.own_level = each, proposed, (float(sigma[0]), float(sigma[1])), own_level
-        self.persistent = PersistentParticles(particles, levels, self.sigma) if particles else None
+        self.start = float(start)
+        self.persistent = PersistentParticles(particles, levels, self.sigma[0]) if particles else None
 
     def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
         """Draw candidates, read them, and let the persistent particles take a step."""
@@ -69,11 +72,14 @@ class CandidatePoses:
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
         groups = [around_truth(batch, model, method.space, self.each, self.sigma, generator)]
-        if self.proposed and scene.said is not None:
+        proposals = scene.said is not None
+        if self.proposed and proposals:
             groups.append(method.propose(scene, self.proposed, generator))
         own = torch.zeros(B, dtype=torch.bool, device=device)
         if self.persistent is not None:
-            particles, level = self.persistent.recall(batch, method.space, generator)
+            count, space = self.persistent.particles, method.space
+            fresh = method.propose(scene, count, generator) if proposals else from_depth(batch, space, count, generator)
+            particles, level = self.persistent.recall(batch, fresh, self.start if proposals else self.sigma[1])
             own = torch.rand(B, device=device, generator=generator) < self.own_level
             sigma = torch.where(own, level, sigma)
             groups.append(particles)

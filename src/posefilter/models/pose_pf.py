@@ -11,9 +11,11 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.models.lessons import Lesson
+from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, lay_out
-from posefilter.nets.proposals import Cells, Coordinates, ObjectCoordinateNet, coordinate_loss, draw_poses, measure_cells
+from posefilter.nets.proposals import ObjectCoordinateNet
+from posefilter.nets.votes import draw_poses, measure_cells
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 
@@ -31,13 +33,18 @@ class PoseScene(NamedTuple):
             raise UserError("initialise=from_relevance needs the proposal network; choose proposals=dense")
         return torch.sigmoid(self.said.logit)[:, None]
 
+    def first(self, count: int) -> "PoseScene":
+        """Return the first so many images."""
+        return PoseScene(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
+
 
 class PosePF(PoseEstimator):
     """A particle filter over SE(3) with a learned likelihood.
 
     likelihood: scores poses (nets/likelihood.py, or the paper's); proposals: the dense network that the filter starts from,
     or None; lesson: what the likelihood is trained on; pixels: image points a pose reads at each filter step; lesson_pixels:
-    the same in training; proposal_weight: of the proposal network's loss.
+    the same in training; lesson_images: of a batch that the likelihood learns from (the proposal network, which needs more
+    of them, learns from all; None: all); proposal_weight: of the proposal network's loss.
     """
 
     legal_losses = ("contrast", "regression")
@@ -50,12 +57,14 @@ class PosePF(PoseEstimator):
         proposals: ObjectCoordinateNet | None = None,
         pixels: int = 64,
         lesson_pixels: int = 48,
+        lesson_images: int | None = None,
         proposal_weight: float = 1.0,
         **base: Any,
     ) -> None:
         super().__init__(**base)
         self.likelihood, self.proposals, self.lesson = likelihood, proposals, lesson
-        self.pixels, self.lesson_pixels, self.proposal_weight = pixels, lesson_pixels, proposal_weight
+        self.pixels, self.lesson_pixels, self.lesson_images = pixels, lesson_pixels, lesson_images
+        self.proposal_weight = proposal_weight
 
     @property
     def space(self) -> PoseSpace:
@@ -70,10 +79,11 @@ class PosePF(PoseEstimator):
 
     def observe(self, batch: Batch) -> PoseScene:
         """Lay the image out, and run the proposal network once."""
-        image = lay_out(batch.rgb, batch.depth, batch.intrinsics)
         if self.proposals is None:
-            return PoseScene(image, None, None)
+            return PoseScene(lay_out(batch.rgb, batch.depth, batch.intrinsics), None, None)
         said = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
+        context = said if said.features.shape[-1] else None
+        image = lay_out(batch.rgb, batch.depth, batch.intrinsics, context)
         return PoseScene(image, said, measure_cells(batch.depth, batch.intrinsics))
 
     def read(self, scene: PoseScene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
@@ -95,18 +105,18 @@ class PosePF(PoseEstimator):
             raise UserError("initialise=from_proposals needs the proposal network; choose proposals=dense")
         if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
             raise UserError("depth: not one pixel of an image has a known depth, so no pose can be proposed")
-        said = Coordinates(*(x.detach() for x in scene.said))
-        return draw_poses(said, scene.cells, self._center(), self.model.radius, particles, generator)
+        return draw_poses(scene.said.detach(), scene.cells, self._center(), self.model.radius, particles, generator)
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the likelihood's loss and the proposal network's, one value an image each, from one look at the images."""
         scene = self.observe(batch)
-        trace = self.lesson(self, scene, batch, generator)
-        losses = {"likelihood": self.loss(trace, batch, self.model)}
+        count = self.lesson_images or len(batch.rgb)
+        part, seen = Batch(*(x[:count] for x in batch)), scene.first(count)
+        losses = {"likelihood": self.loss(self.lesson(self, seen, part, generator), part, self.model)}
         if scene.said is not None and scene.cells is not None:
-            fit, error = coordinate_loss(
-                scene.said, scene.cells, batch.mask, batch.camera_from_object, self._center(), self.model.radius
-            )
+            assert self.proposals is not None
+            size = (self._center(), self.model.radius, float(self.proposals.reach))
+            fit, error = coordinate_loss(scene.said, scene.cells, batch.mask, batch.camera_from_object, *size)
             losses["proposals"] = self.proposal_weight * fit
             self.watch("coordinate_error_mm", 1000 * error.mean())
         return losses
@@ -114,6 +124,8 @@ class PosePF(PoseEstimator):
     def adopt(self, model: ObjectModel) -> None:
         """Learn which object it is about; count, too, how often the truth is outscored."""
         super().adopt(model)
+        if self.proposals is not None:
+            self.proposals.adopt(model.points, model.center, model.radius)
         self.scores["truth_outscored"] = MeanMetric()
         self.scores["truth_outscored_by_wrong"] = MeanMetric()
 

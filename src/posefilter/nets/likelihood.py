@@ -3,6 +3,10 @@
 Each pose looks at pixels drawn around its projected origin, lifts them by their depth and carries them into its object
 frame. A point is judged by where it lies there, its colour, the viewing ray in that frame (so that a surface seen *through*
 the hypothesis differs from one that hides it) and the noise level: one network holds a family, broad to sharp.
+
+A single pixel says little: red is red on every face. So a point may also be judged by its *context*, what the proposal
+network says there: whether this is the object, how likely the part of it that the hypothesis sees there, where exactly,
+and features of its own choosing that the likelihood's loss shapes.
 """
 
 import math
@@ -12,8 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.geometry.camera import project, rays
 from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.nets.coordinates import Context, Coordinates, ask, lay_out_context
 from posefilter.nets.layers import ResnetFC, fourier
 
 
@@ -23,6 +29,12 @@ class Pixels(NamedTuple):
     values: Tensor  # (B, H * W, 4) red, green, blue in [0, 1], z-depth [m] (0 unknown)
     size: tuple[int, int]  # H, W
     intrinsics: Tensor  # (B, 3, 3) [px]
+    context: Context | None = None  # what the proposal network says
+
+    def first(self, count: int) -> "Pixels":
+        """Return the first so many images."""
+        context = None if self.context is None else self.context.first(count)
+        return Pixels(self.values[:count], self.size, self.intrinsics[:count], context)
 
 
 class Points(NamedTuple):
@@ -33,11 +45,18 @@ class Points(NamedTuple):
     ray: Tensor  # (B, N, P, 3) unit viewing ray
     known: Tensor  # (B, N, P) bool: depth is known
     inside: Tensor  # (B, N, P) bool: the pixel lies in the frame
+    context: Tensor | None = None  # (B, N, P, 5 + C), as `ask` answers
 
 
-def lay_out(rgb: Tensor, depth: Tensor, K: Tensor) -> Pixels:
-    """Lay images out for gathering.  (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) -> Pixels."""
-    return Pixels(torch.cat([rgb, depth], dim=1).flatten(2).transpose(1, 2).contiguous(), rgb.shape[-2:], K)  # type: ignore[arg-type]
+def lay_out(rgb: Tensor, depth: Tensor, K: Tensor, said: Coordinates | None = None) -> Pixels:
+    """Lay images out for gathering.  (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) -> Pixels.
+
+    said: what the proposal network says of them, if it is to be read.
+    """
+    H, W = rgb.shape[-2:]
+    context = None if said is None else lay_out_context(said, H, W)
+    values = torch.cat([rgb, depth], dim=1).flatten(2).transpose(1, 2).contiguous()
+    return Pixels(values, (H, W), K, context)
 
 
 def look(image: Pixels, poses: Tensor, center: Tensor, radius: float, noise: Tensor, spread: float = 0.6) -> Points:
@@ -62,13 +81,21 @@ def look(image: Pixels, poses: Tensor, center: Tensor, radius: float, noise: Ten
     along = (ray * middle[..., None, :]).sum(-1, keepdim=True) / (ray * ray).sum(-1, keepdim=True)
     known = z > 0
     position = (ray * torch.where(known, z, along) + origin) @ R
-    return Points(position, color, F.normalize(ray, dim=-1) @ R, known[..., 0], inside)
+    context = None if image.context is None else ask(image.context, u, v, position / radius)
+    return Points(position, color, F.normalize(ray, dim=-1) @ R, known[..., 0], inside, context)
+
+
+def contract(x: Tensor) -> Tensor:
+    """Contract vectors (*, 3) beyond length 2 into the ball of radius 3, as in mip-NeRF 360 (eq. 10)."""
+    far = x.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+    return x / far * torch.where(far > 2, 3 - 2 / far, far)
 
 
 class PoseLikelihood(nn.Module):
     """log p(image | pose) at a noise level, up to a constant an image: `scale` x the mean judgement of its points.
 
-    width, blocks: of the residual MLP; octaves: of the position's Fourier features; sigma: the range of noise levels [m].
+    width, blocks: of the residual MLP; octaves: of the position's Fourier features; sigma: the range of noise levels [m];
+    context: features of the proposal network that a point is judged by, with what it says there; None: by itself alone.
     """
 
     def __init__(
@@ -78,10 +105,13 @@ class PoseLikelihood(nn.Module):
         octaves: int = 5,
         scale: float = 20.0,
         sigma: tuple[float, float] = (0.003, 0.25),
+        context: int | None = None,
     ) -> None:
         super().__init__()
+        self.context = context
         self.octaves, self.scale, self.sigma = octaves, scale, (float(sigma[0]), float(sigma[1]))
-        self.enter = nn.Linear(3 * (2 * octaves + 1) + 7, width)
+        surroundings = 0 if context is None else 9 + context
+        self.enter = nn.Linear(3 * (2 * octaves + 1) + 7 + surroundings, width)
         self.modulate = nn.Sequential(nn.Linear(9, width), nn.ReLU(), nn.Linear(width, 2 * width))
         self.blocks = nn.ModuleList([ResnetFC(width) for _ in range(blocks)])
         self.leave = nn.Linear(width, 1)
@@ -93,13 +123,25 @@ class PoseLikelihood(nn.Module):
         at = (2 * (sigma.clamp_min(1e-6).log() - low) / (high - low) - 1)[..., None]
         return torch.cat([at, fourier(at / 4, 4)[..., 1:]], dim=-1)
 
+    def surroundings(self, points: Points, radius: float) -> Tensor:
+        """Compare what the hypothesis makes of points with what the proposal network says of them.  -> (B, N, P, 9 + C)."""
+        if points.context is None:
+            raise UserError(
+                "likelihood=contextual reads the proposal network; choose proposals=dense or likelihood=contrastive"
+            )
+        log_share, place, logit, features = points.context.split([1, 3, 1, points.context.shape[-1] - 5], dim=-1)
+        error = place - points.position / radius
+        known = [log_share / 5, torch.sigmoid(logit), logit / 8]
+        return torch.cat([*known, contract(error), torch.asinh(10 * error), features], dim=-1)
+
     def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
         """Judge points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
-        p = points.position / radius
-        far = p.norm(dim=-1, keepdim=True).clamp_min(1e-6)
-        p = p / far * torch.where(far > 2, 3 - 2 / far, far)  # contracted beyond two radii, as in mip-NeRF 360 (eq. 10)
+        p = contract(points.position / radius)
         known = points.known[..., None].to(p.dtype)
-        x = self.enter(torch.cat([fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known], dim=-1))
+        seen = [fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known]
+        if self.context is not None:
+            seen.append(self.surroundings(points, radius))
+        x = self.enter(torch.cat(seen, dim=-1))
         gain, bias = self.modulate(level)[:, None, None].chunk(2, dim=-1)
         x = torch.addcmul(x + bias, x, gain)
         for block in self.blocks:

@@ -1,35 +1,12 @@
-"""Proposals: a dense network tells for each cell of the image whether it shows the object, and which point of it.
-
-Cells with their measured 3-D points then vote for poses: a few cells near each other fix a rigid transform (Kabsch).
-The idea of dense object coordinates: Brachmann et al. 2014; of the fit: Kabsch 1976.
-"""
-
-from typing import NamedTuple
+"""The proposal network: it tells for each cell of the image whether it shows the object, and which point of it."""
 
 import torch
 import torch.nn.functional as F
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 
 from posefilter.geometry.camera import back_project, pixel_grid, rays
-from posefilter.geometry.pose import fit_rigid
+from posefilter.nets.coordinates import Coordinates, spread_points
 from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
-
-STRIDE = 8  # pixels a cell
-
-
-class Coordinates(NamedTuple):
-    """What the network says of each of the h x w cells."""
-
-    logit: Tensor  # (B, h, w) is it the object
-    coordinate: Tensor  # (B, h, w, 3) object point, over the radius, from the object's centre
-    log_scale: Tensor  # (B, h, w) log of the Laplace scale of `coordinate`
-
-
-class Cells(NamedTuple):
-    """The measured side of each cell."""
-
-    point: Tensor  # (B, h, w, 3) camera point [m]
-    valid: Tensor  # (B, h, w) bool: depth is known there
 
 
 def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -63,11 +40,20 @@ def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
 class ObjectCoordinateNet(nn.Module):
     """A U-Net with residual blocks: colour at full resolution, geometry (normals, depth, rays) at half of it.
 
-    widths: channels at strides 4, 8, 16 and 32. Sides must be multiples of 8; other strides are met by interpolation.
+    widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told apart by; features: of
+    each cell, for the likelihood's use. Sides must be multiples of 8; other strides are met by interpolation.
     """
 
-    def __init__(self, widths: tuple[int, int, int, int] = (32, 80, 128, 160)) -> None:
+    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's centre
+    reach: Tensor  # () their mean reach, over the radius
+
+    def __init__(
+        self, widths: tuple[int, int, int, int] = (32, 80, 128, 160), fragments: int = 64, features: int = 0
+    ) -> None:
         super().__init__()
+        self.fragments = fragments
+        self.register_buffer("centers", torch.zeros(fragments, 3))
+        self.register_buffer("reach", torch.ones(()))
         a, b, c, d = widths
         self.colour = conv_norm(3, 24, stride=2)
         self.enter = conv_norm(24 + 7, a, stride=2)
@@ -77,7 +63,9 @@ class ObjectCoordinateNet(nn.Module):
         self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
         self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
         self.to8, self.up8 = nn.Conv2d(c, b, 1), nn.Sequential(ResBlock(b), ResBlock(b))
-        self.out = nn.Conv2d(b, 5, 1)
+        self.parts = [1, fragments, 3 * fragments, features]
+        self.out = nn.Conv2d(b, 1 + 4 * fragments + features, 1)
+        nn.init.normal_(self.out.weight, std=0.01)  # at first, every fragment is as likely, and its middle is the place
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
         """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8."""
@@ -89,7 +77,16 @@ class ObjectCoordinateNet(nn.Module):
             x32 = self.down32(x16)
             y16 = self.up16(x16 + self._grow(self.to16(x32), x16))
             y = self.out(self.up8(x8 + self._grow(self.to8(y16), x8))).float()
-        return Coordinates(y[:, 0], y[:, 1:4].permute(0, 2, 3, 1), y[:, 4].clamp(-5.0, 1.0))
+        logit, share, offset, features = y.permute(0, 2, 3, 1).split(self.parts, dim=-1)
+        place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
+        centers = self.centers.expand(len(y), -1, -1)
+        return Coordinates(logit[..., 0], torch.log_softmax(share, dim=-1), place, centers, features)
+
+    def adopt(self, points: Tensor, center: Tensor, radius: float) -> None:
+        """Cut an object into fragments.  (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m]."""
+        middles, reach = spread_points((points - center) / radius, self.fragments)
+        self.centers.copy_(middles)
+        self.reach.fill_(reach)
 
     @staticmethod
     def _geometry(depth: Tensor, K: Tensor) -> Tensor:
@@ -103,72 +100,3 @@ class ObjectCoordinateNet(nn.Module):
     @staticmethod
     def _grow(x: Tensor, like: Tensor) -> Tensor:
         return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
-
-
-def measure_cells(depth: Tensor, K: Tensor) -> Cells:
-    """Lift each cell's central measured depth to a camera point.  (B, 1, H, W) [m], (B, 3, 3) -> Cells.
-
-    The median of the four central pixels' known depths would mix surfaces at edges; the largest-depth-first pick of one
-    pixel does not, so a cell takes the known central pixel nearest to its centre.
-    """
-    B, _, H, W = depth.shape
-    h, w = H // STRIDE, W // STRIDE
-    blocks = depth[:, 0, : h * STRIDE, : w * STRIDE].unflatten(1, (h, STRIDE)).unflatten(3, (w, STRIDE))
-    center = STRIDE // 2
-    choices = [(center - 1, center - 1), (center, center), (center - 1, center), (center, center - 1)]
-    z = torch.zeros(B, h, w, dtype=depth.dtype, device=depth.device)
-    pixel = pixel_grid(H, W, STRIDE, device=depth.device).expand(B, -1, -1, -1).clone()
-    grid0 = pixel_grid(H, W, STRIDE, device=depth.device) - (STRIDE - 1) / 2
-    for row, col in choices:
-        candidate = blocks[:, :, row, :, col]
-        take = (z == 0) & (candidate > 0)
-        z = torch.where(take, candidate, z)
-        offset = torch.tensor([col, row], dtype=depth.dtype, device=depth.device)
-        pixel = torch.where(take[..., None], grid0 + offset, pixel)
-    point = back_project(pixel.flatten(1, 2), z.flatten(1), K).unflatten(1, (h, w))
-    return Cells(point, z > 0)
-
-
-def coordinate_loss(
-    said: Coordinates, cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float
-) -> tuple[Tensor, Tensor]:
-    """Return the loss an image (B,) and the mean coordinate error on the object (B,) [m].
-
-    Binary cross-entropy for `is it the object`, and the Laplace negative log-likelihood of the coordinates where it is and
-    depth is known: |e|_1 / s + 3 log s. mask: (B, 1, H, W) bool.
-    """
-    on = mask[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:, : said.logit.shape[1], : said.logit.shape[2]]
-    R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
-    truth = ((cells.point - t) @ R - center) / radius
-    inside = (on & cells.valid & (truth.norm(dim=-1) < 1.2)).float()
-    bce = F.binary_cross_entropy_with_logits(said.logit, on.float(), reduction="none").mean((1, 2))
-    error = (said.coordinate - truth).abs().sum(-1)
-    laplace = error * torch.exp(-said.log_scale) + 3 * said.log_scale
-    count = inside.sum((1, 2)).clamp_min(1.0)
-    fit = (laplace * inside).sum((1, 2)) / count
-    distance = ((said.coordinate - truth).norm(dim=-1) * inside).sum((1, 2)) / count * radius
-    return 5 * bce + fit * (inside.sum((1, 2)) > 0), distance
-
-
-def draw_poses(
-    said: Coordinates, cells: Cells, center: Tensor, radius: float, count: int, generator: Generator, votes: int = 3
-) -> Tensor:
-    """Draw poses from the cells' votes.  -> (B, count, 4, 4) camera_from_object [m].
-
-    A seed cell is drawn by p(object) / scale, `votes` more by the same weight within 2 radii of it; their weighted Kabsch
-    fit is one pose. Where no cell of an image has a known depth the poses mean nothing.
-    """
-    B = len(said.logit)
-    weight = (torch.sigmoid(said.logit) + 1e-4) / (said.log_scale.exp() + 0.05) * cells.valid
-    weight = weight.flatten(1)
-    weight = torch.where((weight > 0).any(1, keepdim=True), weight, torch.ones_like(weight))
-    point, thing = cells.point.flatten(1, 2), said.coordinate.flatten(1, 2) * radius + center
-    seed = torch.multinomial(weight, count, replacement=True, generator=generator)
-    pick = lambda x, index: x.gather(1, index.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, index.shape[1:])  # noqa: E731
-    at = pick(point, seed)
-    near = torch.cdist(at, point) < 2 * radius
-    local = weight[:, None] * near + 1e-12 * (weight[:, None] > 0)
-    rest = torch.multinomial(local.flatten(0, 1), votes, replacement=True, generator=generator).unflatten(0, (B, count))
-    index = torch.cat([seed[..., None], rest], dim=-1)
-    chosen = weight.gather(1, index.flatten(1)).unflatten(1, index.shape[1:])
-    return fit_rigid(pick(thing, index), pick(point, index), chosen)

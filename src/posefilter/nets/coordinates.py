@@ -1,0 +1,151 @@
+"""Dense object coordinates: for each cell of an image, is it the object, and which point of the object?
+
+Which point is answered in two parts, a fragment of the surface (a classification) and the place within it (a regression),
+after EPOS (Hodan et al. 2020). Regression alone answers doubt by the mean of what is possible, which lies inside the
+object and is nobody's point; shares of fragments can hold several possibilities, so that votes drawn from them do too.
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+STRIDE = 8  # pixels a cell
+
+
+class Coordinates(NamedTuple):
+    """What a network says of each of the h x w cells, K fragments each."""
+
+    logit: Tensor  # (B, h, w) is it the object
+    log_share: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
+    place: Tensor  # (B, h, w, K, 3) the object's point if it is that fragment, over the radius, from the object's centre
+    centers: Tensor  # (B, K, 3) the fragments' middles, over the radius, from the object's centre
+    features: Tensor  # (B, h, w, C) told to a likelihood that reads context; C = 0 where none does
+
+    @property
+    def coordinate(self) -> Tensor:
+        """Return the likeliest object point of each cell, over the radius, from the object's centre, (B, h, w, 3)."""
+        return pick_fragment(self.place, self.log_share.argmax(-1))
+
+    def first(self, count: int) -> "Coordinates":
+        """Return the first so many images."""
+        return Coordinates(*(x[:count] for x in self))
+
+    def detach(self) -> "Coordinates":
+        """Return the same without gradient."""
+        return Coordinates(*(x.detach() for x in self))
+
+
+class Cells(NamedTuple):
+    """The measured side of each cell."""
+
+    point: Tensor  # (B, h, w, 3) camera point [m]
+    valid: Tensor  # (B, h, w) bool: depth is known there
+
+    def first(self, count: int) -> "Cells":
+        """Return the first so many images."""
+        return Cells(*(x[:count] for x in self))
+
+
+def pick_fragment(place: Tensor, fragment: Tensor) -> Tensor:
+    """Return the places of chosen fragments.  (*, K, 3), (*) int64 -> (*, 3)."""
+    return place.gather(-2, fragment[..., None, None].expand(*fragment.shape, 1, 3))[..., 0, :]
+
+
+def nearest_fragment(points: Tensor, centers: Tensor) -> Tensor:
+    """Return which fragment points belong to.  (B, *, 3), (B, K, 3) -> (B, *) int64."""
+    flat = points.flatten(1, -2)
+    nearness = 2 * flat @ centers.transpose(1, 2) - centers.square().sum(-1)[:, None]
+    return nearness.argmax(-1).unflatten(1, points.shape[1:-1])
+
+
+def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
+    """Choose `count` points far from each other (farthest point sampling).  (P, 3) -> (count, 3), their mean reach.
+
+    The reach is the mean distance of all points to the nearest chosen one, in the points' unit. A set with fewer points
+    gives some of them more than once.
+    """
+    distance = (points - points.mean(0)).norm(dim=-1)
+    chosen, nearest = [], torch.full_like(distance, torch.inf)
+    for _ in range(count):
+        index = int(distance.argmax())
+        chosen.append(index)
+        nearest = torch.minimum(nearest, (points - points[index]).norm(dim=-1))
+        distance = nearest
+    return points[chosen], float(nearest.mean())
+
+
+def coordinate_loss(
+    said: Coordinates, cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float, reach: float
+) -> tuple[Tensor, Tensor]:
+    """Return the loss an image (B,) and the mean error of the likeliest coordinates on the object (B,) [m].
+
+    5 x binary cross-entropy for `is it the object`, and where it is and depth is known, cross-entropy of the fragments and
+    0.3 x the true one's L1 error in units of their reach [radii]. mask: (B, 1, H, W) bool.
+    """
+    on = mask[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:, : said.logit.shape[1], : said.logit.shape[2]]
+    R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
+    truth = ((cells.point - t) @ R - center) / radius
+    inside = (on & cells.valid & (truth.norm(dim=-1) < 1.2)).float()
+    count = inside.sum((1, 2)).clamp_min(1.0)
+    mean = lambda x: (x * inside).sum((1, 2)) / count  # noqa: E731
+    bce = F.binary_cross_entropy_with_logits(said.logit, on.float(), reduction="none").mean((1, 2))
+    fragment = nearest_fragment(truth, said.centers)
+    surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
+    error = (pick_fragment(said.place, fragment) - truth).abs().sum(-1) / reach
+    distance = (said.coordinate - truth).norm(dim=-1).detach() * radius
+    return 5 * bce + mean(surprise + 0.3 * error), mean(distance)
+
+
+class Context(NamedTuple):
+    """What a network says of images, laid out for gathering."""
+
+    smooth: Tensor  # (B, H / 2 * W / 2, 1 + C) logit and features, interpolated
+    share: Tensor  # (B, h * w * K)
+    place: Tensor  # (B, h * w * K, 3)
+    centers: Tensor  # (B, K, 3)
+    grid: tuple[int, int]  # h, w
+    columns: int  # W / 2
+
+    def first(self, count: int) -> "Context":
+        """Return the first so many images."""
+        smooth, share, place, centers = (x[:count] for x in self[:4])
+        return Context(smooth, share, place, centers, self.grid, self.columns)
+
+
+def lay_out_context(said: Coordinates, height: int, width: int) -> Context:
+    """Lay out what is said of H x W images. Gradients reach the features alone: the rest has a lesson of its own."""
+    rows, columns = -(-height // 2), -(-width // 2)
+    grid = torch.cat([said.logit.detach()[..., None], said.features], dim=-1).permute(0, 3, 1, 2)
+    grid = F.interpolate(grid, size=(rows, columns), mode="bilinear", align_corners=False)
+    share, place = said.log_share.detach().exp().flatten(1), said.place.detach().flatten(1, 3)
+    return Context(grid.flatten(2).transpose(1, 2), share, place, said.centers, said.logit.shape[1:], columns)  # type: ignore[arg-type]
+
+
+def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
+    """Ask what is said at pixels of the object's points that a hypothesis sees there.
+
+    u, v: (B, *) [px]; position: (B, *, 3) over the radius, from the object's centre. -> (B, *, 5 + C): log of the share of
+    the fragment that the point lies in, where in it the network sees the point, logit, features. Between cells the shares
+    are interpolated, and places by their shares.
+    """
+    h, w = context.grid
+    K = context.centers.shape[1]
+    with torch.no_grad():
+        fragment = nearest_fragment(position, context.centers).flatten(1)
+    x = ((u.flatten(1) + 0.5) / STRIDE - 0.5).clamp(0, w - 1)
+    y = ((v.flatten(1) + 0.5) / STRIDE - 0.5).clamp(0, h - 1)
+    left, top = x.floor(), y.floor()
+    total, place = torch.zeros_like(x), torch.zeros(*x.shape, 3, dtype=x.dtype, device=x.device)
+    for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        near = (1 - (x - left - right).abs()) * (1 - (y - top - down).abs())
+        column, row = (left + right).clamp_max(w - 1).long(), (top + down).clamp_max(h - 1).long()
+        index = (row * w + column) * K + fragment
+        part = near * context.share.gather(1, index) + 1e-12
+        total = total + part
+        place = place + part[..., None] * context.place.gather(1, index[..., None].expand(-1, -1, 3))
+    at = (v.flatten(1).long() // 2) * context.columns + u.flatten(1).long() // 2
+    smooth = context.smooth.gather(1, at[..., None].expand(-1, -1, context.smooth.shape[-1]))
+    out = torch.cat([total.clamp_min(1e-6).log()[..., None], place / total[..., None], smooth], dim=-1)
+    return out.unflatten(1, u.shape[1:])
