@@ -57,7 +57,8 @@ class Told(PoseEstimator):
     def __init__(self) -> None:
         pieces = (FromProposals(), Geometric(0.03, 0.005), Annealed(), Systematic(), Gaussian(0.4), Mean(), NoRefine())
         loss: Any = None
-        super().__init__(ParticleFilter(100, 4, *pieces), loss, partial(torch.optim.SGD, lr=0.1), object_model=model())
+        super().__init__(ParticleFilter(100, 4, *pieces), loss, partial(torch.optim.SGD, lr=0.1))
+        self.adopt(model())
         self.weight = torch.nn.Parameter(torch.ones(1))
 
     @property
