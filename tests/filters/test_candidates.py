@@ -3,7 +3,8 @@
 import torch
 from tests.models.toy import scenes, square
 
-from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth, half_turns, jiggle
+from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth, jiggle
+from posefilter.filters.propose import half_turns
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
@@ -33,7 +34,7 @@ def test_half_turns_are_half_turns_about_the_centre() -> None:
     batch = scenes(2)
     center = torch.tensor([0.03, 0.01, -0.02])
     poses = batch.camera_from_object[:, None].expand(-1, 6, -1, -1)
-    turned = half_turns(poses, center, generator())
+    turned = half_turns(poses, PoseSpace((0.03, 0.01, -0.02), MODEL.radius), generator())
     torch.testing.assert_close(origin_of(turned, center), origin_of(poses, center))
     assert (angle_between(turned[..., :3, :3], poses[..., :3, :3]) - torch.pi).abs().max() < 2e-3
 

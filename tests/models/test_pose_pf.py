@@ -72,15 +72,15 @@ def trained() -> PosePF:
 
 def test_a_short_training_finds_the_pose(trained: PosePF) -> None:
     after, before = error(trained), error(working())
-    assert after.median() < 0.02
+    assert after.median() < 0.025
     assert before.median() > 0.1
 
 
 def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
-    plain = error(trained).median()
+    plain = error(trained, 48).median()
     refined = working(refine=Chain([Rescore(10, 256, SIGMA[0]), Gradient(20, sigma=SIGMA[0], final_sigma=SIGMA[0])]))
     refined.load_state_dict(trained.state_dict(), strict=True)
-    assert error(refined).median() < plain
+    assert error(refined, 48).median() < 0.9 * plain
 
 
 def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:

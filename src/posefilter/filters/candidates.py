@@ -12,8 +12,9 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.filters.initialise import draw_from_depth
+from posefilter.filters.propose import half_turns
 from posefilter.geometry.pose import invert, origin_of, pose_about, rotation_of
-from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import Batch, ObjectModel
 
@@ -21,13 +22,6 @@ from posefilter.types import Batch, ObjectModel
 def from_depth(batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None) -> Tensor:
     """Draw poses at measured points of a batch; see `draw_from_depth`.  -> (B, count, 4, 4)."""
     return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
-
-
-def half_turns(poses: Tensor, center: Tensor, generator: Generator) -> Tensor:
-    """Turn each pose by pi about a random object axis through its centre.  (B, N, 4, 4) -> (B, N, 4, 4)."""
-    axis = torch.randint(0, 3, poses.shape[:-2], generator=generator, device=poses.device)
-    turn = exp_so3(math.pi * torch.eye(3, device=poses.device)[axis])
-    return pose_about(rotation_of(poses) @ turn, origin_of(poses, center), center)
 
 
 def jiggle(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0) -> Tensor:
@@ -58,7 +52,7 @@ def around_truth(
     few = each // 2
     placed = jiggle(truth.expand(B, few, 4, 4), size[:, :few] * 0.5, space, generator, turn=0.0)
     turned = pose_about(random_rotation(B, few, generator=generator, device=device), origin_of(placed, center), center)
-    flipped = jiggle(half_turns(same, center, generator), size * 0.3, space, generator)
+    flipped = jiggle(half_turns(same, space, generator), size * 0.3, space, generator)
     return torch.cat([truth, near, on, anywhere, turned, flipped], dim=1)
 
 

@@ -49,13 +49,18 @@ class HalfTurns:
 
     def __call__(self, state: Tensor, motion: Tensor, step: Step, space: Space, generator: Generator) -> Tensor:
         """Return the states, some turned."""
-        if space.dimensions != 6:
-            raise UserError("propose: half turns need particles that are poses; leave them out for a method on pixels")
-        B, N = state.shape[:2]
-        axis = torch.randint(3, (B, N), generator=generator, device=state.device)
-        chosen = torch.rand(B, N, generator=generator, device=state.device) < self.share
-        turn = math.pi * torch.eye(3, dtype=state.dtype, device=state.device)[axis] * chosen[..., None]
-        return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
+        return half_turns(state, space, generator, self.share)
+
+
+def half_turns(poses: Tensor, space: Space, generator: Generator, share: float = 1.0) -> Tensor:
+    """Turn a share of poses by pi about a random object axis through its centre.  (B, N, 4, 4) -> (B, N, 4, 4)."""
+    if space.dimensions != 6:
+        raise UserError("propose: half turns need particles that are poses; leave them out for a method on pixels")
+    B, N = poses.shape[:2]
+    axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
+    chosen = torch.rand(B, N, generator=generator, device=poses.device) < share
+    turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * chosen[..., None]
+    return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
 class Chain:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
-from posefilter.geometry.pose import transform
+from posefilter.geometry.deviation import deviation, thin
 from posefilter.types import Batch, ObjectModel, Trace
 
 
@@ -14,13 +14,9 @@ def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int 
     (B, N, 4, 4), (B, 4, 4) -> (B, N) [m]. ADD (Hinterstoisser et al. 2012) on a thinned set of points; for symmetric
     objects MSSD's way of taking the minimum over equivalent truths (Hodan et al. 2020) with ADD's mean.
     """
-    thin = model.points[:: max(1, len(model.points) // points)].to(poses.device)
-    there = transform(poses, thin)
-    best = torch.full(poses.shape[:2], torch.inf, device=poses.device)
-    for symmetry in model.symmetries.to(poses.device):
-        same = transform(truth @ symmetry, thin)[:, None]
-        best = torch.minimum(best, (there - same).norm(dim=-1).mean(-1))
-    return best
+    few = thin(model.points, points).to(poses.device)
+    options = [deviation(poses, truth @ symmetry, few) for symmetry in model.symmetries.to(poses.device)]
+    return torch.stack(options).amin(0)
 
 
 class Contrast:
