@@ -13,7 +13,7 @@ from torch import Generator, Tensor, nn
 
 from posefilter.filters.initialise import draw_from_depth
 from posefilter.filters.propose import half_turns
-from posefilter.geometry.pose import invert, origin_of, pose_about, rotation_of
+from posefilter.geometry.pose import invert, origin_of, pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import Batch, ObjectModel
