@@ -50,7 +50,9 @@ class Page:
 
     def evaluate(self, script: str) -> Any:
         """Return what a script in the page comes to."""
-        return self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)["result"].get("value")
+        return self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)["result"].get(
+            "value"
+        )
 
     def picture(self) -> np.ndarray:
         """Return the whole page as it is shown.  -> (H, W, 3) uint8."""

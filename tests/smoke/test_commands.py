@@ -145,3 +145,15 @@ def test_a_mesh_of_another_kind_is_refused(trained: Path, tmp_path: Path, tiny_s
     typed = [f"checkpoint={tmp_path / 'moved.ckpt'}", "console=plain", "threads=1"]
     with pytest.raises(UserError, match="is not the mesh"):
         evaluate(compose_job("evaluate", HOME / "conf", typed, tmp_path))
+
+
+def test_plain_is_for_machines(tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Every line on stdout is a JSON object, the last one tells where everything is; stderr is silent."""
+    typed = ["debug=smoke", "model=cnn_patch", "console=plain", "threads=1", "trainer.max_steps=4", "logger=none"]
+    assert run_command("train", HOME, [*typed, f"data.root={tiny_scenes}", f"out={tmp_path / 'run'}"]) == 0
+    out, err = capfd.readouterr()
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert [line["event"] for line in lines] == ["validation", "trained"]
+    assert lines[-1]["iou"] == read(tmp_path / "run")["iou"]
+    assert all(Path(path).exists() for path in lines[-1]["files"].values())
+    assert err == ""

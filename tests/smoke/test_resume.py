@@ -7,14 +7,14 @@ import torch
 from lightning import Callback
 
 from posefilter.run import train as training
-from posefilter.run.console import PlainProgress
+from posefilter.run.console import Lines
 
 
 class Killed(BaseException):
     """What a killed process does not survive."""
 
 
-class Killer(PlainProgress):
+class Killer(Lines):
     """Kills the run at a step."""
 
     def __init__(self, step: int) -> None:

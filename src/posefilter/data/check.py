@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
+from posefilter.data.bars import watched
 from posefilter.data.compare import Fit, View, compare, half_pixel, likely_causes
 from posefilter.data.contact_sheet import tile, write_sheet
 from posefilter.data.frames import BadData, NotShown, Reader
@@ -57,7 +57,7 @@ def check_dataset(
 
 def format_report(report: dict[str, Any]) -> str:
     """Return the report as a table, and its problems below."""
-    table = Table("object", "frames", "silhouette IoU", "depth error [mm]", "visible share")
+    table = Table("object", "frames", "silhouette IoU", r"depth error \[mm]", "visible share")
     for row in report["objects"]:
         numbers = (_text(row["silhouette_iou"], 3), _text(row["depth_error_mm"], 1), _text(row["visible_share"], 2))
         table.add_row(row["object"], str(row["frames"]), *numbers)
@@ -82,7 +82,7 @@ def _check_object(
     views: list[View] = []
     fits: list[Fit] = []
     tiles: list[np.ndarray] = []
-    for i in track(chosen, description=name, disable=not progress, transient=True):
+    for i in watched(chosen, name, progress):
         try:
             view = View(reader.read(i), reader.others(i), mesh, native)
         except NotShown:

@@ -41,8 +41,30 @@ def write_sheet(path: Path, tiles: Sequence[np.ndarray], columns: int = 3) -> No
     for row in rows:
         row.extend([np.zeros_like(tiles[0])] * (min(columns, len(tiles)) - len(row)))
     sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows])
+    sheet = np.concatenate([legend(sheet.shape[1]), sheet])
     if not cv2.imwrite(str(path), sheet[..., ::-1]):
         raise OSError(f"{path}: the contact sheet could not be written")
+
+
+def legend(width: int) -> np.ndarray:
+    """Return a line that explains the tiles' colours, narrowest sheet one tile.  -> (h, width, 3) uint8."""
+    entries = (
+        ("left: rendered outline", (60, 255, 60)),
+        ("the dataset's mask", (255, 60, 60)),
+        ("right: measured depth nearer", (90, 120, 255)),
+        ("farther", (255, 90, 90)),
+        (f"full colour at {1000 * _RANGE:.0f} mm", (245, 245, 245)),
+    )
+    lines = [np.zeros((_TEXT, width, 3), np.uint8)]
+    at = 4
+    for text, color in entries:
+        size = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)[0][0]
+        if at + size > width:
+            lines.append(np.zeros((_TEXT, width, 3), np.uint8))
+            at = 4
+        cv2.putText(lines[-1], text, (at, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
+        at += size + 18
+    return np.concatenate(lines)
 
 
 def _square(box: tuple[int, int, int, int], shape: tuple[int, ...]) -> tuple[int, int, int, int]:

@@ -10,6 +10,7 @@ from urllib.parse import urlparse
 
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
+from posefilter.data.bars import bars
 from posefilter.errors import UserError
 
 _BLOCK = 1 << 20
@@ -32,7 +33,7 @@ def fetch(
         raise UserError(f"{url}: only http and https addresses can be fetched")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.part")
-    with Progress(*_COLUMNS, disable=not progress) as bar:
+    with bars(*_COLUMNS, shown=progress) as bar:
         task = bar.add_task(path.name, total=None)
         for attempt in range(retries + 1):
             try:

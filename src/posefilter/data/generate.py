@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import logging
 import multiprocessing
 import os
 import time
@@ -14,15 +15,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from posefilter.data import fat_format as fat
+from posefilter.data.bars import bars
 from posefilter.data.meshes import MeshStore
 from posefilter.data.painter import Job, Painter, make_renderer
 from posefilter.data.scenes import SceneSettings
 from posefilter.data.sensor import sensor_model
 from posefilter.data.settle import load_mujoco
 from posefilter.errors import UserError
+
+log = logging.getLogger(__name__)
 
 GENERATOR = "_generator.json"
 VERSION = 4  # of the scenes that a seed gives: raise it when they change
@@ -92,6 +96,8 @@ def generate(
         store.load(object)  # says what is wrong with the name
     _claim(out, job, frames)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
+    if todo:
+        log.info("rendering %d frames of %s into %s", len(todo), object, out)
     began = time.perf_counter()
     for _ in _run(job, out, todo, workers, progress):
         pass
@@ -172,7 +178,7 @@ def _run(job: Job, out: Path, todo: list[int], workers: int, progress: bool) -> 
         lots.setdefault((i // job.frames_per_scene, i // FRAMES_PER_TASK), []).append(i)
     speed = TextColumn("{task.fields[rate]}")
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), speed)
-    with Progress(*columns, disable=not progress) as bar:
+    with bars(*columns, shown=progress) as bar:
         task = bar.add_task("frames", total=len(todo), rate="")
         began, done = time.perf_counter(), 0
         for count in _results(job, out, list(lots.values()), workers):

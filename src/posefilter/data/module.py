@@ -144,7 +144,7 @@ class PoseDataModule(LightningDataModule):
         for name in _STAGES[stage]:
             if name not in self._datasets:
                 self._datasets[name] = self._prepare(name)
-                log.info("%s: %s", name, self.describe()["splits"][name])
+                log.info("%s", self._told(name))
 
     def object_model(self, object_id: int) -> ObjectModel:
         """Return what methods and metrics know of a class."""
@@ -218,6 +218,12 @@ class PoseDataModule(LightningDataModule):
             "left_out_while_listing": dict(self.reader.skipped),
             "notes": dict(self.reader.notes),
         }
+
+    def _told(self, split: str) -> str:
+        """Return a split in a sentence."""
+        own = self.describe()["splits"][split]
+        left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
+        return f"{split}: {own['frames']} frames of {own['scenes']} scenes" + (f"; left out: {left}" if left else "")
 
     def _dataset(self, split: str) -> FrameDataset:
         if split not in NAMES:

@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from rich.progress import Progress
-
+from posefilter.data.bars import bars
 from posefilter.data.cache import Prepared
 from posefilter.data.frames import BadData, FrameRecord, NotShown
 from posefilter.errors import UserError
@@ -54,8 +53,8 @@ def _decoded(
     records: Sequence[FrameRecord], fetch: Fetch, threads: int, title: str, progress: bool
 ) -> Iterator[tuple[FrameRecord, Prepared | BadData]]:
     """Yield the records in order, each with what is kept of it, or what is wrong with it."""
-    quiet = not progress or len(records) < _CHUNK
-    with ThreadPoolExecutor(threads) as pool, Progress(transient=True, disable=quiet) as bar:
+    shown = progress and len(records) >= _CHUNK
+    with ThreadPoolExecutor(threads) as pool, bars(shown=shown, transient=True) as bar:
         task = bar.add_task(title, total=len(records))
         for at in range(0, len(records), _CHUNK):
             chunk = records[at : at + _CHUNK]

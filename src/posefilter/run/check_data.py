@@ -1,11 +1,17 @@
 """Tell whether a dataset fits its meshes."""
 
+from pathlib import Path
+
+from omegaconf import DictConfig
+
 from posefilter.data.check import check_dataset, format_report
+from posefilter.data.generate import GENERATOR
 from posefilter.data.meshes import MeshStore
 from posefilter.data.readers import open_reader
 from posefilter.errors import UserError
 from posefilter.run.build import instantiate
 from posefilter.run.job import Job
+from posefilter.run.voice import PLAIN, ended, typed
 
 
 def check_data(job: Job) -> None:
@@ -16,6 +22,16 @@ def check_data(job: Job) -> None:
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale)
     options = instantiate(cfg.data.options, "data.options") or {}
     reader = open_reader(cfg.data.source, cfg.data.root, cfg.data.object, store, "skip", **options)
-    report = check_dataset(reader, store, limit=cfg.limit, out=job.folder, progress=cfg.console == "rich")
-    print(format_report(report))
-    print(f"report: {job.folder / 'data_report.json'}")
+    report = check_dataset(reader, store, limit=cfg.limit, out=job.folder, progress=cfg.console != PLAIN)
+    if cfg.console != PLAIN:
+        print(format_report(report))
+    files = {"report": job.folder / "data_report.json", "pictures": job.folder / "contact_sheet.png"}
+    following = [] if report["problems"] else [train_on(cfg, name) for name in reader.objects]
+    ended(cfg.console, "checked", {name: path for name, path in files.items() if path.is_file()}, following, **report)
+
+
+def train_on(cfg: DictConfig, name: str) -> str:
+    """Return the command that trains on an object of the data."""
+    rendered = cfg.data.source == "fat" and (Path(cfg.data.root) / GENERATOR).is_file()  # what train.py takes by default
+    source = {} if rendered else {"data": cfg.data.source}
+    return typed("train", **source, data__root=cfg.data.root, data__object=name, data__meshes=cfg.meshes)

@@ -22,6 +22,7 @@ from posefilter.run.build import hint
 from posefilter.run.job import Job, check_settings, first, plain_name, run_of
 from posefilter.run.pieces import loosen
 from posefilter.run.resume import with_resumed
+from posefilter.run.voice import PLAIN, logging_for, settle_logging
 
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
@@ -43,7 +44,7 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     register_resolvers()
     before = sys.argv
     try:
-        arguments = loosen(with_resumed(bracketed(arguments)), name)
+        arguments = loosen(with_resumed(bracketed(arguments)), name) + logging_for(arguments)
         sys.argv = [sys.argv[0], *arguments]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(_task(name))()
     except KeyboardInterrupt:
@@ -70,6 +71,7 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
 
     def task(cfg: DictConfig) -> Any:
         job = job_of(cfg)
+        settle_logging(job.cfg.get("console", PLAIN))
         work: Work = getattr(importlib.import_module(f"posefilter.run.{name}"), name)
         try:
             check_settings(cfg)

@@ -1,33 +1,50 @@
-"""What is seen on the console while a method trains."""
+"""What is seen on the console while a method trains or is tested."""
 
 import sys
 import time
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ProgressBar, RichProgressBar
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from posefilter.report.signs import duration
+from posefilter.run.voice import PLAIN, say
+
+SHOWN = (  # metric, what people call it, format
+    ("train/total", "loss", "{:.3g}"),
+    ("val/add/auc", "ADD AUC", "{:.1f}"),
+    ("val/add/median_mm", "median ADD", "{:.1f} mm"),
+    ("val/iou", "box IoU", "{:.3f}"),
+    ("val/particles_on_object", "on the object", "{:.0%}"),
+)
 
 
 def progress(console: str) -> Callback:
-    """Return the progress display: "rich" bars on a terminal, else ("plain", or no terminal) a line at each validation."""
-    return StepBar(leave=True) if console == "rich" and sys.stdout.isatty() else PlainProgress()
+    """Return the progress display: "rich" bars on a terminal, else a line at each validation ("plain": as JSON)."""
+    return Bars() if console != PLAIN and sys.stdout.isatty() else Lines(console)
 
 
-def is_bar(shown: Callback) -> bool:
-    """Tell whether a display is a bar, as Lightning's trainer wants to know."""
-    return isinstance(shown, ProgressBar)
+def told(metrics: dict[str, Any]) -> str:
+    """Return the metrics that matter in words: `loss 1.25, ADD AUC 71.0`."""
+    return ", ".join(f"{label} {form.format(float(metrics[name]))}" for name, label, form in SHOWN if name in metrics)
 
 
-class StepBar(RichProgressBar):
-    """Lightning's bar; runs are counted in steps here, and their number of epochs is nobody's choice."""
+def briefly(metrics: dict[str, Any]) -> str:
+    """Return the two that fit beside a bar: the loss, and how well it finds the object."""
+    finds = "val/add/auc" if "val/add/auc" in metrics else "val/particles_on_object"
+    return told({name: metrics[name] for name in ("train/total", finds) if name in metrics})
 
-    def _get_train_description(self, current_epoch: int) -> str:
-        return f"epoch {current_epoch}, step {self.trainer.global_step} of {self.trainer.max_steps}"
+
+def is_whole(name: str) -> bool:
+    """Tell whether a metric is of a whole validation, not of a part of its images."""
+    return name.startswith("val/") and "/by_" not in name
 
 
-class PlainProgress(Callback):
-    """One line at each validation: step, loss, score, speed."""
+class Lines(Callback):
+    """One line at each validation: step, loss, what was measured, speed, and how long it will still take."""
 
-    def __init__(self) -> None:
+    def __init__(self, console: str = "rich") -> None:
+        self.console = console
         self._began, self._step = 0.0, 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -38,7 +55,86 @@ class PlainProgress(Callback):
         """Print the line."""
         if trainer.sanity_checking:
             return
-        seen = trainer.callback_metrics
-        rate = (trainer.global_step - self._step) / max(time.perf_counter() - self._began, 1e-9)
-        told = [f"{name} {float(seen[name]):.4g}" for name in ("train/total", "val/score", "val/iou") if name in seen]
-        print(f"step {trainer.global_step}: {', '.join(told)}, {rate:.2f} steps/s", flush=True)
+        step, steps, seen = trainer.global_step, trainer.max_steps, trainer.callback_metrics
+        rate = (step - self._step) / max(time.perf_counter() - self._began, 1e-9)
+        left = f", {duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
+        sentence = f"step {step} of {steps}: {told(seen)}, {rate:.2f} steps/s{left}"
+        numbers = {name: float(value) for name, value in seen.items() if name == "train/total" or is_whole(name)}
+        say(self.console, "validation", sentence, step=step, steps=steps, **numbers, steps_per_second=rate)
+
+
+class Bars(Callback):
+    """A bar over the training's steps with its loss and last figures, one for each validation or test."""
+
+    def __init__(self) -> None:
+        self._bars: Progress | None = None
+        self._training: TaskID | None = None
+        self._looking: TaskID | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open the bar."""
+        self._training = self._shown().add_task("training", total=trainer.max_steps, completed=trainer.global_step, said="")
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Move the bar; figures are fetched from the device as seldom as they are logged."""
+        if self._training is None:
+            return
+        said = {}
+        if trainer.global_step % trainer.log_every_n_steps == 0 or trainer.global_step == trainer.max_steps:  # type: ignore[attr-defined]
+            said = {"said": briefly(trainer.callback_metrics)}
+        self._shown().update(self._training, completed=trainer.global_step, **said)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open a bar for the validation."""
+        if not trainer.sanity_checking:
+            self._look("validation", sum(map(int, trainer.num_val_batches)))
+
+    def on_validation_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Move it."""
+        self._advance()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Put a line in its place."""
+        self._looked()
+        if not trainer.sanity_checking:
+            self._shown().console.print(f"step {trainer.global_step}: {told(trainer.callback_metrics)}", highlight=False)
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open a bar for the test."""
+        self._look("test", sum(map(int, trainer.num_test_batches)))
+
+    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Move it."""
+        self._advance()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Leave the terminal as it was."""
+        self._stop()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Leave the terminal as it was."""
+        self._stop()
+
+    def _look(self, what: str, batches: int) -> None:
+        self._looking = self._shown().add_task(what, total=batches, said="")
+
+    def _advance(self) -> None:
+        if self._looking is not None:
+            self._shown().advance(self._looking)
+
+    def _looked(self) -> None:
+        if self._looking is not None:
+            self._shown().remove_task(self._looking)
+            self._looking = None
+
+    def _shown(self) -> Progress:
+        if self._bars is None:
+            columns = (TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeElapsedColumn())
+            self._bars = Progress(*columns, TimeRemainingColumn(), TextColumn("[dim]{task.fields[said]}"))
+            self._bars.start()
+        return self._bars
+
+    def _stop(self) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+        self._bars = self._training = self._looking = None

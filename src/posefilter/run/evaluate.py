@@ -15,13 +15,14 @@ from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.run.build import instantiate
-from posefilter.run.console import is_bar, progress
+from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.pieces import changed, changes
 from posefilter.run.results import record, show, write_json
 from posefilter.run.train import build_data, quiet, score
+from posefilter.run.voice import typed
 from posefilter.types import ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
@@ -38,7 +39,8 @@ def evaluate(job: Job) -> float:
     keep_training_metrics(job.folder)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
     files = {"metrics": job.folder / "metrics.json", **files}
-    show(metrics, str(job.cfg.estimates or job.cfg.checkpoint), job.cfg.console == "plain", files)
+    following = [typed("report", run=job.folder)] if (job.folder / ".hydra").is_dir() and not job.swept else []
+    show(metrics, str(job.cfg.estimates or job.cfg.checkpoint), job.cfg.console, "evaluated", files, following)
     return score(metrics)
 
 
@@ -47,13 +49,12 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method = method_of(checkpoint, changes(job.cfg))
     if job.cfg.seed is not None:
         method.seed = job.cfg.seed
-    data = build_data(data_settings(job, checkpoint["recipe"]["settings"], method.model.name))
+    data = build_data(data_settings(job, checkpoint["recipe"]["settings"], method.model.name), job.cfg.console)
     data.setup("test")
     method.adopt(object_to_judge(data, method.model))
-    records, shown = Records(beliefs=True), progress(job.cfg.console)
-    trainer = instantiate(
-        job.cfg.trainer, "trainer", callbacks=[records, shown], logger=False, enable_progress_bar=is_bar(shown)
-    )
+    records = Records(beliefs=True)
+    callbacks = [records, progress(job.cfg.console)]
+    trainer = instantiate(job.cfg.trainer, "trainer", callbacks=callbacks, logger=False, enable_progress_bar=False)
     assert isinstance(trainer, Trainer)
     trainer.test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz"}
@@ -71,7 +72,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     if not job.cfg.get("data"):
         raise UserError("estimates need to know of which data: give data=fat|ycb_video|bop|scenes and data.root=DIR")
     rows = read_poses_csv(Path(job.cfg.estimates))
-    data = build_data(data_settings(job, {}, None))
+    data = build_data(data_settings(job, {}, None), job.cfg.console)
     data.setup("test")
     best = {}
     for row in sorted(rows, key=lambda row: row.score):

@@ -10,6 +10,7 @@ from posefilter.models.compact import pack, unpack
 from posefilter.run.evaluate import OF_THE_CHECKPOINT
 from posefilter.run.job import Job
 from posefilter.run.method import method_of, read_checkpoint
+from posefilter.run.voice import ended, typed
 
 _KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
 
@@ -31,7 +32,8 @@ def export(job: Job) -> None:
         partial.unlink()
         raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={job.cfg.most_mb}")
     partial.replace(out)
-    print(f"{out}: {size:.2f} MB")
+    following = [f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"]
+    ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
 
 
 def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dict[str, Any]:

@@ -1,18 +1,43 @@
 """Render a dataset in the FAT format."""
 
+from pathlib import Path
+
 from posefilter.data.generate import Summary
+from posefilter.data.readers import open_reader
 from posefilter.errors import UserError
+from posefilter.pictures.canvas import save_picture
+from posefilter.pictures.preview import draw_preview
 from posefilter.run.build import instantiate
 from posefilter.run.job import Job
+from posefilter.run.voice import PLAIN, ended, typed
 
 
 def generate(job: Job) -> None:
-    """Render the frames that are still missing."""
+    """Render the frames that are still missing, and a picture of some."""
     if job.cfg.out is None:
         raise UserError("out: is missing; name the folder that the dataset goes to")
-    summary = instantiate(job.cfg.generate, "generate")
+    shown = bool(job.cfg.progress) and job.cfg.console != PLAIN
+    summary = instantiate({**job.cfg.generate, "progress": shown}, "generate")
     assert isinstance(summary, Summary)
-    print(
-        f"{summary.out}: {summary.frames} frames in {summary.folders} folders, {summary.rendered} of them now "
-        f"({summary.frames_per_second:.1f} frames/s)"
+    preview = draw(summary, job.cfg.object)
+    if job.cfg.console != PLAIN:
+        speed = f" ({summary.frames_per_second:.1f} frames/s)" if summary.rendered else ""
+        print(f"{summary.frames} frames in {summary.folders} folders, {summary.rendered} of them rendered now{speed}")
+    following = typed("check_data", data="fat", data__root=summary.out, data__object=job.cfg.object, meshes=job.cfg.meshes)
+    ended(
+        job.cfg.console,
+        "generated",
+        {"data": summary.out, "preview": preview},
+        [following],
+        frames=summary.frames,
+        rendered=summary.rendered,
+        frames_per_second=summary.frames_per_second,
     )
+
+
+def draw(summary: Summary, name: str) -> Path:
+    """Write preview.png: four of the frames."""
+    reader = open_reader("scenes", summary.out, name)
+    path = summary.out / "preview.png"
+    save_picture(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
+    return path

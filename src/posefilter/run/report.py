@@ -16,6 +16,7 @@ from posefilter.report.settings import Change, changes
 from posefilter.report.sweep_page import sweep_page
 from posefilter.report.sweeps import best_job, read_sweep
 from posefilter.run.job import Job
+from posefilter.run.voice import ended
 
 FOLDERS = ("run", "sweep", "out")
 
@@ -51,7 +52,7 @@ def report(job: Job) -> None:
     (out / "report.html").write_text(page)
     for name, png in files.items():
         (out / name).write_bytes(png)
-    print(f"report: {out / 'report.html'} ({len(page) / 1e6:.1f} MB, {len(files)} charts beside it)")
+    ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})
 
 
 def compared(run: Run) -> list[Change] | None:

@@ -1,16 +1,13 @@
 """Results: metrics.json, and the table on the console."""
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from posefilter.run.job import Job
 from posefilter.run.machine import device_name, git_state, versions
+from posefilter.run.voice import PLAIN, Files, ended, finite, show_table
 
 _ROWS = (
     ("ADD AUC", ("add", "auc"), "{:.1f}"),
@@ -23,6 +20,7 @@ _ROWS = (
     ("particles on the object", ("particles_on_object",), "{:.1%}"),
     ("time an image", ("seconds_per_image",), "{:.3f} s"),
 )
+_TOLD = ("instances", "missed", "add", "add_s", "iou", "particles_on_object", "seconds_per_image", "belief")  # to machines
 
 
 def record(results: dict[str, Any], job: Job, data: dict[str, Any], checkpoint: Path | None) -> dict[str, Any]:
@@ -50,19 +48,8 @@ def write_json(path: Path, content: Any) -> None:
     partial.replace(path)
 
 
-def finite(content: Any) -> Any:
-    """Return plain content with NaN and infinity as null."""
-    if isinstance(content, dict):
-        return {str(key): finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [finite(value) for value in content]
-    if isinstance(content, float) and not math.isfinite(content):
-        return None
-    return content
-
-
-def show(metrics: dict[str, Any], title: str, plain: bool, written: Mapping[str, Path | str]) -> None:
-    """Print the table, and where everything was written."""
+def show(metrics: dict[str, Any], title: str, console: str, event: str, files: Files, following: Sequence[str] = ()) -> None:
+    """Print the table, where everything was written, and what may be typed next; for machines, all of it as one line."""
     rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
     for label, path, form in _ROWS:
         value: Any = metrics
@@ -70,15 +57,7 @@ def show(metrics: dict[str, Any], title: str, plain: bool, written: Mapping[str,
             value = value.get(key) if isinstance(value, dict) else None
         if isinstance(value, int | float):
             rows.append((label, form.format(value)))
-    if plain:
-        print(f"{title}: " + "; ".join(f"{label} {value}" for label, value in rows))
-        for label, place in written.items():
-            print(f"{label}: {place}")
-        return
-    console = Console()
-    table = Table("", "", title=title, show_header=False, title_justify="left")
-    for row in rows:
-        table.add_row(*row)
-    console.print(table)
-    for label, place in written.items():
-        console.print(f"[dim]{label}:[/dim] {place}", highlight=False, soft_wrap=True)
+    if console != PLAIN:
+        show_table(title, rows)
+    told = {key: metrics[key] for key in _TOLD if key in metrics}
+    ended(console, event, files, following, title=title, **told)

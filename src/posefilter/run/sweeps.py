@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 from posefilter.report.sweeps import number
+from posefilter.run.voice import PLAIN, ended, typed
 
 COLUMNS = {
     "add_auc": ("add", "auc"),
@@ -38,8 +39,11 @@ class SweepSummary(Callback):
         """Say where the summary is."""
         folder = Path(config.hydra.sweep.dir)
         if summarise(folder):
-            print((folder / "summary.md").read_text())
-            print(f"summary: {folder / 'summary.csv'}, {folder / 'summary.png'}")
+            files = {"summary": folder / "summary.csv", "picture": folder / "summary.png"}
+            console = str(config.get("console", PLAIN))
+            if console != PLAIN:
+                print((folder / "summary.md").read_text())
+            ended(console, "swept", files, [typed("report", sweep=folder)])
 
 
 def summarise(folder: Path) -> list[Row]:

@@ -9,29 +9,34 @@ from typing import Any
 import torch
 from lightning import Callback, LightningDataModule, Trainer
 from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from posefilter.callbacks.story import Story
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.run.build import instantiate
-from posefilter.run.console import is_bar, progress
+from posefilter.run.comparing import comparable
+from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import build_method, check_loss, method_of, read_checkpoint, recipe
 from posefilter.run.results import record, show, write_json
 from posefilter.run.resume import last_checkpoint
+from posefilter.run.voice import PLAIN, say, typed
 
 
 def train(job: Job) -> float:
     """Train and test; write metrics.json into the job's folder.  Returns the score that sweeps maximise."""
     done = finished(job)
     if done is not None:
-        print(f"{job.folder}: done before; delete its metrics.json to run it again")
+        say(
+            job.cfg.console, "skipped", f"{job.folder}: done before; delete its metrics.json to run it again", run=job.folder
+        )
         return score(done)
     check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
     method = build_method(recipe(job))  # first, since it is the sooner to complain
-    data = build_data(job.cfg.data)
+    data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
     method.adopt(data.object_model(0))
     trainer = build_trainer(job)
@@ -43,22 +48,31 @@ def train(job: Job) -> float:
     results = test(trainer, data, best)
     metrics = record(results, job, data.describe(), best)
     write_json(job.folder / "metrics.json", metrics)
-    files: dict[str, Path | str] = {
-        "run": job.folder,
-        "checkpoint": best,
-        "next": f"python evaluate.py checkpoint={best} data=...",
-    }
-    show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console == "plain", files)
+    files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
+    following = [] if job.swept else [typed("report", run=job.folder), typed("evaluate", checkpoint=best), "make board"]
+    show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console, "trained", files, following)
     return score(metrics)
 
 
-def build_data(node: DictConfig) -> PoseDataModule:
+def build_data(node: DictConfig, console: str) -> PoseDataModule:
     """Build the data module, and have its scenes rendered where they are missing."""
+    if console == PLAIN:
+        node = without_bars(node)
     data = instantiate(node, "data")
     if not isinstance(data, PoseDataModule):
         raise UserError(f"data._target_={node.get('_target_')}: is no data module")
     data.prepare_data()
     return data
+
+
+def without_bars(node: DictConfig) -> DictConfig:
+    """Return the settings of the data with every bar switched off."""
+    out = OmegaConf.create(OmegaConf.to_container(node, resolve=True))
+    assert isinstance(out, DictConfig)
+    for section in (out, out.get("generate")):
+        if section and "progress" in section:
+            section.progress = False
+    return out
 
 
 def build_trainer(job: Job) -> Trainer:
@@ -67,12 +81,12 @@ def build_trainer(job: Job) -> Trainer:
     cfg = job.cfg.copy()
     cfg.folder = str(job.folder)
     callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
-    shown = progress(cfg.console)
-    callbacks.append(shown)
+    for story in callbacks:
+        if isinstance(story, Story):
+            story.settings = comparable(job)
+    callbacks.append(progress(cfg.console))
     loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]
-    trainer = instantiate(
-        cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=is_bar(shown)
-    )
+    trainer = instantiate(cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=False)
     assert isinstance(trainer, Trainer)
     return trainer
 
