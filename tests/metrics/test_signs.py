@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from posefilter.metrics.signs import auroc, explained, heading, near_edge, off_frame, pairwise_cosine
+from posefilter.metrics.signs import auroc, distinct, explained, heading, near_edge, off_frame, pairwise_cosine
 
 
 def test_pairwise_cosine_equals_the_double_loop() -> None:
@@ -47,3 +47,10 @@ def test_shares_of_places() -> None:
     edge, corner = near_edge(state, 200, 100)
     assert edge.item() == pytest.approx(0.6)
     assert corner.item() == pytest.approx(0.2)
+
+
+def test_copies_count_once() -> None:
+    state = torch.tensor(
+        [[[3.0, 4.0], [3.0, 4.0], [3.04, 4.0], [3.2, 4.0]], [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0], [9.0, 9.0]]]
+    )
+    assert distinct(state).tolist() == [0.5, 1.0]

@@ -75,12 +75,21 @@ def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tu
     return (side_u | side_v).float().mean(1), (side_u & side_v).float().mean(1)
 
 
+def distinct(state: Tensor, cell_px: float = 0.1) -> Tensor:
+    """Return the share of particles with a place of their own: copies of one another count once.  (B, N, 2) [px] -> (B,).
+
+    Resampling copies the likely particles, so a cloud of which all are on the object may be a few places many times over.
+    """
+    cells = (state / cell_px).round()
+    return torch.stack([cells.new_tensor(len(one.unique(dim=0)) / len(one)) for one in cells])
+
+
 class SignsOfFailure(Metric):
     """All of the above over many runs of a filter: numbers, and lists with one number a step.
 
-    off_frame, near_edge, near_corner, on_object: lists; pairwise_cosine: mean over images and steps; offset_r2, heading:
-    displacements against the true offset to the mask's nearest pixel; auroc: of the likelihood, particles on the mask being
-    the positives. The last three are over all steps.
+    off_frame, near_edge, near_corner, on_object, distinct: lists; pairwise_cosine: mean over images and steps; offset_r2,
+    heading: displacements against the true offset to the mask's nearest pixel; auroc: of the likelihood, particles on the
+    mask being the positives. The last three are over all steps.
     """
 
     full_state_update = False
@@ -102,9 +111,8 @@ class SignsOfFailure(Metric):
         kinds = []
         for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
             edge, corner = near_edge(cloud.state, width, height)
-            kinds.append(
-                torch.stack([on_object(batch.mask, cloud.state), off_frame(cloud.state, width, height), edge, corner])
-            )
+            on, off = on_object(batch.mask, cloud.state), off_frame(cloud.state, width, height)
+            kinds.append(torch.stack([on, off, edge, corner, distinct(cloud.state)]))
             self.cosine.append(pairwise_cosine(reading.motion))
             some, motion = cloud.state[:, : self.most], reading.motion[:, : self.most]
             true = nearest_true(batch.mask, some) - some
@@ -112,12 +120,13 @@ class SignsOfFailure(Metric):
             positive = touches(batch.mask, some).float()
             judged = torch.stack([reading.log_likelihood[:, : self.most].float(), positive], dim=-1)
             self.judged.append(judged.flatten(0, 1))
-        self.shares.append(torch.stack(kinds).permute(2, 0, 1))  # (B, T, 4)
+        self.shares.append(torch.stack(kinds).permute(2, 0, 1))  # (B, T, 5)
 
     def compute(self) -> dict[str, Any]:
         """Return the signs by name."""
         shares, offsets, judged = joined(self.shares).mean(0), joined(self.offsets), joined(self.judged)
-        lists = zip(("on_object", "off_frame", "near_edge", "near_corner"), shares.T.tolist(), strict=True)
+        names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct")
+        lists = zip(names, shares.T.tolist(), strict=True)
         motion, true = offsets[:, :2], offsets[:, 2:]
         return dict(lists) | {
             "pairwise_cosine": float(joined(self.cosine).nanmean()),
