@@ -30,11 +30,15 @@ def state(folder: Path) -> dict:
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-@pytest.mark.parametrize("interval", [4, 3], ids=["between epochs", "within an epoch"])
+@pytest.mark.parametrize(
+    ("model", "interval"),
+    [("cnn_patch", 4), ("cnn_patch", 3), ("pose_pf", 3)],
+    ids=["between epochs", "within an epoch", "with particles of its own"],
+)
 def test_a_killed_run_goes_on_to_the_same_end(
-    interval: int, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: str, interval: int, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # type: ignore[no-untyped-def]
-    settings = ["model=cnn_patch", f"trainer.val_check_interval={interval}", f"trainer.max_steps={3 * interval}"]
+    settings = [f"model={model}", f"trainer.val_check_interval={interval}", f"trainer.max_steps={3 * interval}"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     training.train(tiny_job(whole, *settings))
 
@@ -57,5 +61,9 @@ def test_a_killed_run_goes_on_to_the_same_end(
     for one, other in zip(
         a["optimizer_states"][0]["state"].values(), b["optimizer_states"][0]["state"].values(), strict=True
     ):
-        assert torch.equal(one["exp_avg"], other["exp_avg"])
+        for key in one:
+            assert torch.equal(one[key], other[key]), key
+    assert ("lesson" in a) == ("lesson" in b) == (model == "pose_pf")
+    for key, value in a.get("lesson", {}).items():
+        assert torch.equal(value, b["lesson"][key]), key
     assert a["lr_schedulers"][0]["_last_lr"] == b["lr_schedulers"][0]["_last_lr"]

@@ -60,7 +60,7 @@ class PersistentParticles(nn.Module):
     """A few particles a training frame, kept between visits; a frame's noise level falls to `sharpest` with each of them.
 
     They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera was rolled or zoomed by
-    augmentation finds them where they were. Kept out of checkpoints' state dict: a resumed run starts them anew.
+    augmentation finds them where they were.
     """
 
     def __init__(self, particles: int = 16, levels: int = 12, sharpest: float = 0.004, step: float = 0.4) -> None:
@@ -77,6 +77,20 @@ class PersistentParticles(nn.Module):
             rows.append(fresh[row] if kept is None else batch.camera_from_object[row] @ kept.to(fresh.device))
         level = torch.tensor([self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device)
         return torch.stack(rows), start * (self.sharpest / start) ** (level / (self.levels - 1))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what a run needs to go on: frames (F,), their levels (F,) and particles (F, M, 4, 4)."""
+        if not self._poses:
+            return {}
+        frames = sorted(self._poses)
+        levels = torch.tensor([self._level[frame] for frame in frames])
+        return {"frames": torch.tensor(frames), "levels": levels, "poses": torch.stack([self._poses[f] for f in frames])}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` returned."""
+        frames = state["frames"].tolist() if state else []
+        self._poses = dict(zip(frames, state["poses"], strict=True)) if state else {}
+        self._level = dict(zip(frames, state["levels"].tolist(), strict=True)) if state else {}
 
     @torch.no_grad()
     def advance(

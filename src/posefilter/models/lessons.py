@@ -25,6 +25,14 @@ class Lesson(Protocol):
         """Return a trace of one step, its scores differentiable."""
         ...
 
+    def state(self) -> dict[str, Tensor]:
+        """Return what it remembers from batch to batch, for a run that is to be resumed."""
+        ...
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Remember what `state` returned."""
+        ...
+
 
 def one_step_trace(cloud: Cloud, reading: Reading, sigma: Tensor) -> Trace:
     """Wrap a scored cloud of poses as a trace whose belief is the softmax of the scores."""
@@ -90,6 +98,15 @@ class CandidatePoses:
             self.persistent.advance(batch, groups[-1], scores, sigma, own, method.space, generator)
         return one_step_trace(cloud, reading, sigma)
 
+    def state(self) -> dict[str, Tensor]:
+        """Return the persistent particles."""
+        return self.persistent.state() if self.persistent is not None else {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take persistent particles back."""
+        if self.persistent is not None:
+            self.persistent.restore(state)
+
 
 class LabelledRays:
     """The paper's lesson: points along the rays of the object's pixels, scored one by one (section 5).
@@ -137,3 +154,10 @@ class LabelledRays:
         pose = batch.camera_from_object[:, None].expand(-1, judged.shape[1], -1, -1)
         reading = Reading(judged, judged.new_zeros(B, judged.shape[1], 6), pose, cloud.memory)
         return one_step_trace(cloud, reading, torch.full((B,), self.tolerance, device=device))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return nothing: every batch is new to it."""
+        return {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Remember nothing."""

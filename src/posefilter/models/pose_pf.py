@@ -152,6 +152,16 @@ class PosePF(PoseEstimator):
             out["belief"][name] = float(self.scores[name].compute())
         return out
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Carry along what the lesson remembers, so that a resumed run ends as one that was not cut."""
+        super().on_save_checkpoint(checkpoint)
+        checkpoint["lesson"] = self.lesson.state()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Give the lesson its memory back."""
+        super().on_load_checkpoint(checkpoint)
+        self.lesson.restore(checkpoint.get("lesson", {}))
+
     def _center(self) -> Tensor:
         return self.model.center.to(self.device)
 
