@@ -18,6 +18,11 @@ from typing import NamedTuple
 HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
+AT_TEST_TIME = {  # tables of evaluations, and what they sweep
+    "resampling": "resample=never,systematic,guided",
+    "particles": "filter.particles=50,100,1000",
+    "iterations": "filter.steps=10,30,100",
+}
 
 
 class Line(NamedTuple):
@@ -37,8 +42,8 @@ def plan() -> list[Line]:
         Line("memorise", f"{memorise} variant=paper seed=0"),
         Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
     ]
-    lines += [ablation("particles", "50,100,1000", model) for model in (*DETECTORS, *WITH_POSE)]
-    lines += [ablation("steps", "10,30,100", model) for model in (*DETECTORS, *WITH_POSE)]
+    for table, swept in AT_TEST_TIME.items():
+        lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
     lines += [Line("held_out", f"{FOUR} seed=0")]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
@@ -51,11 +56,9 @@ def plan() -> list[Line]:
     return lines
 
 
-def ablation(setting: str, values: str, model: str) -> Line:
-    """Return a sweep at test time over a setting of the filter, on the working variant's first run."""
-    run = f"memorise/experiment=memorise,model={model},seed=0,variant=working"
-    table = {"particles": "particles", "steps": "iterations"}[setting]
-    return Line(table, f"filter.{setting}={values}", run, model)
+def ablation(table: str, swept: str, model: str) -> Line:
+    """Return a sweep at test time over a choice of the filter, on the working variant's first run."""
+    return Line(table, swept, f"memorise/experiment=memorise,model={model},seed=0,variant=working", model)
 
 
 def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:

@@ -1,10 +1,10 @@
 """Write the result tables of docs/methods.md from the metrics.json files of runs.
 
-    python bench/methods_table.py [FOLDER ...] [--into docs/methods.md]
+    python bench/methods_table.py [FOLDER] [--into docs/methods.md]
 
-Folders are searched for metrics.json (default: outputs/runs and outputs/sweeps). Runs that differ only in their seed become
-one row: mean, and half the range between the best and the worst seed. Tables replace what stands between
-`<!-- table: NAME -->` and `<!-- end -->`, NAME being a run's experiment or sweep, or `none`; a name without runs stays.
+FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table, searched for metrics.json. Runs
+that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
+what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
 """
 
 import argparse
@@ -20,7 +20,9 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "on object %": lambda m: 100 * m["particles_on_object"],
     "box IoU": lambda m: m["iou"],
     "ADD AUC": lambda m: m["add"]["auc"],
+    "ADD < 0.1 d %": lambda m: m["add"]["recall_01d"],
     "ADD-S AUC": lambda m: m["add_s"]["auc"],
+    "distinct %": lambda m: 100 * m["signs"]["distinct"][-1],
     "same direction": lambda m: m["signs"]["pairwise_cosine"],
     "offset R2": lambda m: m["signs"]["offset_r2"],
     "off frame %": lambda m: 100 * m["signs"]["off_frame"][-1],
@@ -28,8 +30,10 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "AUROC": lambda m: m["signs"]["auroc"],
     "s / image": lambda m: m["seconds_per_image"],
 }
-NAMES = ("model", "variant", "experiment", "sweep", "seed")
-SILENT = ("logger", "callbacks", "hydra", "trainer", "out", "resume", "data.root")  # change no result
+NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
+SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root")  # change no result
+RUNGS = Path(__file__).parents[1] / "conf" / "rung"
+ORDER = ("paper", "s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")  # of rungs, by what their names begin with
 
 
 def read_runs(folders: Iterable[Path]) -> list[dict[str, Any]]:
@@ -50,7 +54,25 @@ def key_of(run: dict[str, Any]) -> tuple[str, str, str]:
     choices = run["choices"]
     rest = [f"{k}={v}" for k, v in choices.items() if k not in NAMES and k.split(".")[0] not in SILENT and k not in SILENT]
     name, variant = (run.get(key) or choices.get(key) or "?" for key in ("model", "variant"))
-    return name, variant, " ".join(rest)
+    return name, variant, " ".join(sorted(rest))
+
+
+def place(key: tuple[str, str, str]) -> tuple[Any, ...]:
+    """Return what rows are sorted by: methods and numbers as one counts them, rungs as the ladder climbs."""
+    model, variant, rest = key
+    rung = re.search(rf"\brung=({'|'.join(ORDER)})(\d*)(?:_|\b)", rest)
+    climbed = (ORDER.index(rung[1]), int(rung[2] or 0)) if rung else (-1, 0)
+    return model, climbed, variant, [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", rest)]
+
+
+def told(rest: str) -> str:
+    """Return what was chosen, as it is typed; a rung also in its file's own words."""
+    if not rest:
+        return ""
+    rung = re.search(r"\brung=(\w+)", rest)
+    lines = (RUNGS / f"{rung[1]}.yaml").read_text().splitlines() if rung else []
+    words = lines[1].removeprefix("# ").rstrip(".") if len(lines) > 1 and lines[1].startswith("# ") else ""
+    return f"`{rest}`" + (f" {words}" if words else "")
 
 
 def cell(runs: list[dict[str, Any]], read: Callable[[dict[str, Any]], Any]) -> str:
@@ -77,10 +99,11 @@ def table(runs: list[dict[str, Any]]) -> str:
         rows[key_of(run)].append(run)
     shown = [name for name, read in COLUMNS.items() if any(cell([run], read) != "–" for run in runs)]
     lines = ["| method | variant | changed | seeds | " + " | ".join(shown) + " |", "|---" * (4 + len(shown)) + "|"]
-    for (model, variant, rest), same in sorted(rows.items()):
+    for model, variant, rest in sorted(rows, key=place):
+        same = rows[model, variant, rest]
         seeds = len({str(run.get("seed", run["choices"].get("seed"))) for run in same})
         figures = [cell(same, COLUMNS[name]) for name in shown]
-        lines.append(" | ".join([f"| {model}", variant, f"`{rest}`" if rest else "", str(seeds), *figures]) + " |")
+        lines.append(" | ".join([f"| {model}", variant, told(rest), str(seeds), *figures]) + " |")
     return "\n".join(lines)
 
 
@@ -93,21 +116,18 @@ def insert(page: str, name: str, content: str) -> str:
 def main() -> int:
     """Read the runs, write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="*", type=Path, default=[Path("outputs/runs"), Path("outputs/sweeps")])
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/methods"))
     parser.add_argument("--into", type=Path, default=Path("docs/methods.md"))
     options = parser.parse_args()
-    groups = defaultdict(list)
-    for run in read_runs(options.folders):
-        groups[run["choices"].get("sweep") or run["choices"].get("experiment") or "none"].append(run)
     page = options.into.read_text()
-    for name, runs in sorted(groups.items()):
-        print(
-            f"{name}: {len(runs)} runs"
-            + ("" if f"<!-- table: {name} -->" in page else f" (no such table in {options.into})")
-        )
+    found = {folder.name: read_runs([folder]) for folder in sorted(options.folder.glob("*")) if folder.is_dir()}
+    found = {name: runs for name, runs in found.items() if runs}
+    for name, runs in found.items():
+        missing = "" if f"<!-- table: {name} -->" in page else f" (no such table in {options.into})"
+        print(f"{name}: {len(runs)} runs{missing}")
         page = insert(page, name, table(runs))
     options.into.write_text(page)
-    return 0 if groups else 1
+    return 0 if found else 1
 
 
 if __name__ == "__main__":

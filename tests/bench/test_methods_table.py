@@ -21,7 +21,7 @@ def run(folder: Path, on: float, *overrides: str) -> None:
 def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
     both = ("model=patch_pf", "experiment=memorise")
     run(tmp_path / "a", 0.9, *both, "seed=0", "variant=working")
-    run(tmp_path / "b", 0.8, *both, "seed=1", "variant=working", "trainer.max_epochs=3")
+    run(tmp_path / "b", 0.8, *both, "seed=1", "variant=working", "console=plain")
     run(tmp_path / "c", 0.2, *both, "seed=0", "variant=paper")
     runs = methods_table.read_runs([tmp_path])
     lines = methods_table.table(runs).splitlines()
@@ -33,3 +33,25 @@ def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
 def test_only_the_named_table_is_replaced() -> None:
     page = "a\n<!-- table: x -->\nold\n<!-- end -->\nb\n<!-- table: y -->\nkept\n<!-- end -->\n"
     assert methods_table.insert(page, "x", "new") == page.replace("old", "new")
+
+
+def test_rows_climb_the_ladder_and_count_as_people_do(tmp_path: Path) -> None:
+    rungs = ("paper", "c10_x", "c2_glimpse", "s1_glimpse", "pose_c9_own_point", "working", "m3_bounded")
+    keys = [("patch_pf", "paper", f"rung={rung}") for rung in sorted(rungs)]
+    wanted = ["paper", "s1_glimpse", "c2_glimpse", "c10_x", "pose_c9_own_point", "working", "m3_bounded"]
+    assert [key[2].removeprefix("rung=") for key in sorted(keys, key=methods_table.place)] == wanted
+    counts = [("patch_pf", "working", f"filter.particles={n}") for n in (1000, 50, 100)]
+    assert [key[2][17:] for key in sorted(counts, key=methods_table.place)] == ["50", "100", "1000"]
+    assert methods_table.told("rung=c2_glimpse") == "`rung=c2_glimpse` The same, and smooth glimpses"
+
+
+def test_each_folder_is_a_table(tmp_path: Path, monkeypatch, capsys) -> None:
+    run(tmp_path / "runs" / "memorise" / "a", 0.9, "model=patch_pf", "variant=working")
+    run(tmp_path / "runs" / "other" / "deep" / "b", 0.1, "model=patch_pf", "variant=paper")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- table: memorise -->\nold\n<!-- end -->\n")
+    monkeypatch.setattr("sys.argv", ["methods_table", str(tmp_path / "runs"), "--into", str(page)])
+    assert methods_table.main() == 0
+    assert "| patch_pf | working |  | 1 | 90.0 |" in page.read_text()
+    assert "old" not in page.read_text()
+    assert "other: 1 runs (no such table" in capsys.readouterr().out

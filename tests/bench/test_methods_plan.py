@@ -1,0 +1,57 @@
+"""The plan of runs behind the docs' tables: every job of it composes, and an evaluation waits for its checkpoint."""
+
+import importlib.util
+import itertools
+import os
+from pathlib import Path
+
+import pytest
+
+from posefilter.run.command import compose_job
+
+HOME = Path(__file__).parents[2]
+spec = importlib.util.spec_from_file_location("methods", HOME / "bench" / "methods.py")
+assert spec is not None
+assert spec.loader is not None
+methods = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(methods)
+
+
+def jobs(words: str) -> list[tuple[str, ...]]:
+    pairs = [word.split("=", 1) for word in words.split()]
+    return list(itertools.product(*([f"{key}={value}" for value in values.split(",")] for key, values in pairs)))
+
+
+@pytest.mark.parametrize("line", [line for line in methods.plan() if line.of is None], ids=lambda line: line.words)
+def test_every_line_composes(line, tmp_path: Path) -> None:
+    for overrides in (jobs(line.words)[0], jobs(line.words)[-1]):
+        job = compose_job("train", HOME / "conf", list(overrides), tmp_path)
+        assert job.cfg.seed in range(5)
+
+
+def test_every_table_of_the_plan_has_its_place_in_the_docs() -> None:
+    page = (HOME / "docs" / "methods.md").read_text()
+    for line in methods.plan():
+        assert f"<!-- table: {line.table} -->" in page
+
+
+def test_an_evaluation_waits_for_its_checkpoint_and_is_not_done_twice(tmp_path: Path) -> None:
+    line = methods.ablation("particles", "filter.particles=50,100", "patch_pf")
+    words = methods.command(line, tmp_path)
+    assert words[:2] == ["evaluate.py", "-m"]
+    assert "filter.particles=50,100" in words
+    assert methods.waits(line, tmp_path)  # nothing was trained
+    run = tmp_path / line.of
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "metrics.json").write_text("{}")
+    checkpoint = run / "checkpoints" / "best.ckpt"
+    checkpoint.touch()
+    assert not methods.waits(line, tmp_path)
+    summary = tmp_path / line.table / line.into / "summary.csv"
+    summary.parent.mkdir(parents=True)
+    summary.touch()
+    os.utime(checkpoint, (1, 1))
+    assert methods.waits(line, tmp_path)
+    os.utime(checkpoint)
+    os.utime(summary, (1, 1))  # trained anew since
+    assert not methods.waits(line, tmp_path)
