@@ -1,5 +1,6 @@
 """Find the object in one photograph: its pose, a picture of it, and the belief."""
 
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -19,20 +20,26 @@ from posefilter.models.base import PoseEstimator
 from posefilter.pictures.belief import draw_belief
 from posefilter.pictures.canvas import rasterise, save_picture
 from posefilter.pictures.overlay import draw_overlay
+from posefilter.pictures.recording import check_viewer, record
+from posefilter.pictures.shown import what_is_shown
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.pieces import changes
 from posefilter.run.results import write_json
 from posefilter.run.train import quiet
-from posefilter.types import Batch
+from posefilter.run.voice import PLAIN, ended
+from posefilter.types import Batch, Belief
+
+VIEW = "view.rrd"
 
 
 def predict(job: Job) -> None:
-    """Write pose.json, overlay.png, belief.png and belief.npz."""
+    """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
     quiet()
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
+    check_view(cfg.view)
     checkpoint = read_checkpoint(cfg.checkpoint)
     method = method_of(checkpoint, changes(cfg))
     if not method.tells_pose:
@@ -50,9 +57,9 @@ def predict(job: Job) -> None:
     method.seed = cfg.seed
     began = time.perf_counter()
     with torch.no_grad():
-        belief = method.predict_step(batch, 0).belief
+        trace = method.predict_step(batch, 0)
     seconds = time.perf_counter() - began
-    belief = type(belief)(*(x.cpu() for x in belief))
+    belief = Belief(*(x.cpu() for x in trace.belief))
     pose, weights = belief.best[0].double().numpy(), belief.log_weights[0].exp().double()
     folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,10 +67,24 @@ def predict(job: Job) -> None:
     save_picture(draw_overlay(rgb, K.numpy(), pose, shape, caption=caption), folder / "overlay.png")
     save_picture(rasterise(draw_belief(belief, method.model, rgb, K.numpy())), folder / "belief.png")
     np.savez_compressed(folder / "belief.npz", poses=belief.poses[0].numpy(), weights=weights.float().numpy())
-    write_json(folder / "pose.json", told(pose, belief_numbers(weights), float(belief.score[0]), seconds, method, job))
-    print(f"{method.model.name} at {np.array2string(1000 * pose[:3, 3], precision=1)} mm, {seconds:.2f} s")
-    for name in ("pose.json", "overlay.png", "belief.png", "belief.npz"):
-        print(f"{name.partition('.')[0]}: {folder / name}")
+    answer = told(pose, belief_numbers(weights), float(belief.score[0]), seconds, method, job)
+    write_json(folder / "pose.json", answer)
+    if cfg.view:
+        record(what_is_shown(trace, batch, method.model, method.space, shape), folder / VIEW)
+    if cfg.console != PLAIN:
+        print(f"{method.model.name} at {np.array2string(1000 * pose[:3, 3], precision=1)} mm, {seconds:.2f} s")
+    files = {"pose": "pose.json", "overlay": "overlay.png", "belief": "belief.png", "numbers": "belief.npz"}
+    files |= {"view": VIEW} if cfg.view else {}
+    following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.view else []
+    ended(cfg.console, "predicted", {name: folder / file for name, file in files.items()}, following, **answer)
+
+
+def check_view(view: Any) -> None:
+    """Raise UserError, before the work is done, where the 3-D view cannot be written."""
+    if not isinstance(view, bool):
+        raise UserError(f"view={view}: choose true or false")
+    if view:
+        check_viewer()
 
 
 def told(
