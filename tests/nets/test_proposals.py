@@ -151,7 +151,10 @@ def test_the_network_learns_coordinates_of_a_toy() -> None:
     torch.manual_seed(0)
     net, model = ObjectCoordinateNet((16, 24, 32, 32), fragments=12), square()
     net.adopt(model.points, model.center, model.radius)
-    assert net.centers.norm(dim=-1).max() <= 1 + 1e-5
+    cut = net.centers.clone()
+    assert cut.norm(dim=-1).max() <= 1 + 1e-5
+    net.adopt(model.points.flip(0) * 0.9, model.center, model.radius)  # other points of the same object, to judge it by
+    assert torch.equal(net.centers, cut)
     optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
     errors = []
     for step in range(60):

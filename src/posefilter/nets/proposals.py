@@ -83,7 +83,12 @@ class ObjectCoordinateNet(nn.Module):
         return Coordinates(logit[..., 0], torch.log_softmax(share, dim=-1), place, centers, features)
 
     def adopt(self, points: Tensor, center: Tensor, radius: float) -> None:
-        """Cut an object into fragments.  (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m]."""
+        """Cut an object into fragments, once: what was learned is about these, whatever points it is judged by later.
+
+        (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m].
+        """
+        if bool(self.centers.any()):
+            return
         middles, reach = spread_points((points - center) / radius, self.fragments)
         self.centers.copy_(middles)
         self.reach.fill_(reach)
