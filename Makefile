@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format smoke bench methods board weights clean
+.PHONY: help setup train test check format smoke bench methods board report tour pictures weights clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -42,6 +42,16 @@ methods: $(STAMP) ## run (or go on with) every run behind docs/methods.md, and w
 
 board: $(STAMP) ## show every run in TensorBoard
 	$(VENV)/bin/tensorboard --logdir outputs
+
+report: $(STAMP) ## explain a run on one page: make report RUN=outputs/runs/... (or SWEEP=outputs/sweeps/...)
+	@test -n "$(RUN)$(SWEEP)" || { echo "give RUN=outputs/runs/... or SWEEP=outputs/sweeps/..."; exit 2; }
+	$(PY) report.py "$(if $(SWEEP),sweep=$(SWEEP),run=$(RUN))"
+
+tour: $(STAMP) ## run the commands of docs/tour.md: from a mesh to a trained filter
+	$(PY) docs/run_tour.py
+
+pictures: $(STAMP) ## make the pictures of README.md, and of docs/tour.md where it was run: ARGS="--checkpoint FILE --meshes DIR"
+	$(PY) docs/make_pictures.py $(ARGS)
 
 weights: $(STAMP) ## strip a run to what ships: make weights RUN=outputs/runs/... NAME=carton
 	@test -n "$(RUN)" -a -n "$(NAME)" || { echo "give RUN=outputs/runs/... and NAME=..."; exit 2; }

@@ -1,0 +1,174 @@
+"""Make the pictures of README.md and docs/ from real runs: `make pictures`, never by hand.
+
+    python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
+
+Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about the first, and how particles came
+there.  Of docs/tour.md's commands, where they have been run: the pictures that they left.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+
+from posefilter.data.frames import Sample
+from posefilter.data.generate import generate
+from posefilter.data.meshes import MeshStore
+from posefilter.data.readers import open_reader
+from posefilter.errors import UserError
+from posefilter.metrics.errors import add
+from posefilter.models.base import PoseEstimator
+from posefilter.pictures.belief import draw_belief
+from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, rasterise, strip, whole
+from posefilter.pictures.cloud import draw_strip
+from posefilter.pictures.overlay import Shape, axes_legend, overlay
+from posefilter.run.machine import settle
+from posefilter.run.method import method_of, read_checkpoint
+from posefilter.run.predict import as_batch
+from posefilter.run.train import quiet
+from posefilter.types import Batch, Trace
+
+HOME = Path(__file__).parents[1]
+SEED, FRAMES = 20_000_101, 6  # of the rendered scenes: a seed that no training uses, and a scene a frame
+WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
+TOUR = {  # what docs/tour.md shows -> what its commands leave
+    "tour_scenes": "scenes/preview.png",
+    "tour_check": "check/contact_sheet.png",
+    "tour_train": "run/figures/validation_overlays.png",
+    "tour_predict": "prediction/belief.png",
+}
+BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+
+
+class Found(NamedTuple):
+    """What the filter made of one frame."""
+
+    sample: Sample
+    batch: Batch
+    trace: Trace
+
+
+def main() -> int:
+    """Make all that can be made; say what was left as it is, and why."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--checkpoint", type=Path, default=HOME / "weights" / "003_cracker_box.ckpt")
+    parser.add_argument("--scenes", type=Path, help="rendered frames in the FAT format (default: docs/scenes/<object>)")
+    parser.add_argument("--meshes", default="builtin", help="to render scenes from, where there are none yet")
+    parser.add_argument("--tour", type=Path, default=Path("outputs/tour"), help="where docs/tour.md's commands wrote")
+    parser.add_argument("--out", type=Path, default=HOME / "docs" / "pictures")
+    said = parser.parse_args()
+    try:
+        of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
+        of_tour(said.tour, said.out)
+    except UserError as error:
+        print(f"make_pictures: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path) -> None:
+    """Write predictions.jpg, belief.jpg and particles.jpg."""
+    quiet()
+    settle(None, 0)
+    kept = read_checkpoint(checkpoint)
+    method = method_of(kept)
+    name = method.model.name
+    scenes = scenes or HOME / "docs" / "scenes" / name
+    if not scenes.is_dir():
+        generate(scenes, FRAMES, meshes=meshes, object=name, seed=SEED, size=(320, 240), frames_per_scene=1, workers=1)
+    store = MeshStore(meshes)
+    shape: Shape = store.load(name) if name in store.names() else method.model.hull
+    found = list(run(method, kept["recipe"]["settings"]["data"], scenes, name))
+    write(out / "predictions.jpg", predictions(found, method, shape))
+    first, K = found[0].sample, found[0].sample.intrinsics
+    title = f"Belief about the first image, {len(found[0].trace.belief.log_weights[0])} particles"
+    args = (found[0].trace.belief, method.model, first.rgb, K, first.camera_from_object, title)
+    write(out / "belief.jpg", picture(draw_belief(*args)))
+    title = "Particles over the filter's iterations, first image"
+    write(out / "particles.jpg", draw_strip(first.rgb, K, found[0].trace, 0, method.space, title))
+
+
+def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:
+    """Yield what the filter makes of each frame of a folder of scenes; the frames are of the size that it was trained on."""
+    reader = open_reader("scenes", scenes, name)
+    for i in range(len(reader.records())):
+        sample = reader.read(i)
+        width = data.get("image_width") or sample.rgb.shape[1]
+        if sample.rgb.shape[1] != width:
+            raise UserError(f"{scenes}: frames are {sample.rgb.shape[1]} pixels wide, but the filter takes {width}")
+        K = torch.from_numpy(sample.intrinsics).double()
+        batch = as_batch(sample.rgb, sample.depth, K, *sample.depth.shape)
+        method.seed = 0
+        with torch.no_grad():
+            yield Found(sample, batch, method.predict_step(batch, 0))
+
+
+def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.ndarray:
+    """Draw estimate and truth in every frame, with the error; none is left out."""
+    tiles = []
+    for sample, _, trace in found:
+        height, width = sample.mask.shape
+        truth = torch.from_numpy(sample.camera_from_object)[None]
+        error = 1000 * float(add(trace.belief.best, truth, method.model.points)[0])
+        view = whole(height, width, 460)
+        pose = trace.belief.best[0].double().numpy()
+        drawn = overlay(sample.rgb, sample.intrinsics, pose, shape, view, truth=sample.camera_from_object)
+        tiles.append(np.concatenate([drawn, strip(460, f"ADD {error:.1f} mm")]))
+    sheet = grid(tiles, 3)
+    legend = [("truth", TRUTH), ("estimate", ESTIMATE), *axes_legend()]
+    return np.concatenate(
+        [strip(sheet.shape[1], f"{method.model.name}: {len(found)} scenes that no training saw", legend), sheet]
+    )
+
+
+def of_tour(tour: Path, out: Path) -> None:
+    """Write what the tour's commands left; a report's first screen needs a Chromium."""
+    for name, source in TOUR.items():
+        if (tour / source).is_file():
+            write(out / f"{name}.jpg", np.asarray(Image.open(tour / source).convert("RGB")))
+        else:
+            print(f"left as it is: {name}.jpg (no {tour / source}: run the commands of docs/tour.md, or make tour)")
+    page = tour / "run" / "report" / "report.html"
+    if BROWSER is None or not page.is_file():
+        reason = f"no {page}" if BROWSER else "no Chromium is installed"
+        print(f"left as it is: tour_report.jpg ({reason})")
+    else:
+        write(out / "tour_report.jpg", np.concatenate([screen(page, dark=False), screen(page, dark=True)], axis=1))
+
+
+def screen(page: Path, dark: bool) -> np.ndarray:
+    """Return a page's first screen as a browser shows it."""
+    with tempfile.TemporaryDirectory() as folder:
+        shot = Path(folder) / "shot.png"
+        command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+                   "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
+                   f"--user-data-dir={folder}/profile", f"--screenshot={shot}", "--window-size=900,1100",
+                   *(["--blink-settings=preferredColorScheme=0"] if dark else []), page.resolve().as_uri()]  # fmt: skip
+        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        return np.asarray(Image.open(shot).convert("RGB"))
+
+
+def picture(drawn: object) -> np.ndarray:
+    """Return a figure of either kind as a picture."""
+    return drawn if isinstance(drawn, np.ndarray) else rasterise(drawn)  # type: ignore[arg-type]
+
+
+def write(path: Path, content: np.ndarray) -> None:
+    """Write a JPEG, made smaller where it is wide."""
+    image = Image.fromarray(content)
+    image.thumbnail((WIDTH, 4 * WIDTH), Image.Resampling.LANCZOS)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image.save(path, quality=QUALITY, optimize=True, progressive=True)
+    print(f"{path} ({path.stat().st_size / 1000:.0f} kB)")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""`make pictures`: what it draws of a checkpoint and of the tour, and what it says where something is not there."""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from posefilter.data.generate import generate
+from posefilter.pictures.canvas import TRUTH
+from posefilter.run.train import train
+
+HOME = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    """Return docs/make_pictures.py."""
+    spec = importlib.util.spec_from_file_location("make_pictures", HOME / "docs" / "make_pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_a_checkpoint_is_pictured(script: ModuleType, tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """Every scene has its tile with the truth's outline in it; the belief and the particles have theirs."""
+    train(tiny_job(tmp_path / "run", "trainer.max_steps=1", "trainer.val_check_interval=1", "data.limit_test=1"))
+    few = (1, 1)
+    size = (160, 120)
+    generate(
+        tmp_path / "scenes",
+        2,
+        object="carton",
+        seed=5,
+        workers=1,
+        size=size,
+        distractors=few,
+        frames_per_scene=1,
+        progress=False,
+    )
+    out = tmp_path / "pictures"
+    script.of_checkpoint(tmp_path / "run" / "checkpoints" / "best.ckpt", tmp_path / "scenes", "builtin", out)
+    shown = np.asarray(Image.open(out / "predictions.jpg").convert("RGB")).astype(int)
+    green = np.abs(shown - TRUTH).max(2) < 40
+    tile = shown.shape[1] // 2
+    assert green[60:, :tile].sum() > 100
+    assert green[60:, tile:].sum() > 100
+    for name in ("belief", "particles"):
+        assert np.asarray(Image.open(out / f"{name}.jpg")).std() > 10
+
+
+def test_the_tour_is_pictured_as_far_as_it_was_run(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A picture that is there becomes a smaller JPEG; the others are named."""
+    (tmp_path / "tour" / "check").mkdir(parents=True)
+    Image.fromarray(np.full((300, 2800, 3), (200, 30, 90), np.uint8)).save(tmp_path / "tour" / "check" / "contact_sheet.png")
+    script.of_tour(tmp_path / "tour", tmp_path / "out")
+    shown = Image.open(tmp_path / "out" / "tour_check.jpg")
+    assert shown.size == (script.WIDTH, 150)
+    assert np.abs(np.asarray(shown).astype(int) - (200, 30, 90)).max() < 6
+    said = capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["tour_check.jpg"]
+    for name in ("tour_scenes", "tour_train", "tour_predict", "tour_report"):
+        assert f"left as it is: {name}.jpg" in said
+
+
+def test_mistakes_are_one_line(script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr("sys.argv", ["make_pictures.py", "--checkpoint", str(tmp_path / "none.ckpt")])
+    assert script.main() == 2
+    assert capsys.readouterr().err.startswith(f"make_pictures: checkpoint={tmp_path / 'none.ckpt'}")
+
+
+def test_committed_scenes_tell_nothing_of_the_machine_that_made_them() -> None:
+    """They can be read without their meshes, and hold no folder's name."""
+    for path in (HOME / "docs" / "scenes").rglob("*.json"):
+        assert "/" not in json.dumps(json.loads(path.read_text())), path
