@@ -29,6 +29,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "at an edge %": lambda m: 100 * m["signs"]["near_edge"][-1],
     "AUROC": lambda m: m["signs"]["auroc"],
     "s / image": lambda m: m["seconds_per_image"],
+    "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root")  # change no result

@@ -46,6 +46,9 @@ def test_a_run_leaves_what_was_promised(trained: Path) -> None:
     assert set(metrics["add"]) == set(metrics["add_s"]) == {"auc", "recall_01d", "recall_2cm", "median_mm"}
     assert {"iou", "particles_on_object", "seconds_per_image", "belief", "data", "git", "versions"} <= set(metrics)
     assert "debug=smoke" in metrics["overrides"]
+    assert metrics["training"]["steps"] == 8
+    assert metrics["training"]["seconds_per_step"] > 0
+    assert metrics["training"]["cpu_seconds_per_step"] > 0
 
 
 def test_checkpoints_are_plain_data(trained: Path) -> None:

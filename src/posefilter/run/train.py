@@ -2,6 +2,7 @@
 
 import json
 import logging
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -41,17 +42,33 @@ def train(job: Job) -> float:
     method.adopt(data.object_model(0))
     trainer = build_trainer(job)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
-    trainer.fit(method, datamodule=data, ckpt_path=start_from(job), weights_only=True)
+    start = start_from(job)
+    before = int(read_checkpoint(start)["global_step"]) if start else 0
+    began = time.perf_counter(), time.process_time()
+    trainer.fit(method, datamodule=data, ckpt_path=start, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
+    training = cost(trainer.global_step, before, *began)
     best = job.folder / "checkpoints" / "best.ckpt"
     results = test(trainer, data, best)
-    metrics = record(results, job, data.describe(), best)
+    metrics = record(results, job, data.describe(), best) | {"training": training}
     write_json(job.folder / "metrics.json", metrics)
     files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
     following = [] if job.swept else [typed("report", run=job.folder), typed("evaluate", checkpoint=best), "make board"]
     show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console, "trained", files, following)
     return score(metrics)
+
+
+def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | None]:
+    """Return what a step of training took, validations included: by the clock, and of this process's own processor time.
+
+    before: steps that an earlier start had done; wall, cpu: the two clocks when this one began [s]. The processor time says
+    what a run costs where others compute beside it; it is the sum over threads, without the loader's workers.
+    """
+    done = steps - before
+    each = (time.perf_counter() - wall, time.process_time() - cpu)
+    seconds, cpu_seconds = (spent / done if done > 0 else None for spent in each)
+    return {"steps": steps, "seconds_per_step": seconds, "cpu_seconds_per_step": cpu_seconds}
 
 
 def build_data(node: DictConfig, console: str) -> PoseDataModule:
