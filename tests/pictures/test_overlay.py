@@ -11,7 +11,7 @@ from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.pictures.canvas import AXES, ESTIMATE, TRUTH, View, close_up, whole
-from posefilter.pictures.overlay import draw_overlay, outline, silhouette, view_of_poses
+from posefilter.pictures.overlay import draw_overlay, outline, outlines_of, silhouette, view_of_poses
 
 H, W = 120, 160
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
@@ -119,3 +119,10 @@ def test_close_up_holds_what_it_should(carton: Mesh) -> None:
         assert (place < [view.width, view.height]).all()
     assert view.scale > 3.5  # and enlarges
     assert close_up(np.array([[-500.0, -500.0], [900.0, 900.0]]), H, W, 480) == whole(H, W, 480)
+
+
+def test_a_coarse_outline_misses_the_fine_one_by_its_coarseness_at_most(carton: Mesh) -> None:
+    fine, coarse = (np.concatenate(outlines_of(pose(), carton, K * [[4], [4], [1]], 480, 640, c)) for c in (1, 3))
+    far = np.linalg.norm(coarse[:, None] - fine[None], axis=-1).min(1)
+    assert far.max() <= 3
+    assert np.abs(coarse.mean(0) - fine.mean(0)).max() < 5  # no corner is lost, and nothing is shifted

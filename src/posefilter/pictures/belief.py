@@ -139,6 +139,7 @@ def draw_centres(
     axes.scatter([at(best)[0]], [at(best)[1]], s=180, marker="s", facecolors="none", edgecolors=[_BEST], linewidths=2)
     left, top, right, bottom = window(dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2])
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u [px]", ylabel="v [px]")
+    axes.locator_params(nbins=4)
     axes.set_title("Centres on the photograph", fontsize=11)
 
 
@@ -206,7 +207,8 @@ def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[f
     margin = max(0.3 * (high - low), 1e-2)
     low, high = min(low - margin, *marks), max(high + margin, *marks)
     pad = 0.02 * (high - low)
-    axes.hist(values, bins=np.linspace(low - pad, high + pad, bins + 1).tolist(), weights=weights, color=_MASS)
+    mass, edges = np.histogram(values, np.linspace(low - pad, high + pad, bins + 1), weights=weights)
+    axes.stairs(mass, edges, fill=True, color=_MASS)  # one patch: bars of their own take ten times as long
     for value, colour, style in zip(marks, (_BEST, _TRUE), ("-", "--"), strict=False):
         axes.axvline(value, color=colour, linestyle=style, linewidth=1.8)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
@@ -214,6 +216,7 @@ def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[f
         said = axes.text(0.98, 0.96, f"{beyond:.1%} beyond", transform=axes.transAxes, ha="right", va="top", fontsize=8)
         said.set_bbox({"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1})
     axes.set_xlim(low - pad, high + pad)
-    axes.margins(y=0.15)
+    axes.set_ylim(0, 1.15 * max(float(mass.max()), 1e-6))
+    axes.locator_params(nbins=4)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)

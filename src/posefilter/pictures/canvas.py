@@ -87,12 +87,15 @@ def close_up(points: np.ndarray, height: int, width: int, shown: int, margin: fl
     return View(float(corner[0]), float(corner[1]), scale, shown, round(float(size[1]) * scale))
 
 
-def draw_lines(picture: np.ndarray, paths: Sequence[np.ndarray], colour: Colour, width: int, closed: bool = False) -> None:
+def draw_lines(
+    picture: np.ndarray, paths: Sequence[np.ndarray], colour: Colour, width: int, closed: bool = False, halo: bool = True
+) -> None:
     """Draw anti-aliased lines, with a dark halo so that they show on any ground.  paths: each (P, 2) [px]."""
     fixed = [np.round(np.clip(path, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(np.int32) for path in paths if len(path) > 1]
     if not fixed:
         return
-    cv2.polylines(picture, fixed, closed, _HALO, width + 2, cv2.LINE_AA, _SHIFT)
+    if halo:
+        cv2.polylines(picture, fixed, closed, _HALO, width + 2, cv2.LINE_AA, _SHIFT)
     cv2.polylines(picture, fixed, closed, colour, width, cv2.LINE_AA, _SHIFT)
 
 

@@ -100,7 +100,7 @@ def draw_strip(
 
 def headed(tile: np.ndarray, caption: str) -> np.ndarray:
     """Put a caption above a tile."""
-    return np.concatenate([strip(tile.shape[1], caption, size=16), tile])
+    return np.concatenate([strip(tile.shape[1], caption, size=14), tile])
 
 
 def caption_of(trace: Trace, image: int, number: int, unit: str) -> str:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from posefilter.pictures.canvas import new_figure
+from posefilter.pictures.canvas import Colour, grid, strip
+from posefilter.pictures.panels import Axis, curve_panel
 
 _TITLES = {
     "ess": ("effective particles", "share of all"),
@@ -16,32 +16,66 @@ _TITLES = {
     "sigma_px": ("noise level", "px"),
     "best_log_likelihood": ("best log-likelihood", "nat"),
 }
-_LINE = "#2b6cb0"
+_LINE: Colour = (43, 108, 176)
+_WIDTH, _HEIGHT = 270, 150  # [px] of a plot
 
 
-def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health") -> Figure:
+def in_unit(name: str, values: Sequence[float]) -> np.ndarray:
+    """Return numbers in the unit that their panel is labelled with."""
+    unit = _TITLES.get(name, ("", ""))[1]
+    return np.asarray(values, float) * {"mm": 1000, "degrees": 180 / np.pi}.get(unit, 1)
+
+
+def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health") -> np.ndarray:
     """Draw how the filter fares over its iterations, one panel a quantity.
 
     curves: by name, one number an iteration, means over `images` images; units as the names' endings say.
     """
-    figure = new_figure(1000, 560)
-    columns = 3
-    rows = -(-len(curves) // columns)
-    spacing = {"left": 0.07, "right": 0.98, "bottom": 0.1, "top": 0.86, "hspace": 0.55, "wspace": 0.3}
-    panels = figure.subplots(rows, columns, squeeze=False, gridspec_kw=spacing)
-    for axes, (name, values) in zip(panels.flat, curves.items(), strict=False):
+    panels = []
+    for name, values in curves.items():
         label, unit = _TITLES.get(name, (name.replace("_", " "), ""))
-        shown = np.asarray(values, float) * {"mm": 1000, "degrees": 180 / np.pi}.get(unit, 1)
-        axes.plot(np.arange(len(shown)), shown, "o-", color=_LINE, markersize=3.5, linewidth=1.6)
-        axes.set(title=label, ylabel=unit, xlabel="iteration")
-        if name == "ess":
-            axes.set_ylim(0, 1)
-        elif len(shown) and np.isfinite(shown).all() and shown.min() >= 0 and not name.startswith("best"):
-            axes.set_ylim(0, max(float(shown.max()) * 1.08, 1e-9))
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    for axes in panels.flat[len(curves) :]:
-        axes.set_axis_off()
-    figure.suptitle(f"{title}: means over {images} image{'s' * (images != 1)}", fontsize=14, x=0.02, ha="left")
-    return figure
+        shown = in_unit(name, values)
+        places = np.arange(len(shown), dtype=float)
+        low, high = bounds(name, shown)
+        y = Axis(unit, low, high, even_ticks(low, high))
+        panels.append(curve_panel([(shown, _LINE)], places, iterations(len(shown)), y, label, _WIDTH, _HEIGHT))
+    sheet = grid(panels, 3)
+    said = f"{title}: means over {images} image{'s' * (images != 1)}"
+    return np.concatenate([strip(sheet.shape[1], said, size=20), sheet])
+
+
+def draw_shares(curves: Mapping[str, tuple[Sequence[float], Colour]], title: str, foot: str) -> np.ndarray:
+    """Draw shares of the particles over the iterations, in percent, in one panel.  curves: numbers in [0, 1], a colour."""
+    count = max(len(values) for values, _ in curves.values())
+    lines = [(100 * np.asarray(values, float), colour) for values, colour in curves.values()]
+    y = Axis("share of the particles [%]", -2, 102, (0, 25, 50, 75, 100))
+    panel = curve_panel(lines, np.arange(count, dtype=float), iterations(count), y, "", 620, 320)
+    legend = [(name.replace("_", " "), colour) for name, (_, colour) in curves.items()]
+    width = panel.shape[1]
+    return np.concatenate([strip(width, title, size=20), panel, strip(width, "", legend), strip(width, foot)])
+
+
+def iterations(count: int) -> Axis:
+    """Return the axis of `count` iterations, marked in whole numbers."""
+    step = max(1, -(-(count - 1) // 6))
+    return Axis("iteration", -0.3, max(count - 0.7, 0.7), tuple(range(0, count, step)))
+
+
+def bounds(name: str, shown: np.ndarray) -> tuple[float, float]:
+    """Return where a panel ends: shares at 0 and 1, sizes at 0, the rest a little beyond its numbers."""
+    good = shown[np.isfinite(shown)]
+    if name == "ess" or not len(good):
+        return 0.0, 1.0
+    low, high = float(good.min()), float(good.max())
+    if low >= 0 and not name.startswith("best"):
+        return 0.0, max(high * 1.08, 1e-9)
+    pad = max(0.08 * (high - low), 1e-6)
+    return low - pad, high + pad
+
+
+def even_ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
+    """Return round numbers, evenly spaced, within bounds."""
+    rough = (high - low) / most
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * (1 - 1e-9))
+    return tuple(float(round(i * step, 12)) for i in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1))

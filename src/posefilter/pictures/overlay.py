@@ -58,13 +58,17 @@ def overlay(
     view: View,
     colour: Colour = ESTIMATE,
     truth: np.ndarray | None = None,
+    coarse: int = 1,
 ) -> np.ndarray:
-    """Return the same without writing, of the part of the photograph that `view` shows."""
+    """Return the same without writing, of the part of the photograph that `view` shows.
+
+    coarse: pixels that a mesh's outline may miss its silhouette by; rays are cast that much more sparsely.
+    """
     picture = view.show(rgb)
     shown = view.camera(K)
     if truth is not None:
-        draw_pose(picture, shown, np.asarray(truth, np.float64), shape, TRUTH)
-    draw_pose(picture, shown, np.asarray(pose, np.float64), shape, colour)
+        draw_pose(picture, shown, np.asarray(truth, np.float64), shape, TRUTH, coarse=coarse)
+    draw_pose(picture, shown, np.asarray(pose, np.float64), shape, colour, coarse=coarse)
     return picture
 
 
@@ -85,11 +89,13 @@ def axes_legend() -> list[tuple[str, Colour]]:
     return list(zip("xyz", AXES, strict=True))
 
 
-def draw_pose(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2) -> None:
+def draw_pose(
+    picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2, coarse: int = 1
+) -> None:
     """Draw a pose's outline and axes into a picture, in place.  Poses that are not finite draw nothing."""
     if not np.isfinite(pose).all():
         return
-    draw_lines(picture, outlines_of(pose, shape, K, *picture.shape[:2]), colour, width, closed=True)
+    draw_lines(picture, outlines_of(pose, shape, K, *picture.shape[:2], coarse), colour, width, closed=True)
     draw_axes(picture, K, pose, shape, colour, width)
 
 
@@ -109,10 +115,12 @@ def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape
         draw_dots(picture, pixels[[axis + 1]], np.array([colour]), width + 1)
 
 
-def outlines_of(pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, width: int) -> list[np.ndarray]:
+def outlines_of(pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, width: int, coarse: int = 1) -> list[np.ndarray]:
     """Return the closed lines round the object: a mesh's silhouette, or the projected hull.  -> each (P, 2) [px]."""
     if isinstance(shape, Mesh):
-        return outline(silhouette(shape, pose, K, height, width))
+        view = View(-0.5, -0.5, 1 / coarse, -(-width // coarse), -(-height // coarse))
+        found = outline(silhouette(shape, pose, view.camera(K), view.height, view.width))
+        return [(line + 0.5) * coarse - 0.5 for line in found]
     camera = _before_camera(vertices_of(shape) @ pose[:3, :3].T + pose[:3, 3])
     if len(camera) < 3:
         return []

@@ -1,0 +1,196 @@
+"""A short film of the filter at work, and its particles' silhouettes: clouds of poses or of pixels, from one to the next."""
+
+from collections.abc import Iterator, Sequence
+from io import BytesIO
+
+import cv2
+import numpy as np
+import torch
+from matplotlib import colormaps
+from PIL import Image
+
+from posefilter.contracts import Space
+from posefilter.geometry.camera import project
+from posefilter.geometry.pose import origin_of, transform
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.pictures.canvas import INK, PAPER, TRUTH, View, close_up, draw_dots, draw_lines, grid, strip, whole
+from posefilter.pictures.cloud import (
+    caption_of,
+    faded,
+    headed,
+    spread_choice,
+    steps_shown,
+    weight_colours,
+    weight_scale,
+    weights_of,
+)
+from posefilter.pictures.panels import beside, flat_bar
+from posefilter.types import Trace
+
+_LINE = (255, 225, 120)
+# colours that a film's palette must have, however few of its pixels show them: weights, lines, writing
+_KEPT = np.concatenate(
+    [colormaps["plasma"](np.linspace(0, 1, 20))[:, :3] * 255, [TRUTH, _LINE, INK, PAPER, (150, 152, 156)]]
+)
+
+
+def hulls_on_image(poses: torch.Tensor, hull: torch.Tensor, K: np.ndarray) -> np.ndarray:
+    """Return where poses put the points of a convex hull.  (N, 4, 4), (V, 3) [m], (3, 3) -> (N, V, 2) [px].
+
+    Not a number where any of a pose's points lies behind the camera: its outline means nothing.
+    """
+    points = transform(poses, hull.to(poses))
+    pixels = project(points, torch.as_tensor(np.asarray(K)).to(poses))
+    behind = (points[..., 2] < 0.01).any(1)
+    return torch.where(behind[:, None, None], torch.nan, pixels).numpy()
+
+
+def outlines(pixels: np.ndarray) -> list[np.ndarray]:
+    """Return the convex outline of each pose's points, none where these are not numbers.  (N, V, 2) -> each (P, 2)."""
+    return [cv2.convexHull(one.astype(np.float32))[:, 0] for one in pixels if one.size and np.isfinite(one).all()]
+
+
+def coverage(pixels: np.ndarray, weights: np.ndarray, view: View) -> np.ndarray:
+    """Return the weight of the poses whose silhouette covers each shown pixel.  (N, V, 2) [px], (N,) -> (h, w) float32."""
+    total = np.zeros((view.height, view.width), np.float32)
+    for one, weight in zip(pixels, weights, strict=True):
+        if np.isfinite(one).all():
+            layer = np.zeros(total.shape, np.uint8)
+            cv2.fillConvexPoly(layer, cv2.convexHull(np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)), 1)
+            total += float(weight) * layer
+    return total
+
+
+def draw_silhouettes(
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, hull: torch.Tensor, truth: np.ndarray, title: str, width: int = 300
+) -> np.ndarray:
+    """Draw where the poses of one image put the object, at four of the filter's steps: on the frame, and close up.
+
+    trace: of one image. Colour is the weight of the particles whose silhouette covers a pixel; lines are some outlines.
+    """
+    height, wide = rgb.shape[:2]
+    steps = steps_shown(len(trace.clouds), 4)
+    places = torch.as_tensor(np.asarray(truth))[None]
+    true = hulls_on_image(places, hull, K)
+    frame = whole(height, wide, width)
+    near = close_up(true[0], height, wide, width, margin=0.4) if np.isfinite(true).all() else frame
+    rows: list[list[np.ndarray]] = [[], []]
+    for number in steps:
+        weights = weights_of(trace.clouds[number], 0)
+        chosen = trace.clouds[number].state[0].detach().cpu().double()[spread_choice(weights, 64)]
+        pixels = hulls_on_image(chosen, hull, K)
+        for row, view in zip(rows, (frame, near), strict=True):
+            share = coverage(pixels, np.full(len(pixels), 1 / len(pixels)), view)
+            picture = cover(faded(view.show(rgb), 0.6), share)
+            draw_lines(picture, [view.place(line) for line in outlines(pixels[::4])], _LINE, 1, closed=True, halo=False)
+            draw_lines(picture, [view.place(line) for line in outlines(true)], TRUTH, 2, closed=True)
+            row.append(picture)
+        rows[0][-1] = headed(rows[0][-1], caption_of(trace, 0, number, "mm").partition(",")[0])
+    sheet = grid([*rows[0], *rows[1]], 4)
+    legend = strip(420, "", [("true outline", TRUTH), ("outlines of 16 particles", _LINE)])
+    foot = beside([flat_bar("weight that covers the pixel", "0", "1", "plasma"), legend], sheet.shape[1])
+    return np.concatenate([strip(sheet.shape[1], title, size=20), sheet, foot])
+
+
+def cover(picture: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return a picture under a map (h, w) in [0, 1], the more opaque the higher."""
+    paint = colormaps["plasma"](np.clip(share, 0, 1))[..., :3] * 255
+    opacity = 0.75 * np.clip(share * 2, 0, 1)[..., None]
+    return np.asarray(picture * (1 - opacity) + paint * opacity).round().astype(np.uint8)
+
+
+class Film:
+    """A film of one image's particles, from each cloud to the next.
+
+    rgb (H, W, 3) uint8; K (3, 3) [px]; trace: of one image; hull (V, 3) [m]; target: lines round the true object [px].
+    Pixels are dots, coloured by weight. Poses are outlines of some and the centres of all, on the frame and, beside it,
+    close up.
+    """
+
+    def __init__(
+        self,
+        rgb: np.ndarray,
+        K: np.ndarray,
+        trace: Trace,
+        space: Space,
+        hull: torch.Tensor,
+        target: Sequence[np.ndarray],
+        title: str = "The filter at work",
+    ) -> None:
+        self.camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
+        self.trace, self.space, self.hull, self.target = trace, space, hull, target
+        height, wide = rgb.shape[:2]
+        self.posed = isinstance(space, PoseSpace)
+        self.views = [whole(height, wide, 320 if self.posed else 480)]
+        if self.posed and target:
+            self.views.append(close_up(np.concatenate(list(target)), height, wide, 320, margin=0.4))
+        self.grounds = [faded(view.show(rgb), 0.5) for view in self.views]
+        width = sum(view.width for view in self.views)
+        legend = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
+        self.head = strip(width, title, size=14 if width > 600 else 13)
+        self.foot = np.concatenate([strip(width, "", legend, size=13), weight_scale(width, [], 13)])
+
+    def frames(self, between: int = 2) -> Iterator[np.ndarray]:
+        """Yield the pictures, `between` of them from each cloud to the next."""
+        for number, cloud in enumerate(self.trace.clouds):
+            weights = weights_of(cloud, 0)
+            few = spread_choice(weights, 24).unique()
+            parents = cloud.ancestors[0].cpu()
+            ends = self.drawn(number, torch.arange(len(weights)), few)
+            starts = self.drawn(number - 1, parents, parents[few]) if number else ends
+            told = caption_of(self.trace, 0, number, "mm" if self.posed else "px").partition(",")[0]
+            caption = told.replace(":", f" of {len(self.trace.clouds) - 1}:", 1)
+            for k in range(between if number else 1):
+                share = (k + 1) / between
+                dots, lines = (a + share * (b - a) for a, b in zip(starts, ends, strict=True))
+                yield self.frame(dots, lines, weights.numpy(), caption)
+
+    def drawn(self, number: int, dots: torch.Tensor, lines: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return chosen particles' dots (N, 2), and the corners of others' outlines (n, V, 2), none for pixels.  [px]"""
+        state = self.trace.clouds[number].state[0].detach().cpu().double()
+        if not isinstance(self.space, PoseSpace):
+            return state[dots].numpy(), np.zeros((len(lines), 0, 2))
+        center = torch.tensor(self.space.center, dtype=torch.float64)
+        corners = hulls_on_image(state[lines], self.hull, self.camera.numpy())
+        return project(origin_of(state[dots], center), self.camera).numpy(), corners
+
+    def frame(self, dots: np.ndarray, corners: np.ndarray, weights: np.ndarray, caption: str) -> np.ndarray:
+        """Draw one picture."""
+        order = np.argsort(weights, kind="stable")
+        colours = weight_colours(weights)[order]
+        parts = []
+        for view, ground in zip(self.views, self.grounds, strict=True):
+            picture = ground.copy()
+            draw_dots(picture, view.place(dots[order]), colours, 2 if self.posed else 3)
+            draw_lines(picture, [view.place(x) for x in outlines(corners)], _LINE, 1, closed=True, halo=False)
+            draw_lines(picture, [view.place(x) for x in self.target], TRUTH, 2, closed=True)
+            parts.append(picture)
+        return np.concatenate([self.head, headed(beside(parts), caption), self.foot])
+
+
+def to_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500, colours: int = 120) -> bytes:
+    """Return frames as an animated GIF that loops, the one film that TensorBoard plays; the last is held."""
+    ground = Image.fromarray(frames[-1]).quantize(colours - len(_KEPT), Image.Quantize.MEDIANCUT).getpalette() or []
+    palette = np.concatenate([_KEPT, np.reshape(ground, (-1, 3))[: colours - len(_KEPT)]]).astype(np.uint8)
+    palette = np.pad(palette, ((0, colours - len(palette)), (0, 0)))
+    table = nearest_colours(palette)
+    indexed = [table[tuple((frame >> 3).transpose(2, 0, 1))] for frame in frames]
+    images = []
+    for before, frame in zip([None, *indexed[:-1]], indexed, strict=True):
+        kept = frame if before is None else np.where(frame == before, np.uint8(colours), frame)  # `colours`: see-through
+        images.append(Image.fromarray(kept, "P"))
+        images[-1].putpalette(palette.tobytes())
+    durations = [milliseconds] * (len(frames) - 1) + [hold]
+    stream = BytesIO()
+    save = {"duration": durations, "loop": 0, "transparency": colours, "disposal": 1, "optimize": False}
+    images[0].save(stream, "GIF", save_all=True, append_images=images[1:], **save)
+    return stream.getvalue()
+
+
+def nearest_colours(palette: np.ndarray) -> np.ndarray:
+    """Return which of at most 255 colours (P, 3) is nearest to each colour of 5 bits a channel.  -> (32, 32, 32) uint8."""
+    line = np.arange(32, dtype=np.float32) * 8 + 4
+    places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
+    own = palette.astype(np.float32)
+    far = (own * own).sum(1) - 2 * places @ own.T  # less the place's own square, which is the same for all
+    return far.argmin(1).astype(np.uint8).reshape(32, 32, 32)

@@ -1,0 +1,109 @@
+"""Draw what a network says of every cell of an image: where the object is, which of its points, and where to look."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from posefilter.pictures.canvas import TRUTH, Colour, View, draw_dots, draw_lines, grid, strip, whole
+from posefilter.pictures.cloud import draw_cloud, draw_many_axes, headed, weight_scale
+from posefilter.pictures.overlay import Shape, axes_legend, outline, outlines_of
+from posefilter.pictures.panels import beside, colours, flat_bar
+
+_TILE = 480  # [px]
+_PROPOSED: Colour = (255, 190, 40)
+
+
+class Proposals(NamedTuple):
+    """What the proposal network makes of one image of h x w cells, and what would have been right."""
+
+    chance: np.ndarray  # (h, w) that the cell shows the object
+    coordinates: np.ndarray  # (h, w, 3) object point, from the object's centre, over its radius
+    true: np.ndarray  # (h, w, 3) the same as the depth and the true pose have it
+    on: np.ndarray  # (h, w) bool, where that is the object
+    axes: np.ndarray  # (M, 4, 2) [px] centre and ends of the axes of poses drawn from it
+    error: float  # mean distance of `coordinates` from `true` where `on` [m], NaN where nothing is
+
+
+def draw_proposals(
+    said: Proposals, rgb: np.ndarray, K: np.ndarray, truth: np.ndarray, shape: Shape, radius: float, title: str
+) -> np.ndarray:
+    """Draw the chance map, the object's points as colours beside the true ones, and poses drawn from them."""
+    view = whole(*rgb.shape[:2], _TILE)
+    edge = outlines_of(truth, shape, view.camera(K), view.height, view.width)
+    chance = heat_over(rgb, said.chance, view)
+    draw_lines(chance, edge, TRUTH, 2, closed=True)
+    drawn = view.finer(2).show(rgb)
+    draw_many_axes(drawn, view.finer(2).place(said.axes), 0.8)
+    draw_dots(drawn, view.finer(2).place(said.axes[:, 0]), np.tile(np.array([_PROPOSED]), (len(said.axes), 1)), 5)
+    drawn = np.asarray(cv2.resize(drawn, (view.width, view.height), interpolation=cv2.INTER_AREA))
+    draw_lines(drawn, edge, TRUTH, 2, closed=True)
+    mean = f", {1000 * said.error:.0f} mm off on average" if np.isfinite(said.error) else ""
+    tiles = [
+        headed(chance, "chance of the object, and its true outline"),
+        headed(drawn, f"{len(said.axes)} poses drawn from these maps"),
+        headed(points_as_colours(said.coordinates, said.chance, view), f"predicted object points{mean}"),
+        headed(points_as_colours(said.true, said.on.astype(float), view), "true object points"),
+    ]
+    sheet = grid(tiles, 2)
+    reach = f"{1000 * radius:.0f} mm"
+    legend = [("true outline", TRUTH), ("centre of a drawn pose", _PROPOSED), *((f"axis {n}", c) for n, c in axes_legend())]
+    bars = beside(
+        [
+            flat_bar("chance", "0", "1", "magma", long=120),
+            strip(420, f"points: red, green, blue = x, y, z, -{reach} to {reach}"),
+        ],
+        sheet.shape[1],
+    )
+    return np.concatenate([strip(sheet.shape[1], title, size=20), sheet, strip(sheet.shape[1], "", legend), bars])
+
+
+def points_as_colours(points: np.ndarray, chance: np.ndarray, view: View) -> np.ndarray:
+    """Return object points (h, w, 3) in [-1, 1] as colours, the fainter the less likely the object.  -> picture."""
+    paint = (np.clip(points, -1, 1) + 1) / 2
+    share = np.clip(chance, 0, 1)[..., None]
+    cells = (255 * (paint * share + 0.13 * (1 - share))).round().astype(np.uint8)
+    return np.asarray(cv2.resize(cells, (view.width, view.height), interpolation=cv2.INTER_NEAREST))
+
+
+def heat_over(rgb: np.ndarray, values: np.ndarray, view: View, name: str = "magma") -> np.ndarray:
+    """Return a photograph in grey below a map (h, w) in [0, 1] whose cells lie evenly over it.  -> picture."""
+    ground = view.show(rgb).mean(-1, keepdims=True)
+    cells = cv2.resize(colours(values, 0, 1, name), (view.width, view.height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(0.35 * ground + 0.65 * cells).round().astype(np.uint8)
+
+
+def draw_relevance(
+    relevance: np.ndarray,
+    rgb: np.ndarray,
+    mask: np.ndarray,
+    first: tuple[np.ndarray, np.ndarray],
+    last: tuple[np.ndarray, np.ndarray],
+    title: str,
+) -> np.ndarray:
+    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last cloud: pixels (N, 2), weights (N,) each.
+
+    mask (H, W) bool: the object's visible part, whose rim is drawn.
+    """
+    view = whole(*rgb.shape[:2], _TILE - 80)
+    rim = [view.place(line) for line in outline(mask)]
+    heat = heat_over(rgb, relevance, view)
+    mean = relevance_on(relevance, mask), relevance_on(relevance, ~mask)
+    tiles = [headed(heat, f"relevance: {mean[0]:.2f} on the object, {mean[1]:.2f} elsewhere")]
+    for name, (pixels, weights) in (("first", first), ("last", last)):
+        tiles.append(headed(draw_cloud(rgb, pixels, weights, view), f"the {name} cloud"))
+    for tile in tiles:
+        draw_lines(tile[-view.height :], rim, TRUTH, 2, closed=True)
+    sheet = grid(tiles, 3)
+    bars = beside([flat_bar("relevance", "0", "1", "magma", long=120), strip(240, "", [("rim of the mask", TRUTH)])])
+    return np.concatenate(
+        [strip(sheet.shape[1], title, size=20), sheet, beside([bars], sheet.shape[1]), weight_scale(sheet.shape[1], [], 15)]
+    )
+
+
+def relevance_on(relevance: np.ndarray, mask: np.ndarray) -> float:
+    """Return the mean relevance of a mask's pixels, NaN where it has none.  (h, w), (H, W) bool."""
+    if not mask.any():
+        return float("nan")
+    full = cv2.resize(relevance.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return float(full[mask].mean())

@@ -1,0 +1,72 @@
+"""Maps over the image: colours tell the network's numbers, where the cells are."""
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter.pictures.canvas import TRUTH, whole
+from posefilter.pictures.maps import Proposals, draw_proposals, draw_relevance, heat_over, points_as_colours, relevance_on
+
+H, W = 48, 64
+RGB = np.full((H, W, 3), 100, np.uint8)
+K = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+MASK = np.zeros((H, W), bool)
+MASK[16:32, 32:48] = True
+
+
+def test_heat_is_where_its_cells_are() -> None:
+    values = np.zeros((6, 8))
+    values[2:4, 4:6] = 1.0  # cells of 8 pixels: the mask
+    heat = heat_over(RGB, values, whole(H, W, 640)).astype(int).sum(-1)
+    shown = np.kron(MASK, np.ones((10, 10))).astype(bool)
+    assert heat[shown].min() > heat[~shown].max() + 200
+
+
+def test_points_have_the_colours_of_their_axes_and_fade_with_doubt() -> None:
+    points = np.zeros((1, 3, 3))
+    points[0, 0], points[0, 1], points[0, 2] = [1, -1, -1], [-1, -1, 1], [1, 1, 1]
+    picture = points_as_colours(points, np.array([[1.0, 1.0, 0.0]]), whole(1, 3, 30))
+    assert picture[5, 5].tolist() == [255, 0, 0]
+    assert picture[5, 15].tolist() == [0, 0, 255]
+    assert picture[5, 25].max() < 40  # surely not the object
+
+
+def test_relevance_is_averaged_over_the_mask() -> None:
+    relevance = np.zeros((6, 8))
+    relevance[2:4, 4:6] = 0.8
+    assert relevance_on(relevance, MASK) == pytest.approx(0.8)
+    assert relevance_on(relevance, ~MASK) == 0
+    assert np.isnan(relevance_on(relevance, np.zeros_like(MASK)))
+
+
+def test_sheet_of_relevance_shows_map_rim_and_both_clouds() -> None:
+    relevance = np.zeros((6, 8))
+    relevance[2:4, 4:6] = 1.0
+    weights = np.full(20, 0.05)
+    start, end = np.tile([8.0, 8.0], (20, 1)), np.tile([40.0, 24.0], (20, 1))
+    sheet = draw_relevance(relevance, RGB, MASK, (start, weights), (end, weights), "relevance")
+    assert 1000 < sheet.shape[1] < 1300
+    top = int(np.nonzero((sheet == TRUTH).all(-1))[0].min()) - round(16 * 400 / 64)  # of the tiles' photographs
+    dot = lambda tile, place: sheet[top + round(place[1] * 6.25), 6 + tile * 406 + round(place[0] * 6.25)].astype(int)  # noqa: E731
+    ground = dot(1, (60.0, 44.0))
+    assert np.abs(dot(1, (8.0, 8.0)) - ground).max() > 50
+    assert np.abs(dot(2, (8.0, 8.0)) - ground).max() < 5
+    assert np.abs(dot(2, (40.0, 24.0)) - ground).max() > 50
+
+
+def test_sheet_of_proposals_shows_them_where_they_are() -> None:
+    chance = np.zeros((6, 8))
+    chance[2:4, 4:6] = 1.0
+    points = np.zeros((6, 8, 3))
+    points[2:4, 4:6] = [1.0, -1.0, -1.0]
+    axes = np.array([[[10.0, 40.0], [14.0, 40.0], [10.0, 44.0], [10.0, 36.0]]])
+    said = Proposals(chance, points, -points, chance > 0, axes, 0.012)
+    truth = np.eye(4)
+    truth[:3, 3] = [0.11, 0.0, 0.8]
+    hull = torch.tensor([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+    sheet = draw_proposals(said, RGB, K, truth, hull, 0.14, "proposals")
+    red, cyan = (sheet == (255, 0, 0)).all(-1), (sheet == (0, 255, 255)).all(-1)
+    assert red[:, :500].sum() == cyan[:, 490:].sum() == 120 * 120  # the predicted and the true points, 16 x 16 pixels
+    orange = (np.abs(sheet.astype(int) - (255, 190, 40)).max(-1) < 12)[:450, 490:]
+    assert orange.any()
+    assert abs(np.nonzero(orange)[1].mean() - 2 - 10 * 7.5) < 8
