@@ -10,12 +10,16 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from PIL import Image
+from scipy.spatial import ConvexHull
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import DataLoader
 
 from posefilter.callbacks.board import Budget
-from posefilter.callbacks.figures import Figures, errors_of
+from posefilter.callbacks.drawings import DRAWINGS
+from posefilter.callbacks.figures import Figures, looking
+from posefilter.callbacks.gallery import draw_tile, errors_of
 from posefilter.callbacks.health import FilterHealth
+from posefilter.errors import UserError
 from posefilter.filters.estimate import Mean
 from posefilter.filters.initialise import FromProposals
 from posefilter.filters.loop import ParticleFilter
@@ -28,6 +32,8 @@ from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
+from posefilter.pictures.canvas import TRUTH
+from posefilter.pictures.overlay import view_of_poses
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 H, W, IMAGES = 48, 64, 8
@@ -93,14 +99,14 @@ def validate(folder: Path, *callbacks: Any) -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures, FilterHealth]:
     folder = tmp_path_factory.mktemp("run")
-    figures, health = Figures(folder / "figures"), FilterHealth(folder / "figures")
+    figures, health = Figures(folder / "figures", best=2, worst=2), FilterHealth(folder / "figures")
     validate(folder, figures, health)
     return folder, figures, health
 
 
 def test_best_and_worst_are_the_best_and_the_worst(run: tuple[Path, Figures, FilterHealth]) -> None:
     kept = run[1]._kept
-    assert [one.frame_id for one in kept["first"]] == [0, 1, 2, 3]
+    assert [one.frame_id for one in kept["first"]] == [0, 1, 2, 3, 4]
     assert [one.frame_id for one in kept["best"]] == [0, 1]
     assert [one.frame_id for one in kept["worst"]] == [7, 6]
     assert kept["worst"][0].error == pytest.approx(0.07, abs=0.01)
@@ -110,15 +116,20 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     folder = run[0]
     board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
     board.Reload()
-    names = {"figures/overlays", "figures/particles", "figures/belief", "figures/filter_health"}
-    assert set(board.Tags()["images"]) == names
+    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "film", "filter_health"}
+    assert set(board.Tags()["images"]) == {f"figures/{name}" for name in names}
     for tag, file in (("figures/overlays", "validation_overlays"), ("figures/filter_health", "filter_health")):
         written = (folder / "figures" / f"{file}.png").read_bytes()
         assert board.Images(tag)[0].encoded_image_string == written
     with Image.open(folder / "figures" / "validation_overlays.png") as overlays:
         picture = np.asarray(overlays.convert("RGB"))
-    assert picture.shape[1] > 4 * 480
+    assert 1250 < picture.shape[1] < 1400  # five in a row
     assert (picture == 128).all(-1).mean() > 0.3  # the grey photographs
+    film = board.Images("figures/film")[0]
+    assert film.encoded_image_string == (folder / "figures" / "validation_film.gif").read_bytes()
+    with Image.open(folder / "figures" / "validation_film.gif") as moving:
+        assert moving.n_frames == 7  # four clouds, two frames from one to the next
+        assert moving.size == (film.width, film.height)
     assert board.Scalars("filter/sigma_m/step_00")[0].value == pytest.approx(0.03)
     assert board.Scalars("filter/sigma_m/step_03")[0].value == pytest.approx(0.005)
 
@@ -144,7 +155,8 @@ def test_looking_changes_nothing(tmp_path: Path) -> None:
     figures.on_validation_epoch_start(trainer, method)
     figures.on_validation_batch_end(trainer, method, trace, batch, 0)
     figures.on_validation_epoch_end(trainer, method)
-    assert len(list(tmp_path.glob("*.png"))) == 3
+    assert len(list(tmp_path.glob("*.png"))) == 6
+    assert len(list(tmp_path.glob("*.gif"))) == 1
     assert torch.equal(torch.get_rng_state(), before)
     assert (np.random.get_state()[1] == other).all()  # type: ignore[index]  # noqa: NPY002
     assert all(torch.equal(value, state[name]) for name, value in method.state_dict().items())
@@ -205,3 +217,37 @@ def test_estimates_that_are_no_numbers_are_the_worst() -> None:
     errors = errors_of(trace, batch, method, model().points)
     assert errors[0] == torch.inf
     assert errors[1] < 0.05
+
+
+def test_one_figure_alone_is_switched_off_by_its_name(tmp_path: Path) -> None:
+    assert set(Figures(without=["film", "field"]).drawings) == set(DRAWINGS) - {"film", "field"}
+    with pytest.raises(UserError, match=r"figures.without=fild: there is no such figure; there are .*field"):
+        Figures(without=["fild"])
+
+
+def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:
+    method = Told()
+    method.train()
+    method.filter.eval()
+    with looking(method):
+        assert not method.training
+        assert not torch.is_grad_enabled()
+    assert method.training
+    assert not method.filter.training
+    assert torch.is_grad_enabled()
+
+
+def test_overlays_outline_lies_on_the_mask_of_a_worst_image(run: tuple[Path, Figures, FilterHealth]) -> None:
+    worst = run[1]._kept["worst"][0]
+    tile = draw_tile(worst, model().hull, True)[-192:]
+    view = view_of_poses([worst.estimate, worst.truth], model().hull, worst.intrinsics, H, W, 256)
+    green = np.argwhere((tile == TRUTH).all(-1))[:, ::-1]
+
+    def farthest_corner(pose: np.ndarray) -> float:
+        corners = model().hull.numpy() @ pose[:3, :3].T + pose[:3, 3]
+        places = view.place(corners[:, :2] / corners[:, 2:] * 60 + [(W - 1) / 2, (H - 1) / 2])
+        outer = places[ConvexHull(places).vertices]
+        return float(np.linalg.norm(outer[:, None] - green[None], axis=-1).min(1).max())
+
+    assert farthest_corner(worst.truth) < 7  # the other outline lies over some of it; enlarged, 20 px are 1.5 cm
+    assert farthest_corner(worst.estimate) > 20  # it is 7 cm away

@@ -2,13 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from posefilter.callbacks.health import evenly, health, scalars
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.pictures.curves import draw_health
+from posefilter.pictures.curves import bounds, draw_health, even_ticks, in_unit
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 
@@ -61,11 +62,24 @@ def test_scalars_are_named_by_step() -> None:
     assert evenly(5, 1) == [4]
 
 
-def test_figure_shows_the_numbers_in_the_units_it_says() -> None:
-    figure = draw_health({"spread_m": [0.1, 0.02], "spread_rad": [math.pi, 0.0], "ess": [0.25, 0.5]}, images=3)
-    panels = {axes.get_title(): axes for axes in figure.axes}
-    assert panels["spread of the centres"].get_ylabel() == "mm"
-    assert panels["spread of the centres"].lines[0].get_ydata().tolist() == [100.0, 20.0]
-    assert panels["spread of the rotations"].lines[0].get_ydata().tolist() == pytest.approx([180.0, 0.0])
-    assert panels["effective particles"].get_ylim() == (0, 1)
-    assert figure.get_suptitle().endswith("means over 3 images")
+def test_figure_shows_the_numbers_where_its_axes_say() -> None:
+    picture = draw_health({"spread_m": [0.1, 0.02], "ess": [0.25, 0.5]}, images=3)
+    blue = (picture == (43, 108, 176)).all(-1)
+    half = picture.shape[1] // 2
+    for columns, first, last in ((slice(0, half), 100 / 108, 20 / 108), (slice(half, None), 0.25, 0.5)):
+        rows, places = np.nonzero(blue[:, columns])
+        top = len(picture) - 6 - 44 - 150  # the panels' plots are 150 pixels high, above ticks and labels
+        assert (149 - (rows[places == places.min()].mean() - top)) / 149 == pytest.approx(first, abs=0.03)
+        assert (149 - (rows[places == places.max()].mean() - top)) / 149 == pytest.approx(last, abs=0.03)
+    assert in_unit("spread_m", [0.1]).tolist() == [100.0]
+    assert in_unit("spread_rad", [math.pi]).tolist() == [180.0]
+
+
+def test_axes_hold_the_numbers_and_have_round_ticks() -> None:
+    assert bounds("ess", np.array([0.2, 0.3])) == (0.0, 1.0)
+    assert bounds("spread_m", np.array([2.0, 10.0])) == pytest.approx((0.0, 10.8))
+    low, high = bounds("best_log_likelihood", np.array([-3.0, 5.0]))
+    assert low < -3 < 5 < high
+    assert bounds("sigma_m", np.array([np.nan])) == (0.0, 1.0)
+    assert even_ticks(0.0, 10.8) == (0.0, 5.0, 10.0)
+    assert even_ticks(-3.6, 5.6) == (-2.5, 0.0, 2.5, 5.0)

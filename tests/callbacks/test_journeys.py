@@ -1,13 +1,16 @@
-"""Pictures of journeys: they must show what happened."""
+"""Journeys: who stood where, and saw what."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
-from posefilter.callbacks.journeys import journey_figure, journey_film, lineage, save_film
-from posefilter.types import Cloud
+from posefilter.callbacks.journeys import followed, glimpses_of, journey_film, lineage, save_film
+from posefilter.nets.glimpse import IntegerCut
+from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 
 def journey() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -17,14 +20,6 @@ def journey() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     end = torch.tensor([[30.0, 20.0], [58.0, 38.0], [30.0, 15.0]])
     states = torch.stack([start + s * (end - start) for s in torch.linspace(0, 1, 5)])
     return torch.full((3, 40, 60), 0.2), mask, states
-
-
-def test_figure_counts_who_arrived() -> None:
-    figure = journey_figure(*journey())
-    assert "67%" in figure.axes[0].get_title()
-    assert figure.axes[0].get_xlim()[0] > -5  # nobody left the frame, so the frame fills the axes
-    rgb, mask, states = journey()
-    assert journey_figure(rgb, mask, states - 100).axes[0].get_xlim()[0] == -30
 
 
 def test_film_moves_and_is_an_animation(tmp_path: Path) -> None:
@@ -51,3 +46,21 @@ def test_a_journey_is_a_line_of_ancestors() -> None:
         cloud([22.0, 13.0, 14.0], [2, 0, 1]),
     ]
     assert lineage(clouds)[0, :, :, 0].T.tolist() == [[20.0, 21.0, 22.0], [10.0, 11.0, 13.0], [10.0, 12.0, 14.0]]
+
+
+def test_the_heaviest_are_followed_and_what_they_saw_is_what_is_there() -> None:
+    state = torch.tensor([[[2.0, 3.0], [10.0, 5.0], [20.0, 8.0]]])
+    weights = torch.tensor([[0.05, 0.05, 0.9]]).log()
+    cloud = Cloud(state, torch.zeros(1, 3, 0), weights, torch.tensor([[0, 1, 2]]))
+    reading = Reading(weights, torch.zeros(1, 3, 2), torch.eye(4).expand(1, 3, 4, 4), torch.zeros(1, 3, 0))
+    belief = Belief(reading.pose, weights, reading.pose[:, 0], torch.zeros(1))
+    trace = Trace((cloud, cloud), (reading,) * 2, tuple(Step(t, 2, torch.tensor(1.0)) for t in range(2)), belief)
+    states = followed(trace, most=2)
+    assert states.tolist() == [[[20.0, 8.0]]] * 2
+    image = torch.rand(1, 4, 16, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    method: Any = SimpleNamespace(glimpse=IntegerCut(3))
+    scene: Any = SimpleNamespace(image=image)
+    seen = glimpses_of(method, scene, states)
+    assert seen.shape == (2, 1, 3, 3, 3)
+    there = (image[0, :3, 7:10, 19:22].permute(1, 2, 0).numpy() + 1) / 2 * 255
+    assert np.abs(seen[1, 0] - there).max() <= 0.5 + 1e-3

@@ -1,5 +1,6 @@
 """Hand pictures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
 
+import struct
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,24 +10,39 @@ import numpy as np
 from lightning import Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.compat.proto.summary_pb2 import Summary
+from torch.utils.tensorboard.writer import FileWriter
 
 from posefilter.pictures.canvas import to_png
 
 
-def post(trainer: Trainer, tag: str, picture: np.ndarray, file: Path | None) -> None:
-    """Show a picture (H, W, 3) uint8 under a tag, at the trainer's step, and write it as PNG unless `file` is None.
+def post(trainer: Trainer, tag: str, drawn: np.ndarray | bytes, file: Path | None) -> None:
+    """Show a picture (H, W, 3) uint8, or a film as the bytes of a GIF, under a tag at the trainer's step.
 
-    It is packed once for all: `add_image` would pack it again for each logger, slowly.
+    file: where it is written too, its suffix aside (None: nowhere). It is packed once for all: `add_image` would pack it
+    again for each logger, slowly, and knows no films.
     """
-    png = to_png(picture)
-    image = Summary.Image(height=picture.shape[0], width=picture.shape[1], colorspace=3, encoded_image_string=png)
-    for logger in trainer.loggers:
-        if isinstance(logger, TensorBoardLogger):
-            writer = logger.experiment._get_file_writer()
-            writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
+    packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_png(drawn), ".png")
+    width, height = size_of(drawn)
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
+    for writer in writers(trainer):
+        writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(png)
+        file.with_name(file.name + suffix).write_bytes(packed)
+
+
+def size_of(drawn: np.ndarray | bytes) -> tuple[int, int]:
+    """Return width and height of a picture, or of a GIF, which has them in its head [px]."""
+    if isinstance(drawn, bytes):
+        width, height = struct.unpack("<HH", drawn[6:10])
+        return width, height
+    return drawn.shape[1], drawn.shape[0]
+
+
+def writers(trainer: Trainer) -> list[FileWriter]:
+    """Return the writers of the trainer's TensorBoards."""
+    boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    return [board.experiment._get_file_writer() for board in boards]
 
 
 class Budget:

@@ -10,7 +10,6 @@ from posefilter.callbacks.board import Budget, post
 from posefilter.contracts import Space
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
-from posefilter.pictures.canvas import rasterise
 from posefilter.pictures.curves import draw_health
 from posefilter.types import Trace
 
@@ -22,7 +21,7 @@ class FilterHealth(Callback):
     share: of the validations' time that the figure may take (null: no limit), else it is left to a later validation.
     """
 
-    def __init__(self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.02) -> None:
+    def __init__(self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.005) -> None:
         self.folder = None if folder is None else Path(folder)
         self.most = most
         self.budget = Budget(share)
@@ -56,8 +55,8 @@ class FilterHealth(Callback):
             logger.log_metrics(scalars(curves, self.most), trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
-                picture = rasterise(draw_health(curves, self._images, f"Filter health after {trainer.global_step} steps"))
-                post(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health.png")
+                picture = draw_health(curves, self._images, f"Filter health after {trainer.global_step} steps of training")
+                post(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health")
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""

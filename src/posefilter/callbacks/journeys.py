@@ -1,19 +1,18 @@
-"""Pictures of the particles' journeys over an image: the paper's figures 2 and 4, as a figure and as a short film."""
+"""The particles' journeys over an image: where each stood, what it saw there, and a short film of it."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 from torch import Tensor
 
 from posefilter.geometry.lookup import touches
-from posefilter.types import Cloud
-
-ON, OFF, START = (60, 220, 90), (255, 80, 60), (250, 220, 60)
+from posefilter.models.image_space import ImageScene, ImageSpace
+from posefilter.pictures.cloud import spread_choice, weights_of
+from posefilter.pictures.journeys import OFF, ON
+from posefilter.types import Cloud, Trace
 
 
 def lineage(clouds: Sequence[Cloud]) -> Tensor:
@@ -28,31 +27,17 @@ def lineage(clouds: Sequence[Cloud]) -> Tensor:
     return torch.stack(path[::-1], dim=1)
 
 
-def journey_figure(rgb: Tensor, mask: Tensor, states: Tensor, most: int = 100) -> Figure:
-    """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off it).
+def followed(trace: Trace, most: int = 8) -> Tensor:
+    """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2) [px]."""
+    chosen = spread_choice(weights_of(trace.clouds[-1], 0), most).unique()
+    return lineage(trace.clouds)[0][:, chosen]
 
-    rgb (3, H, W), mask (1, H, W) bool, states (T, N, 2) [px]; `most` particles are drawn. The axes show half a frame more
-    on each side, since particles may leave it.
-    """
-    H, W = mask.shape[-2:]
-    path = states[:, :most].cpu()
-    on = touches(mask[None].cpu(), path[-1:], 1)[0].numpy()
-    figure = Figure(figsize=(8, 6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    axes.imshow(rgb.permute(1, 2, 0).cpu().clamp(0, 1).numpy())
-    axes.contour(mask[0].cpu().numpy(), [0.5], colors="white", linewidths=1)
-    xy = path.numpy()
-    for end, color in ((False, OFF), (True, ON)):
-        chosen = xy[:, on == end]
-        shade = tuple(c / 255 for c in color)
-        axes.plot(chosen[..., 0], chosen[..., 1], "-", color=shade, linewidth=0.7, alpha=0.6)
-        axes.plot(chosen[-1, :, 0], chosen[-1, :, 1], "o", color=shade, markersize=3)
-    axes.plot(xy[0, :, 0], xy[0, :, 1], ".", color=tuple(c / 255 for c in START), markersize=2)
-    reach = 0.5 if bool(((path < 0) | (path > torch.tensor([W, H]))).any()) else 0.02
-    axes.set(xlim=(-reach * W, (1 + reach) * W), ylim=((1 + reach) * H, -reach * H))
-    axes.set_title(f"{len(states)} steps: {on.mean():.0%} of the particles end on the object")
-    return figure
+
+def glimpses_of(method: ImageSpace, scene: ImageScene, states: Tensor) -> np.ndarray:
+    """Return what particles see where they stand in one image, its colours.  (T, n, 2) [px] -> (T, n, k, k, 3) uint8."""
+    seen = method.glimpse(scene.image, states.flatten(0, 1)[None].to(scene.image))[0, :, :3]
+    colours = ((seen + 1) / 2).clamp(0, 1).mul(255).round().byte().cpu()
+    return colours.unflatten(0, states.shape[:2]).permute(0, 1, 3, 4, 2).numpy()
 
 
 def journey_film(rgb: Tensor, mask: Tensor, states: Tensor, between: int = 4, scale: int = 2) -> list[Image.Image]:

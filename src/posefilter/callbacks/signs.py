@@ -5,72 +5,77 @@ from typing import Any, cast
 
 import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from posefilter.callbacks.journeys import journey_figure, journey_film, lineage, save_film
+from posefilter.callbacks.board import Budget, post
+from posefilter.callbacks.journeys import journey_film, lineage, save_film
 from posefilter.metrics.signs import SignsOfFailure
+from posefilter.pictures.canvas import AXES, Colour, to_picture
+from posefilter.pictures.curves import draw_shares
+from posefilter.pictures.journeys import draw_journeys
 from posefilter.types import Batch, Trace
 
-LISTS = ("on_object", "off_frame", "near_edge", "near_corner")
+LISTS: dict[str, Colour] = {
+    "on_object": AXES[1],
+    "off_frame": AXES[0],
+    "near_edge": AXES[2],
+    "near_corner": (240, 160, 30),
+}
+NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 
 
 class Signs(Callback):
-    """Draw the journeys of the first images of each validation and test, and log where the particles are, step by step.
+    """Log where the particles are, step by step, after each validation; draw and film the journeys of a test's first images.
 
-    The numbers themselves are among the method's metrics (val/signs/...). folder: where figures and the film are written
-    (null: nowhere); images: how many are drawn. Silent for methods whose particles are no pixels.
+    The numbers themselves are among the method's metrics (val/signs/...); a validation's journeys are among its figures.
+    folder: where figures and films are written (null: nowhere); images: how many are drawn; share: of the validations' time
+    that the curves may take (null: no limit). Silent for methods whose particles are no pixels.
     """
 
-    def __init__(self, folder: str | Path | None = None, images: int = 2) -> None:
+    def __init__(self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005) -> None:
         self.folder = None if folder is None else Path(folder)
         self.images = images
+        self.budget = Budget(share)
 
-    def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
-    ) -> None:
-        """Draw the first batch's journeys."""
-        if batch_idx == 0 and not trainer.sanity_checking and on_pixels(outputs):
-            self.draw(trainer, outputs, batch, "validation", film=False)
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self.budget.start()
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the shares of particles, step by step."""
+        self.budget.stop()
+        scores = cast(torch.nn.ModuleDict, pl_module.scores)
+        if "signs" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        found = cast(SignsOfFailure, scores["signs"]).compute()
+        for logger in trainer.loggers:
+            logger.log_metrics({f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step)
+        if self.budget.allows():
+            with self.budget.spend():
+                title = f"Signs of failure after {trainer.global_step} steps of training"
+                self._post(trainer, "figures/signs", "validation_signs", draw_signs(found, title))
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
         """Draw and film the first batch's journeys."""
         if batch_idx == 0 and on_pixels(outputs):
-            self.draw(trainer, outputs, batch, "test", film=True)
+            self.draw(trainer, outputs, batch)
 
-    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log the shares of particles, step by step."""
-        scores = cast(torch.nn.ModuleDict, pl_module.scores)
-        if "signs" not in scores or trainer.sanity_checking:
-            return
-        found = cast(SignsOfFailure, scores["signs"]).compute()
-        self.show(trainer, curves_figure(found), "signs/by_step", "validation_signs")
-        for logger in trainer.loggers:
-            logger.log_metrics({f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step)
-
-    def draw(self, trainer: Trainer, trace: Trace, batch: Batch, stage: str, film: bool) -> None:
+    def draw(self, trainer: Trainer, trace: Trace, batch: Batch) -> None:
         """Draw the journeys of a batch's first images."""
         states = lineage(trace.clouds)
         for i in range(min(self.images, len(states))):
-            figure = journey_figure(batch.rgb[i], batch.mask[i], states[i])
-            self.show(trainer, figure, f"journeys/{stage}_{i}", f"{stage}_journeys_{i}")
-            if film and self.folder is not None:
+            mask = batch.mask[i, 0].cpu().numpy()
+            title = f"Journeys, image {int(batch.frame_id[i])} of the test"
+            picture = draw_journeys(to_picture(batch.rgb[i]), mask, states[i].cpu().numpy(), title)
+            self._post(trainer, f"journeys/test_{i}", f"test_journeys_{i}", picture)
+            if self.folder is not None:
                 between = max(1, 24 // states.shape[1])
-                save_film(
-                    journey_film(batch.rgb[i], batch.mask[i], states[i], between), self.folder / f"{stage}_journeys_{i}.webp"
-                )
+                film = journey_film(batch.rgb[i], batch.mask[i], states[i], between)
+                save_film(film, self.folder / f"test_journeys_{i}.webp")
 
-    def show(self, trainer: Trainer, figure: Figure, tag: str, file: str) -> None:
-        """Hand a figure to TensorBoard, and write it down."""
-        for logger in trainer.loggers:
-            if isinstance(logger, TensorBoardLogger):
-                logger.experiment.add_figure(tag, figure, trainer.global_step)
-        if self.folder is not None:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(self.folder / f"{file}.png", dpi=110)
+    def _post(self, trainer: Trainer, tag: str, file: str, picture: Any) -> None:
+        post(trainer, tag, picture, self.folder and self.folder / file)
 
 
 def on_pixels(outputs: Any) -> bool:
@@ -78,15 +83,7 @@ def on_pixels(outputs: Any) -> bool:
     return isinstance(outputs, Trace) and outputs.clouds[-1].state.shape[2:] == (2,)
 
 
-def curves_figure(found: dict[str, Any]) -> Figure:
+def draw_signs(found: dict[str, Any], title: str) -> Any:
     """Draw the shares of particles on the object, off the frame, at an edge and in a corner against the step."""
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for name in LISTS:
-        axes.plot(range(len(found[name])), [100 * x for x in found[name]], marker=".", label=name.replace("_", " "))
-    axes.set(xlabel="step", ylabel="share of the particles [%]", ylim=(-3, 103))
-    numbers = ("pairwise_cosine", "offset_r2", "heading", "auroc")
-    axes.set_title(", ".join(f"{name.replace('_', ' ')} {found[name]:.2f}" for name in numbers), fontsize=9)
-    axes.legend()
-    return figure
+    foot = ", ".join(f"{name.replace('_', ' ')} {found[name]:.2f}" for name in NUMBERS)
+    return draw_shares({name: (found[name], colour) for name, colour in LISTS.items()}, title, foot)

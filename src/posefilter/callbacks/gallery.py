@@ -1,0 +1,102 @@
+"""What is kept of a validation's images, and sheets of them: the first, the best and the worst."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from lightning import Trainer
+from torch import Tensor
+
+from posefilter.data.meshes import MeshStore
+from posefilter.metrics.beliefs import on_object
+from posefilter.metrics.errors import add
+from posefilter.models.base import PoseEstimator
+from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, to_picture, whole
+from posefilter.pictures.cloud import draw_cloud, weight_scale
+from posefilter.pictures.overlay import Shape, axes_legend, overlay, view_of_poses
+from posefilter.types import Batch, Belief, Cloud, Reading, Trace
+
+_TILE = 256  # [px]; five in a row are as wide as a browser shows without shrinking
+_COLUMNS = 5
+
+
+class Shown(NamedTuple):
+    """What is kept of an image that may be drawn."""
+
+    frame_id: int
+    error: float  # ADD [m]; for methods that tell no pose, the share of the particles that miss the object
+    rgb: np.ndarray  # (H, W, 3) uint8
+    intrinsics: np.ndarray  # (3, 3) [px]
+    estimate: np.ndarray  # (4, 4)
+    truth: np.ndarray  # (4, 4)
+    pixels: np.ndarray  # (N, 2) the last cloud on the image [px]
+    weights: np.ndarray  # (N,)
+
+
+def errors_of(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor) -> Tensor:
+    """Return how wrong each image is, infinite where no number says: ADD [m], or the share of particles that miss.  (B,)."""
+    if method.tells_pose:
+        error = add(trace.belief.best.detach(), batch.camera_from_object, points)
+    else:
+        error = 1 - on_object(batch.mask, method.particle_pixels(trace.clouds[-1], batch))
+    return torch.nan_to_num(error.double(), nan=torch.inf)
+
+
+def shown(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float) -> Shown:
+    """Copy what a drawing needs of one image."""
+    numpy = lambda x: x[i].detach().cpu().double().numpy()  # noqa: E731
+    cloud = trace.clouds[-1]
+    pixels = method.particle_pixels(cloud, batch)
+    return Shown(
+        int(batch.frame_id[i]),
+        error,
+        to_picture(batch.rgb[i]),
+        numpy(batch.intrinsics),
+        numpy(trace.belief.best),
+        numpy(batch.camera_from_object),
+        numpy(pixels),
+        numpy(torch.softmax(cloud.log_weights.double(), 1)),
+    )
+
+
+def one_image(trace: Trace, i: int) -> Trace:
+    """Return the trace of one image alone, on the CPU, without gradients."""
+    take = lambda x: x[i : i + 1].detach().cpu() if x.ndim else x.detach().cpu()  # noqa: E731
+    return Trace(
+        tuple(Cloud(*map(take, cloud)) for cloud in trace.clouds),
+        tuple(Reading(*map(take, reading)) for reading in trace.readings),
+        tuple(step._replace(sigma=take(step.sigma)) for step in trace.steps),
+        Belief(*map(take, trace.belief)),
+    )
+
+
+def shape_of(trainer: Trainer, method: PoseEstimator) -> Shape:
+    """Return what outlines are drawn from: the mesh where the data has it, else the hull that the method carries."""
+    store = getattr(getattr(trainer, "datamodule", None), "meshes", None)
+    if isinstance(store, MeshStore) and method.model.name in store.names():
+        return store.load(method.model.name)
+    return method.model.hull
+
+
+def draw_gallery(kept: Sequence[Shown], shape: Shape, tells_pose: bool, title: str) -> np.ndarray:
+    """Draw images side by side, in rows, under a title and above what the lines mean."""
+    sheet = grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
+    width = max(sheet.shape[1], 2 * _TILE)
+    sheet = np.pad(sheet, ((0, 0), (0, width - sheet.shape[1]), (0, 0)), constant_values=255)
+    legend = [("truth", TRUTH), ("estimate", ESTIMATE), *((f"axis {name}", colour) for name, colour in axes_legend())]
+    foot = strip(width, "", legend) if tells_pose else weight_scale(width, [], 15)
+    return np.concatenate([strip(width, title, size=20), sheet, foot])
+
+
+def draw_tile(one: Shown, shape: Shape, tells_pose: bool) -> np.ndarray:
+    """Draw one image: a close-up of estimate and truth, or the particles where no pose is told."""
+    height, width = one.rgb.shape[:2]
+    if tells_pose:
+        view = view_of_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
+        picture = overlay(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
+        caption = f"image {one.frame_id}, ADD {1000 * one.error:.3g} mm"
+    else:
+        picture = draw_cloud(one.rgb, one.pixels, one.weights, whole(height, width, _TILE))
+        caption = f"image {one.frame_id}, {1 - one.error:.0%} on the object"
+    return np.concatenate([strip(_TILE, caption), picture])

@@ -1,0 +1,83 @@
+"""How fast a run goes, and what it waits for."""
+
+import time
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from posefilter.callbacks.board import Budget
+
+
+class Speed(Callback):
+    """Log `speed/...`: images and steps a second, the share of the training that waits for data, and what validations take.
+
+    Training's numbers are means since they were last logged, every `log_every_n_steps` steps; validations are left out of
+    them. drawing_share: what other callbacks' figures have taken so far, over the time of all validations without them.
+    """
+
+    def __init__(self) -> None:
+        self._images = self._steps = self._seen = 0
+        self._waited = self._worked = 0.0
+        self._mark: float | None = None  # when the last batch ended
+        self._began = 0.0  # the batch, or the validation
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Count the time since the last batch as waiting."""
+        self._began = time.perf_counter()
+        if self._mark is not None:
+            self._waited += self._began - self._mark
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Count the batch, and log from time to time."""
+        self._mark = time.perf_counter()
+        self._worked += self._mark - self._began
+        self._images += len(batch[0])
+        self._steps += 1
+        if self._steps >= trainer.log_every_n_steps:
+            self.log(trainer, self.training())
+            self._images = self._steps = 0
+            self._waited = self._worked = 0.0
+
+    def training(self) -> dict[str, float]:
+        """Return the numbers since they were last logged."""
+        total = max(self._waited + self._worked, 1e-9)
+        numbers = {
+            "train_images_per_second": self._images / total,
+            "train_steps_per_second": self._steps / total,
+            "waiting_share": self._waited / total,
+        }
+        if torch.cuda.is_available():
+            numbers["peak_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
+        return numbers
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock of a validation."""
+        self._began, self._seen = time.perf_counter(), 0
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        """Count images."""
+        self._seen += len(batch[0])
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log what the validation took."""
+        now = time.perf_counter()
+        self._mark = None if self._mark is None else now
+        if trainer.sanity_checking:
+            return
+        seconds = max(now - self._began, 1e-9)
+        budgets = [found for c in trainer.callbacks if isinstance(found := getattr(c, "budget", None), Budget)]  # type: ignore[attr-defined]
+        numbers = {"validation_seconds": seconds, "validation_images_per_second": self._seen / seconds}
+        if budgets:
+            numbers["drawing_share"] = sum(b.drawn for b in budgets) / max(max(b.validated for b in budgets), 1e-9)
+        self.log(trainer, numbers)
+
+    def log(self, trainer: Trainer, numbers: dict[str, float]) -> None:
+        """Hand numbers to the loggers."""
+        if trainer.is_global_zero:
+            for logger in trainer.loggers:
+                logger.log_metrics({f"speed/{name}": value for name, value in numbers.items()}, trainer.global_step)

@@ -1,0 +1,35 @@
+"""What a run is told apart by from others: its choices, and every plain setting."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from posefilter.run.job import Job
+
+_PASSING = ("callbacks", "console", "debug", "folder", "logger", "out", "resume", "threads")  # where and how, not what
+
+
+def comparable(job: Job) -> dict[str, bool | int | float | str]:
+    """Return a job's choices by group, and its settings by dotted key; a setting that repeats another is left out."""
+    chosen: dict[str, bool | int | float | str] = {
+        group: choice
+        for group, choice in job.choices.items()
+        if "/" not in group and group not in _PASSING and choice not in ("None", "null")
+    }
+    settings = OmegaConf.to_container(job.cfg, resolve=False)
+    assert isinstance(settings, dict)
+    return chosen | dict(leaves({key: value for key, value in settings.items() if key not in _PASSING}))
+
+
+def leaves(node: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, bool | int | float | str]]:
+    """Yield the settings of a section: neither nulls, nor interpolations (they repeat another), nor classes' names."""
+    for key, value in node.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{name}.")
+        elif isinstance(value, list):
+            if not any(isinstance(item, Mapping) for item in value):
+                yield name, str(value)
+        elif value is not None and not str(key).startswith("_") and not (isinstance(value, str) and "${" in value):
+            yield name, value

@@ -1,0 +1,49 @@
+"""Speed is counted by a clock that the test turns."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from posefilter.callbacks import speed
+from posefilter.callbacks.board import Budget
+from posefilter.callbacks.speed import Speed
+
+
+def test_images_waiting_and_validations_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
+    logged: list[dict[str, float]] = []
+    logger = SimpleNamespace(log_metrics=lambda numbers, step: logged.append(numbers))
+    drawer = SimpleNamespace(budget=Budget(None))
+    drawer.budget.validated, drawer.budget.drawn = 20.0, 1.0
+    trainer: Any = SimpleNamespace(
+        loggers=[logger], global_step=0, is_global_zero=True, sanity_checking=False, log_every_n_steps=4, callbacks=[drawer]
+    )
+    method: Any = None
+    callback, batch = Speed(), [[0] * 8]
+
+    def step(wait: float) -> None:
+        now[0] += wait
+        callback.on_train_batch_start(trainer, method, batch, 0)
+        now[0] += 3.0
+        callback.on_train_batch_end(trainer, method, None, batch, 0)
+
+    step(100.0)  # the first wait, for workers to start, is nobody's
+    step(1.0)
+    callback.on_validation_start(trainer, method)
+    for _ in range(3):
+        callback.on_validation_batch_end(trainer, method, None, batch, 0)
+    now[0] += 48.0
+    callback.on_validation_end(trainer, method)
+    step(1.0)
+    step(1.0)
+    validation, training = logged
+    assert validation == {
+        "speed/validation_seconds": 48.0,
+        "speed/validation_images_per_second": 0.5,
+        "speed/drawing_share": 0.05,
+    }
+    assert training["speed/train_images_per_second"] == pytest.approx(32 / 15)
+    assert training["speed/train_steps_per_second"] == pytest.approx(4 / 15)
+    assert training["speed/waiting_share"] == pytest.approx(3 / 15)

@@ -1,0 +1,50 @@
+"""One line of config switches the looking off; runs are told apart by their choices and settings."""
+
+from pathlib import Path
+
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from posefilter.callbacks.figures import Figures
+from posefilter.callbacks.story import Story
+from posefilter.run.command import compose_job
+from posefilter.run.comparing import comparable
+from posefilter.run.job import Job
+from posefilter.run.train import build_trainer
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def compose(folder: Path, *overrides: str) -> Job:
+    return compose_job("train", CONF, ["console=plain", "logger=none", "trainer.accelerator=cpu", *overrides], folder)
+
+
+def kinds(job: Job) -> list[type]:
+    trainer = build_trainer(job)
+    return [type(callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
+
+
+def test_none_leaves_the_checkpoints_and_nothing_that_looks(tmp_path: Path) -> None:
+    usual, none = kinds(compose(tmp_path)), kinds(compose(tmp_path, "callbacks=none"))
+    assert Figures in usual
+    assert none.count(ModelCheckpoint) == usual.count(ModelCheckpoint) == 2
+    assert not [kind for kind in none if kind.__module__.startswith("posefilter.callbacks")]
+
+
+def test_a_single_figure_is_switched_off_by_its_name(tmp_path: Path) -> None:
+    trainer = build_trainer(compose(tmp_path, "callbacks.figures.without=[film]"))
+    (figures,) = [c for c in trainer.callbacks if isinstance(c, Figures)]  # type: ignore[attr-defined]
+    assert "film" not in figures.drawings
+    assert "belief" in figures.drawings
+
+
+def test_a_run_is_told_apart_by_choices_and_settings_but_not_by_where_it_is(tmp_path: Path) -> None:
+    job = compose(tmp_path, "refine=none", "filter.particles=50", f"out={tmp_path}", "seed=3")
+    settings = comparable(job)
+    assert settings["refine"] == "none"
+    assert settings["filter.particles"] == 50
+    assert settings["seed"] == 3
+    assert "model.filter" not in settings  # it repeats the section `filter`
+    assert not [key for key in settings if key.split(".")[0] in ("out", "folder", "callbacks", "logger", "console")]
+    assert not [value for value in settings.values() if isinstance(value, str) and "${" in value]
+    (story,) = [c for c in build_trainer(job).callbacks if isinstance(c, Story)]  # type: ignore[attr-defined]
+    assert story.settings == settings
