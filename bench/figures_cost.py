@@ -1,0 +1,96 @@
+"""Measure what a validation's figures cost: `python bench/figures_cost.py [--checkpoint FILE] [train.py's settings ...]`.
+
+Validations of the same method on the same images run by turns without and with every callback that only looks, each figure
+drawn at each validation however long it takes (in a training, drawing is put off where it would take more than its share).
+Without a checkpoint the method is new, which takes as long.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from posefilter.callbacks.board import Budget
+from posefilter.run.build import instantiate
+from posefilter.run.command import compose_job
+from posefilter.run.machine import settle
+from posefilter.run.method import build_method, method_of, read_checkpoint, recipe
+
+HOME = Path(__file__).parents[1]
+LOOKING = ("story", "speed", "signs", "health", "figures")
+
+
+class Clock(Callback):
+    """Remember when a validation began and ended, seen from its place among the callbacks."""
+
+    def __init__(self) -> None:
+        self.began = self.ended = 0.0
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start."""
+        self.began = time.perf_counter()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Stop."""
+        self.ended = time.perf_counter()
+
+
+def validate(method: LightningModule, data: Any, callbacks: list[Callback], folder: str) -> float:
+    """Return what one validation takes [s]."""
+    first, last = Clock(), Clock()
+    trainer = Trainer(
+        logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
+        callbacks=[first, *callbacks, last],
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False, inference_mode=False,
+    )  # fmt: skip
+    trainer.validate(method, datamodule=data, verbose=False)
+    return last.ended - first.began
+
+
+def looking(job: Any, folder: str) -> list[Callback]:
+    """Build the callbacks that look, without a limit to what drawing takes."""
+    job.cfg.folder = folder
+    made = instantiate({name: job.cfg.callbacks[name] for name in LOOKING}, "callbacks")
+    for callback in made.values():
+        if isinstance(getattr(callback, "budget", None), Budget):
+            callback.budget = Budget(None)
+    return list(made.values())
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--checkpoint", default=None)
+    parser.add_argument("--repeats", type=int, default=5)
+    known, settings = parser.parse_known_args()
+    with tempfile.TemporaryDirectory() as folder:
+        job = compose_job("train", HOME / "conf", settings, Path(folder))
+        settle(job.cfg.threads, job.cfg.seed)
+        data = instantiate(job.cfg.data, "data")
+        data.prepare_data()
+        data.setup("fit")
+        checkpoint = read_checkpoint(known.checkpoint) if known.checkpoint else None
+        method = method_of(checkpoint) if checkpoint else build_method(recipe(job), data.object_model(0))
+        validate(method, data, looking(job, folder), folder)  # caches, fonts and compiled kernels: neither's to pay
+        plain, drawn = [], []
+        for number in range(known.repeats):
+            for with_figures in (True, False) if number % 2 else (False, True):
+                seconds = validate(method, data, looking(job, folder) if with_figures else [], folder)
+                (drawn if with_figures else plain).append(seconds)
+                print(f"{'with' if with_figures else 'without'} figures: {seconds:.3f} s", flush=True)
+    ratios = [a / b for a, b in zip(drawn, plain, strict=True)]
+    print(
+        f"{known.repeats} validations each, {torch.get_num_threads()} threads: {sum(plain):.2f} s without and "
+        f"{sum(drawn):.2f} s with all figures; ratio {sum(drawn) / sum(plain):.3f}, of pairs {min(ratios):.3f} to "
+        f"{max(ratios):.3f}, median {statistics.median(ratios):.3f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
