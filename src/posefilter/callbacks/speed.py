@@ -37,7 +37,7 @@ class Speed(Callback):
         self._images += len(batch[0])
         self._steps += 1
         if self._steps >= trainer.log_every_n_steps:
-            self.log(trainer, self.training())
+            self.write_down(trainer, self.training())
             self._images = self._steps = 0
             self._waited = self._worked = 0.0
 
@@ -74,9 +74,9 @@ class Speed(Callback):
         numbers = {"validation_seconds": seconds, "validation_images_per_second": self._seen / seconds}
         if budgets:
             numbers["drawing_share"] = sum(b.drawn for b in budgets) / max(max(b.validated for b in budgets), 1e-9)
-        self.log(trainer, numbers)
+        self.write_down(trainer, numbers)
 
-    def log(self, trainer: Trainer, numbers: dict[str, float]) -> None:
+    def write_down(self, trainer: Trainer, numbers: dict[str, float]) -> None:
         """Hand numbers to the loggers."""
         if trainer.is_global_zero:
             for logger in trainer.loggers:

@@ -76,7 +76,12 @@ def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) 
     recipe = checkpoint["recipe"]
     recipe = {**recipe, "settings": changed(recipe["settings"], wanted or {})}
     method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
-    missing, foreign = method.load_state_dict(unpack(checkpoint["state_dict"]), strict=False)
+    try:
+        missing, foreign = method.load_state_dict(unpack(checkpoint["state_dict"]), strict=False)
+    except RuntimeError as error:  # tensors of other shapes
+        raise UserError(
+            "checkpoint: its weights do not fit the method; they were trained by another version of this code"
+        ) from error
     lost = [key for key in missing if not key.startswith("scores.")]
     if lost or foreign:
         raise UserError(f"checkpoint: its weights do not fit the method ({len(lost)} missing, {len(foreign)} unknown)")
