@@ -2,8 +2,8 @@
 
     python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
 
-Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about the first, and how particles came
-there.  Of docs/tour.md's commands, where they have been run: the pictures that they left.
+Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and its particles'
+way there.  Of docs/tour.md's commands, where they have been run: the pictures that they left.
 """
 
 import argparse
@@ -38,6 +38,7 @@ from posefilter.types import Batch, Trace
 
 HOME = Path(__file__).parents[1]
 SEED, FRAMES = 20_000_101, 6  # of the rendered scenes: a seed that no training uses, and a scene a frame
+EXAMPLE = 3  # which of them belief and particles are drawn of
 WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
 TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_scenes": "scenes/preview.png",
@@ -88,12 +89,15 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     shape: Shape = store.load(name) if name in store.names() else method.model.hull
     found = list(run(method, kept["recipe"]["settings"]["data"], scenes, name))
     write(out / "predictions.jpg", predictions(found, method, shape))
-    first, K = found[0].sample, found[0].sample.intrinsics
-    title = f"Belief about the first image, {len(found[0].trace.belief.log_weights[0])} particles"
-    args = (found[0].trace.belief, method.model, first.rgb, K, first.camera_from_object, title)
-    write(out / "belief.jpg", picture(draw_belief(*args)))
-    title = "Particles over the filter's iterations, first image"
-    write(out / "particles.jpg", draw_strip(first.rgb, K, found[0].trace, 0, method.space, title))
+    one = found[min(EXAMPLE, len(found) - 1)]
+    sample, K = one.sample, one.sample.intrinsics
+    title = f"Belief about one image, {one.trace.belief.log_weights.shape[1]} particles"
+    write(
+        out / "belief.jpg",
+        picture(draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object, title)),
+    )
+    title = "Particles over the filter's iterations"
+    write(out / "particles.jpg", draw_strip(sample.rgb, K, one.trace, 0, method.space, title))
 
 
 def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:
