@@ -1,6 +1,7 @@
 """The commands, the whole way at toy size: what one writes the next one reads, and they agree."""
 
 import csv
+import importlib.util
 import json
 from pathlib import Path
 
@@ -110,7 +111,9 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     out = tmp_path / "prediction"
     typed = [f"checkpoint={weights}", f"rgb={rgb}", f"depth={depth}", "intrinsics=266,266,78,60", f"out={out}", "threads=1"]
-    assert run_command("predict", HOME, [*typed, "meshes=builtin"]) == 0
+    can_view = importlib.util.find_spec("rerun") is not None  # the optional extra [viz]
+    assert run_command("predict", HOME, [*typed, "meshes=builtin", f"view={str(can_view).lower()}"]) == 0
+    assert (out / "view.rrd").is_file() == can_view
     told = json.loads((out / "pose.json").read_text())
     R = np.array(told["camera_from_object"])[:3, :3]
     assert np.allclose(R @ R.T, np.eye(3), atol=1e-4)
@@ -120,6 +123,16 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     assert belief["weights"].sum() == pytest.approx(1, abs=1e-4)
     assert (out / "overlay.png").is_file()
     assert (out / "belief.png").is_file()
+
+
+@pytest.mark.parametrize(("view", "told"), [("true", "pip install -e '.[viz]'"), ("maybe", "choose true or false")])
+def test_a_view_that_cannot_be_written_is_told_before_the_work(
+    view: str, told: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "rerun" else found(name, *rest))
+    assert run_command("predict", HOME, [f"view={view}", f"out={tmp_path}"]) == 2
+    assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
 
 
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf", "cnn_patch", "downsized"])
