@@ -18,6 +18,7 @@ from typing import NamedTuple
 HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
+UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
 AT_TEST_TIME = {  # tables of evaluations, and what they sweep
     "resampling": "resample=never,systematic,guided",
     "particles": "filter.particles=50,100,1000",
@@ -39,6 +40,7 @@ def plan() -> list[Line]:
     memorise = f"{FOUR} experiment=memorise"
     lines = [
         Line("memorise", f"{memorise} variant=working seed=0"),
+        Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
         Line("memorise", f"{memorise} variant=paper seed=0"),
         Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
     ]
@@ -48,6 +50,7 @@ def plan() -> list[Line]:
     lines += [Line("held_out", f"{FOUR} seed=0")]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
     lines += [
+        Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),
         Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
         Line("held_out", f"{FOUR} seed=1,2"),
         Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),

@@ -24,9 +24,11 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "ADD-S AUC": lambda m: m["add_s"]["auc"],
     "distinct %": lambda m: 100 * m["signs"]["distinct"][-1],
     "same direction": lambda m: m["signs"]["pairwise_cosine"],
+    "heading": lambda m: m["signs"]["heading"],
     "offset R2": lambda m: m["signs"]["offset_r2"],
     "off frame %": lambda m: 100 * m["signs"]["off_frame"][-1],
     "at an edge %": lambda m: 100 * m["signs"]["near_edge"][-1],
+    "in a corner %": lambda m: 100 * m["signs"]["near_corner"][-1],
     "AUROC": lambda m: m["signs"]["auroc"],
     "s / image": lambda m: m["seconds_per_image"],
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
@@ -99,12 +101,15 @@ def table(runs: list[dict[str, Any]]) -> str:
     for run in runs:
         rows[key_of(run)].append(run)
     shown = [name for name, read in COLUMNS.items() if any(cell([run], read) != "–" for run in runs)]
+    typed = [set(rest.split()) for _, _, rest in rows]
+    common = set.intersection(*typed) if len(rows) > 1 else set()  # is said once, above the table
     lines = ["| method | variant | changed | seeds | " + " | ".join(shown) + " |", "|---" * (4 + len(shown)) + "|"]
     for model, variant, rest in sorted(rows, key=place):
         same = rows[model, variant, rest]
+        own = " ".join(part for part in rest.split() if part not in common)
         seeds = len({str(run.get("seed", run["choices"].get("seed"))) for run in same})
         figures = [cell(same, COLUMNS[name]) for name in shown]
-        lines.append(" | ".join([f"| {model}", variant, told(rest), str(seeds), *figures]) + " |")
+        lines.append(" | ".join([f"| {model}", variant, told(own), str(seeds), *figures]) + " |")
     return "\n".join(lines)
 
 

@@ -19,7 +19,7 @@ def run(folder: Path, on: float, *overrides: str) -> None:
 
 
 def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
-    both = ("model=patch_pf", "experiment=memorise")
+    both = ("model=patch_pf", "experiment=memorise", "data.limit_train=6")
     run(tmp_path / "a", 0.9, *both, "seed=0", "variant=working")
     run(tmp_path / "b", 0.8, *both, "seed=1", "variant=working", "console=plain")
     run(tmp_path / "c", 0.2, *both, "seed=0", "variant=paper")
