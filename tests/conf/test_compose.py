@@ -37,6 +37,17 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, varia
     assert method.filter.particles == job.cfg.filter.particles
 
 
+@pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
+def test_what_a_deviation_sets_holds(model: str, variant: str, tmp_path: Path) -> None:
+    """No choice later in the list of defaults may undo it."""
+    cfg = compose(tmp_path, f"model={model}", f"variant={variant}").cfg
+    body = OmegaConf.load(CONF / "deviation" / model / f"{variant}.yaml")
+    for group, settings in body.items():
+        for name, value in settings.items() if OmegaConf.is_dict(settings) else []:
+            if not OmegaConf.is_interpolation(settings, name):
+                assert cfg[group][name] == value, f"{group}.{name}"
+
+
 def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:
     method = build_method(recipe(compose(tmp_path, "variant=paper")))
     assert isinstance(method, PosePF)
