@@ -84,6 +84,12 @@ def test_each_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> N
     assert trace.belief.best.isfinite().all()
 
 
+def test_the_motions_margin_is_as_much_of_the_object_at_either_width(tmp_path: Path) -> None:
+    margins = {model: build(tmp_path, f"model={model}").lessons["motion"].loss.label.margin_px for model in KINDS}  # type: ignore[attr-defined]
+    assert margins == {"pixel_pf": 3, "patch_pf": 3, "cnn_patch": 6, "downsized": 3}
+    assert "motion" not in build(tmp_path, "model=cnn_patch", "motion_lesson=none").lessons
+
+
 @pytest.mark.parametrize("change", ["pose_code=absolute", "pose_lesson=none", "estimate=densest_pose", "estimate=mean"])
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf"])
 def test_each_pose_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
