@@ -79,7 +79,7 @@ class Bars(Callback):
         """Move the bar; figures are fetched from the device as seldom as they are logged."""
         if self._training is None:
             return
-        said = {}
+        said: dict[str, Any] = {}
         if trainer.global_step % trainer.log_every_n_steps == 0 or trainer.global_step == trainer.max_steps:  # type: ignore[attr-defined]
             said = {"said": briefly(trainer.callback_metrics)}
         self._shown().update(self._training, completed=trainer.global_step, **said)
