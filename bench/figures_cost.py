@@ -2,11 +2,11 @@
 
 Validations of the same method on the same images run by turns without and with every callback that only looks, each figure
 drawn at each validation however long it takes (in a training, drawing is put off where it would take more than its share).
+Computing time tells the same where other programs keep the machine busy.
 Without a checkpoint the method is new, which takes as long.
 """
 
 import argparse
-import statistics
 import tempfile
 import time
 from pathlib import Path
@@ -30,19 +30,19 @@ class Clock(Callback):
     """Remember when a validation began and ended, seen from its place among the callbacks."""
 
     def __init__(self) -> None:
-        self.began = self.ended = 0.0
+        self.began = self.ended = (0.0, 0.0)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start."""
-        self.began = time.perf_counter()
+        self.began = time.perf_counter(), time.process_time()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Stop."""
-        self.ended = time.perf_counter()
+        self.ended = time.perf_counter(), time.process_time()
 
 
-def validate(method: LightningModule, data: Any, callbacks: list[Callback], folder: str) -> float:
-    """Return what one validation takes [s]."""
+def validate(method: LightningModule, data: Any, callbacks: list[Callback], folder: str) -> tuple[float, float]:
+    """Return what one validation takes: time, and computing time of all threads [s]."""
     first, last = Clock(), Clock()
     trainer = Trainer(
         logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
@@ -50,7 +50,7 @@ def validate(method: LightningModule, data: Any, callbacks: list[Callback], fold
         enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False, inference_mode=False,
     )  # fmt: skip
     trainer.validate(method, datamodule=data, verbose=False)
-    return last.ended - first.began
+    return last.ended[0] - first.began[0], last.ended[1] - first.began[1]
 
 
 def looking(job: Any, folder: str) -> list[Callback]:
@@ -81,15 +81,21 @@ def main() -> None:
         plain, drawn = [], []
         for number in range(known.repeats):
             for with_figures in (True, False) if number % 2 else (False, True):
-                seconds = validate(method, data, looking(job, folder) if with_figures else [], folder)
-                (drawn if with_figures else plain).append(seconds)
-                print(f"{'with' if with_figures else 'without'} figures: {seconds:.3f} s", flush=True)
-    ratios = [a / b for a, b in zip(drawn, plain, strict=True)]
-    print(
-        f"{known.repeats} validations each, {torch.get_num_threads()} threads: {sum(plain):.2f} s without and "
-        f"{sum(drawn):.2f} s with all figures; ratio {sum(drawn) / sum(plain):.3f}, of pairs {min(ratios):.3f} to "
-        f"{max(ratios):.3f}, median {statistics.median(ratios):.3f}"
-    )
+                took = validate(method, data, looking(job, folder) if with_figures else [], folder)
+                (drawn if with_figures else plain).append(took)
+                print(
+                    f"{'with' if with_figures else 'without'} figures: {took[0]:.2f} s, computing {took[1]:.2f} s",
+                    flush=True,
+                )
+    print(f"{known.repeats} validations each, by turns, {torch.get_num_threads()} threads")
+    for kind, without, with_all in zip(
+        ("time", "computing"), zip(*plain, strict=True), zip(*drawn, strict=True), strict=True
+    ):
+        ratios = [a / b for a, b in zip(with_all, without, strict=True)]
+        print(
+            f"{kind}: {sum(without):.2f} s without and {sum(with_all):.2f} s with all figures; ratio "
+            f"{sum(with_all) / sum(without):.3f}, of pairs {min(ratios):.3f} to {max(ratios):.3f}"
+        )
 
 
 if __name__ == "__main__":

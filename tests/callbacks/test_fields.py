@@ -12,6 +12,7 @@ from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import invert, make_pose, origin_of, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.likelihood import Points, PoseLikelihood, lay_out
 from posefilter.nets.paper_likelihood import PaperLikelihood
 from posefilter.pictures.canvas import TRUTH
@@ -160,3 +161,20 @@ def test_picture_of_points_shows_each_slice() -> None:
 
 def test_ticks_are_round() -> None:
     assert [round_down(x) for x in (72.0, 216.0, -6.7, 0.0, 1.0, 0.034)] == [70, 200, -6, 0, 1, pytest.approx(0.03)]
+
+
+def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() -> None:
+    class Told(PoseLikelihood):
+        def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
+            assert points.context is not None
+            return points.context[..., 0]  # log of the share of the fragment there
+
+    centers = torch.tensor([[[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]])  # two halves, along the object's x
+    share = torch.tensor([0.9, 0.1]).log().expand(1, 6, 8, 2)
+    said = Coordinates(torch.zeros(1, 6, 8), share, torch.zeros(1, 6, 8, 2, 3), centers, torch.zeros(1, 6, 8, 4))
+    image = lay_out(scene().rgb, scene().depth, scene().intrinsics, said)
+    field = point_field(Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True)
+    assert 0 in field.plane
+    along_x = field.judged[0].mean(0 if field.plane[0] == 0 else 1)  # columns go along the plane's first axis
+    assert along_x[:18] == pytest.approx(math.log(0.9), abs=1e-3)
+    assert along_x[-18:] == pytest.approx(math.log(0.1), abs=1e-3)

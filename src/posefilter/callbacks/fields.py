@@ -108,8 +108,8 @@ def point_field(
     places = place.expand(cells, cells, 3).clone()
     places[..., plane[0]], places[..., plane[1]] = line[None, :], line[:, None]
     asked = torch.cat([place[None], places.flatten(0, 1)])
-    many = type(points)(*(None if x is None else x.expand(1, 1, len(asked), *x.shape[3:]) for x in points))
-    many = many._replace(position=asked[None, None])
+    alike = lambda x: x.expand(1, 1, len(asked), *x.shape[3:])  # noqa: E731
+    many = Points(asked[None, None], *(alike(x) for x in (points.color, points.ray, points.known, points.inside)))
     if image.context is not None:  # what the proposal network says of the place that is asked for
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
         many = many._replace(context=ask(image.context, u, v, many.position / model.radius))

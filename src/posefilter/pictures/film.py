@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from io import BytesIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -182,7 +183,7 @@ def to_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 15
         images[-1].putpalette(palette.tobytes())
     durations = [milliseconds] * (len(frames) - 1) + [hold]
     stream = BytesIO()
-    save = {"duration": durations, "loop": 0, "transparency": colours, "disposal": 1, "optimize": False}
+    save: dict[str, Any] = {"duration": durations, "loop": 0, "transparency": colours, "disposal": 1, "optimize": False}
     images[0].save(stream, "GIF", save_all=True, append_images=images[1:], **save)
     return stream.getvalue()
 
