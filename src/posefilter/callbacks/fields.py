@@ -61,9 +61,9 @@ def pose_field(
         generator = torch.Generator(device=truth.device).manual_seed(0)
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):  # as the filter reads
             score = method.score_poses(scene, poses[None], sigma, generator, pixels)[0].float().cpu()
-        score = (score - score[0])[1:].numpy()
-        planes.append(score[: 3 * cells * cells].reshape(3, cells, cells))
-        turns.append(score[3 * cells * cells :].reshape(3, len(degrees)))
+        less = (score - score[0])[1:].numpy()
+        planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
+        turns.append(less[3 * cells * cells :].reshape(3, len(degrees)))
     return PoseField(tuple(sigmas), reaches, np.stack(planes), degrees.numpy(), np.stack(turns))
 
 
@@ -170,5 +170,6 @@ def proposals_of(method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24
     on = shown & scene.cells.valid[0] & (true.norm(dim=-1) < 1.2)
     off = (scene.said.coordinate[0] - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan
-    said = (torch.sigmoid(scene.said.logit[0]), scene.said.coordinate[0], true, on)
-    return Proposals(*(x.detach().cpu().numpy() for x in said), axes, error)
+    chance, coordinate = torch.sigmoid(scene.said.logit[0]), scene.said.coordinate[0]
+    arrays = [x.detach().cpu().numpy() for x in (chance, coordinate, true, on)]
+    return Proposals(arrays[0], arrays[1], arrays[2], arrays[3], axes, error)

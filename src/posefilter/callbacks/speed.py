@@ -36,7 +36,7 @@ class Speed(Callback):
         self._worked += self._mark - self._began
         self._images += len(batch[0])
         self._steps += 1
-        if self._steps >= trainer.log_every_n_steps:
+        if self._steps >= trainer.log_every_n_steps:  # type: ignore[attr-defined]  # the logger connector sets it
             self.write_down(trainer, self.training())
             self._images = self._steps = 0
             self._waited = self._worked = 0.0

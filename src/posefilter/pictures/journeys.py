@@ -54,7 +54,7 @@ def draw_glimpses(
     """
     T, n = states.shape[:2]
     on = hits(mask, states)
-    view = whole(*mask.shape, 440)
+    view = whole(mask.shape[0], mask.shape[1], 440)
     picture = view.show(rgb)
     draw_lines(picture, [view.place(line) for line in outline(mask)], (255, 255, 255), 1, closed=True)
     for i in range(n):

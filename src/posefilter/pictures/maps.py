@@ -29,7 +29,7 @@ def draw_proposals(
     said: Proposals, rgb: np.ndarray, K: np.ndarray, truth: np.ndarray, shape: Shape, radius: float, title: str
 ) -> np.ndarray:
     """Draw the chance map, the object's points as colours beside the true ones, and poses drawn from them."""
-    view = whole(*rgb.shape[:2], _TILE)
+    view = whole(rgb.shape[0], rgb.shape[1], _TILE)
     edge = outlines_of(truth, shape, view.camera(K), view.height, view.width)
     chance = heat_over(rgb, said.chance, view)
     draw_lines(chance, edge, TRUTH, 2, closed=True)
@@ -85,7 +85,7 @@ def draw_relevance(
 
     mask (H, W) bool: the object's visible part, whose rim is drawn.
     """
-    view = whole(*rgb.shape[:2], _TILE - 80)
+    view = whole(rgb.shape[0], rgb.shape[1], _TILE - 80)
     rim = [view.place(line) for line in outline(mask)]
     heat = heat_over(rgb, relevance, view)
     mean = relevance_on(relevance, mask), relevance_on(relevance, ~mask)

@@ -95,7 +95,7 @@ def draw_pose(
     """Draw a pose's outline and axes into a picture, in place.  Poses that are not finite draw nothing."""
     if not np.isfinite(pose).all():
         return
-    draw_lines(picture, outlines_of(pose, shape, K, *picture.shape[:2], coarse), colour, width, closed=True)
+    draw_lines(picture, outlines_of(pose, shape, K, picture.shape[0], picture.shape[1], coarse), colour, width, closed=True)
     draw_axes(picture, K, pose, shape, colour, width)
 
 
