@@ -39,8 +39,8 @@ class Told:
         if self.answer == "mean":
             way = way.mean((0, 1)).expand_as(way)
         raw = way / (W / 2) if isinstance(self.head, Unbounded) else torch.atanh((way / (0.25 * W)).clamp(-0.999, 0.999))
-        motion = self.head(raw, cloud.state, W, H)
         flat = torch.zeros_like(cloud.log_weights)
+        motion = self.head(raw, flat, cloud.state, W, H)
         pose = torch.eye(4).expand(*flat.shape, 4, 4)
         return Reading(flat, motion, pose, cloud.memory)
 

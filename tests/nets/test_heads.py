@@ -4,20 +4,30 @@ import torch
 
 from posefilter.geometry.pose import invert, is_rigid, transform
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
-from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointSixD, Unbounded, fill_depth
+from posefilter.nets.heads import AbsoluteQuaternion, Bounded, Held, NoPose, OwnPointSixD, Unbounded, fill_depth
 
 
 def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
     g = torch.Generator().manual_seed(0)
     state = torch.rand(4, 100, 2, generator=g) * torch.tensor([99.0, 49.0])
-    raw = torch.randn(4, 100, 2, generator=g) * 5
-    goal = state + Bounded(0.3)(raw, state, 100, 50)
+    raw, logit = torch.randn(4, 100, 2, generator=g) * 5, torch.zeros(4, 100)
+    goal = state + Bounded(0.3)(raw, logit, state, 100, 50)
     assert goal.min() >= 0
     assert (goal <= torch.tensor([99.0, 49.0])).all()
     assert (goal - state).abs().max() <= 30 + 1e-4
-    out = state + Unbounded()(raw, state, 100, 50)
+    out = state + Unbounded()(raw, logit, state, 100, 50)
     assert (out < 0).any()
     assert (out > 100).any()
+
+
+def test_who_is_there_stays_there() -> None:
+    raw, state = torch.ones(1, 3, 2), torch.full((1, 3, 2), 20.0)
+    logit = torch.tensor([[-9.0, 0.0, 9.0]]).requires_grad_()
+    free, held = Bounded(0.1)(raw, logit, state, 100, 80), Held(Bounded(0.1))(raw.requires_grad_(), logit, state, 100, 80)
+    torch.testing.assert_close(held / free, torch.tensor([1.0, 0.5, 0.0])[None, :, None].expand(1, 3, 2), atol=2e-4, rtol=0)
+    held.sum().backward()
+    assert logit.grad is None
+    assert raw.grad is not None
 
 
 def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> None:

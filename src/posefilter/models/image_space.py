@@ -108,7 +108,7 @@ class ImageSpace(PoseEstimator):
         extra = torch.cat([self.context.look(scene.context, state), self.place(scene, state)], dim=-1)
         said = self.net(patch, extra, memory)
         height, width = scene.image.shape[-2:]
-        motion = self.motion(said.motion, state, width, height)
+        motion = self.motion(said.motion, said.logit, state, width, height)
         pose = self.pose_code(said.pose, self.own_points(scene, state)[0])
         return Reading(F.logsigmoid(said.logit), motion, pose, said.memory)
 

@@ -13,8 +13,8 @@ from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
 class Motion(Protocol):
     """Turns two plain outputs into a displacement."""
 
-    def __call__(self, raw: Tensor, state: Tensor, width: int, height: int) -> Tensor:
-        """(B, N, 2), (B, N, 2) [px] in a frame of width x height -> (B, N, 2) [px]."""
+    def __call__(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
+        """(B, N, 2), likelihood's logit (B, N), (B, N, 2) [px] in a frame of width x height -> (B, N, 2) [px]."""
         ...
 
 
@@ -35,7 +35,7 @@ class PoseCode(Protocol):
 class Unbounded(nn.Module):
     """The outputs are the displacement, in half frame widths; a particle may leave the frame, and go on."""
 
-    def forward(self, raw: Tensor, state: Tensor, width: int, height: int) -> Tensor:
+    def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2) -> (B, N, 2) [px]."""
         return raw * (width / 2)
 
@@ -47,11 +47,27 @@ class Bounded(nn.Module):
         super().__init__()
         self.reach = reach
 
-    def forward(self, raw: Tensor, state: Tensor, width: int, height: int) -> Tensor:
-        """(B, N, 2), (B, N, 2) [px] -> (B, N, 2) [px]."""
+    def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
+        """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
         corner = state.new_tensor([width - 1.0, height - 1.0])
         goal = state + torch.tanh(raw) * self.reach * width
         return torch.minimum(goal.clamp_min(0.0), corner) - state
+
+
+class Held(nn.Module):
+    """Another motion, less the surer the particle is of being on the object: who is there stays there.
+
+    A displacement that is wrong in one place in twenty throws a cloud off again, all copies of a particle at once. The
+    likelihood learns nothing through this: it has a lesson of its own.
+    """
+
+    def __init__(self, motion: Motion) -> None:
+        super().__init__()
+        self.motion = motion
+
+    def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
+        """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
+        return self.motion(raw, logit, state, width, height) * torch.sigmoid(-logit.detach())[..., None]
 
 
 class _AnyObject(nn.Module):
