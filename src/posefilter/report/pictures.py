@@ -13,11 +13,34 @@ SECTIONS = {  # the first whose words a picture's name has; what is in none is "
     "worst": {"worst"},
     "best": {"best"},
     "overlays": {"overlay", "overlays", "estimate", "estimates", "pose", "poses"},
-    "belief": {"belief", "beliefs", "so3", "rotations", "likelihood", "field", "proposals", "relevance", "marginals"},
-    "particles": {"journeys", "particles", "cloud", "clouds", "film", "video", "strip", "signs", "health", "filter"},
+    "belief": {
+        "belief",
+        "beliefs",
+        "so3",
+        "rotations",
+        "likelihood",
+        "field",
+        "points",
+        "proposals",
+        "relevance",
+        "marginals",
+    },
+    "particles": {
+        "journeys",
+        "particles",
+        "cloud",
+        "clouds",
+        "film",
+        "video",
+        "strip",
+        "silhouettes",
+        "signs",
+        "health",
+        "filter",
+    },
 }
 LARGEST_PX = 2000
-SHEET_PX = 1100  # from which width on a picture is a sheet of several, which a phone scrolls
+SHEET_PX = 900  # from which width on a picture is a sheet of several, which a phone scrolls
 KEPT_BYTES = 60_000
 
 
