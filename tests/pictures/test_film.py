@@ -10,7 +10,7 @@ from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.pictures.canvas import TRUTH, whole
-from posefilter.pictures.cloud import weight_colours
+from posefilter.pictures.cloud import draw_strip, weight_colours
 from posefilter.pictures.film import Film, coverage, draw_silhouettes, hulls_on_image, outlines, to_gif
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
@@ -73,6 +73,20 @@ def test_sheet_of_silhouettes_shows_the_true_outline_in_every_tile() -> None:
         assert tile[290:].any()
     yellow = np.array([240, 240, 60])
     assert (np.abs(sheet.astype(int) - yellow).max(-1) < 70).sum() > 2000  # where every particle agrees
+
+
+def test_close_ups_are_below_their_frames_however_few_steps_there_are() -> None:
+    truth, hull = pose().numpy(), HULL
+    for count in (2, 3):
+        trace = trace_of([pose().expand(5, 4, 4)] * count, [[0] * 5] * count)
+        sheets = [
+            draw_silhouettes(RGB, K, trace, hull, truth, "silhouettes"),
+            draw_strip(RGB, K, trace, 0, PoseSpace((0.0, 0.0, 0.0), 0.14), "particles", width=300),
+        ]
+        for sheet in sheets:
+            assert sheet.shape[1] == count * 306 + 6
+            rows = sheet[60:-40]
+            assert (rows[len(rows) * 3 // 4, -150:-10] != 255).any()  # the last tile of the second row is not empty
 
 
 def test_pixels_move_from_their_parents_to_themselves() -> None:

@@ -83,7 +83,7 @@ def draw_strip(
         steps = [PoseStep(K, trace, image, number, space) for number in steps_shown(len(trace.clouds), 4)]
         near = close_up(steps[-1].extent(), height, wide, width, margin=0.1)
         tiles = [headed(one.draw(rgb, frame), one.caption) for one in steps] + [one.draw(rgb, near) for one in steps]
-        legend = axes_legend()
+        legend, columns = axes_legend(), len(steps)
     else:
         tiles = []
         for number in steps_shown(len(trace.clouds), 8):
@@ -92,8 +92,8 @@ def draw_strip(
             off = ((state < -0.5) | (state > [wide - 0.5, height - 0.5])).any(1).mean()
             caption = caption_of(trace, image, number, "px") + (f", {off:.0%} off the frame" if off else "")
             tiles.append(headed(draw_cloud(rgb, state, weights, frame), caption))
-        legend = []
-    sheet = grid(tiles, 4)
+        legend, columns = [], 4
+    sheet = grid(tiles, columns)
     head = strip(sheet.shape[1], title or "Particles over the filter's iterations", size=22)
     return np.concatenate([head, sheet, weight_scale(sheet.shape[1], legend)])
 

@@ -87,7 +87,7 @@ def draw_silhouettes(
             draw_lines(picture, [view.place(line) for line in outlines(true)], TRUTH, 2, closed=True)
             row.append(picture)
         rows[0][-1] = headed(rows[0][-1], caption_of(trace, 0, number, "mm").partition(",")[0])
-    sheet = grid([*rows[0], *rows[1]], 4)
+    sheet = grid([*rows[0], *rows[1]], len(steps))
     legend = strip(420, "", [("true outline", TRUTH), ("outlines of 16 particles", _LINE)])
     foot = beside([flat_bar("weight that covers the pixel", "0", "1", "plasma"), legend], sheet.shape[1])
     return np.concatenate([strip(sheet.shape[1], title, size=20), sheet, foot])
