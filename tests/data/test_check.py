@@ -51,7 +51,7 @@ def test_a_true_dataset_passes(tmp_path, meshes):
     assert 0.4 < row["visible_share"] < 1
     assert json.loads((tmp_path / "out" / "data_report.json").read_text()) == report
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
-    assert sheet.shape == (2 * 276, 3 * 512, 3)
+    assert sheet.shape == (2 * 276 + 20, 3 * 512, 3)  # two rows of tiles, and the legend
     assert NAME in format_report(report)
     assert "no problems" in format_report(report)
 

@@ -7,6 +7,7 @@ import torch
 from tests.models.toy import scenes, square
 
 from posefilter.errors import UserError
+from posefilter.filters.candidates import jiggle
 from posefilter.filters.estimate import Best
 from posefilter.filters.initialise import FromDepth, FromProposals
 from posefilter.filters.loop import ParticleFilter
@@ -25,14 +26,15 @@ from posefilter.models.pose_pf import PosePF
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.nets.paper_likelihood import PaperLikelihood
 from posefilter.nets.proposals import ObjectCoordinateNet
+from posefilter.types import Belief
 
 SIGMA = (0.01, 0.2)
 
 
-def working(initialise: object = None, refine: object = None) -> PosePF:
+def working(initialise: object = None) -> PosePF:
     torch.manual_seed(0)
     start = initialise or FromProposals()
-    pieces = (start, Geometric(0.05, SIGMA[0]), Annealed(), Systematic(), Gaussian(0.4), Best(), refine or NoRefine())
+    pieces = (start, Geometric(0.05, SIGMA[0]), Annealed(), Systematic(), Gaussian(0.4), Best(), NoRefine())
     method = PosePF(
         PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
         CandidatePoses(each=6, proposed=4, particles=6, sigma=SIGMA),
@@ -77,10 +79,20 @@ def test_a_short_training_finds_the_pose(trained: PosePF) -> None:
 
 
 def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
-    plain = error(trained, 48).median()
-    refined = working(refine=Chain([Rescore(10, 256, SIGMA[0]), Gradient(20, sigma=SIGMA[0], final_sigma=SIGMA[0])]))
-    refined.load_state_dict(trained.state_dict(), strict=True)
-    assert error(refined, 48).median() < 0.9 * plain
+    """From places a few centimetres off, so that the gain does not drown in what so short a training leaves open."""
+    trained.eval()
+    batch = scenes(32, seed=40_000)
+    g = torch.Generator().manual_seed(0)
+    truth = batch.camera_from_object
+    start = jiggle(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
+    belief = Belief(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
+    with torch.no_grad():
+        scene = trained.observe(batch)
+        climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])
+        refined = Chain([Rescore(1, 256, SIGMA[0]), climb])(belief, scene, trained, g)
+    before, after = (add(x, truth, trained.model.points).median() for x in (belief.best, refined.best))
+    assert before > 0.05
+    assert after < 0.6 * before
 
 
 def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
