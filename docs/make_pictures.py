@@ -94,7 +94,7 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     title = f"Belief about one image, {one.trace.belief.log_weights.shape[1]} particles"
     write(
         out / "belief.jpg",
-        picture(draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object, title)),
+        rasterise(draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object, title)),
     )
     title = "Particles over the filter's iterations"
     write(out / "particles.jpg", draw_strip(sample.rgb, K, one.trace, 0, method.space, title))
@@ -158,11 +158,6 @@ def screen(page: Path, dark: bool) -> np.ndarray:
                    *(["--blink-settings=preferredColorScheme=0"] if dark else []), page.resolve().as_uri()]  # fmt: skip
         subprocess.run(command, check=True, capture_output=True, timeout=300)
         return np.asarray(Image.open(shot).convert("RGB"))
-
-
-def picture(drawn: object) -> np.ndarray:
-    """Return a figure of either kind as a picture."""
-    return drawn if isinstance(drawn, np.ndarray) else rasterise(drawn)  # type: ignore[arg-type]
 
 
 def write(path: Path, content: np.ndarray) -> None:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
@@ -18,7 +17,7 @@ from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import invert, make_pose, origin_of, pose_about, rotation_of, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.models.pose_pf import PosePF, PoseScene
-from posefilter.nets.coordinates import ask
+from posefilter.nets.coordinates import ask, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, Points, PoseLikelihood, look
 from posefilter.nets.paper_likelihood import PaperLikelihood
@@ -164,10 +163,8 @@ def proposals_of(method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
     poses = method.propose(scene, drawn, generator)[0].cpu().double()
     axes = project_axes(poses, model.center.cpu().double(), 0.5 * model.radius, batch.intrinsics[0].cpu().double())
-    points = transform(invert(batch.camera_from_object), scene.cells.point.flatten(1, 2))
-    true = ((points - center) / model.radius).unflatten(1, scene.cells.valid.shape[1:])[0]
-    shown = F.interpolate(batch.mask.float(), size=scene.cells.valid.shape[1:], mode="nearest")[0, 0] > 0
-    on = shown & scene.cells.valid[0] & (true.norm(dim=-1) < 1.2)
+    truth, _, usable = true_coordinates(scene.cells, batch.mask, batch.camera_from_object, center, model.radius)
+    true, on = truth[0], usable[0]
     off = (scene.said.coordinate[0] - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan
     chance, coordinate = torch.sigmoid(scene.said.logit[0]), scene.said.coordinate[0]

@@ -88,9 +88,11 @@ class PersistentParticles(nn.Module):
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on from what `state` returned."""
-        frames = state["frames"].tolist() if state else []
-        self._poses = dict(zip(frames, state["poses"], strict=True)) if state else {}
-        self._level = dict(zip(frames, state["levels"].tolist(), strict=True)) if state else {}
+        self._poses, self._level = {}, {}
+        if state:
+            frames = state["frames"].tolist()
+            self._poses.update(zip(frames, state["poses"], strict=True))
+            self._level.update(zip(frames, state["levels"].tolist(), strict=True))
 
     @torch.no_grad()
     def advance(

@@ -215,8 +215,7 @@ class PoseEstimator(LightningModule):
         """Log the metrics; `val/score` is what the best checkpoint has most of."""
         results = self.results()
         self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
-        score = results["add"]["auc"] if results["add"] else 100 * results["particles_on_object"]
-        self.log("val/score", float(score), prog_bar=True)
+        self.log("val/score", score_of(results), prog_bar=True)
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
@@ -233,6 +232,16 @@ class PoseEstimator(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the object from the checkpoint."""
         self.adopt(ObjectModel(**checkpoint["object_model"]))
+
+
+def score_of(results: dict[str, Any]) -> float:
+    """Return one figure in [0, 100], more is better: the ADD AUC, or of a detector the mean of particles on the object and box IoU.
+
+    Particles may all be on the object long before the box that they tell fits it.
+    """
+    if results["add"]:
+        return float(results["add"]["auc"])
+    return 50.0 * float(results["particles_on_object"] + results["iou"])
 
 
 def flatten(results: dict[str, Any], prefix: str = "") -> dict[str, float]:

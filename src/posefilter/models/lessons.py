@@ -62,7 +62,7 @@ class CandidatePoses:
     def __init__(
         self,
         each: int = 8,
-        proposed: int = 16,
+        proposed: int = 8,
         particles: int = 16,
         sigma: tuple[float, float] = (0.004, 0.25),
         start: float = 0.05,

@@ -76,6 +76,22 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
     return points[chosen], float(nearest.mean())
 
 
+def true_coordinates(
+    cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what a perfect network would say.
+
+    mask: (B, 1, H, W) bool; camera_from_object: (B, 4, 4) [m]. -> the object point that each cell's measured point is, over
+    the radius, from the centre, (B, h, w, 3); whether the cell's middle pixel shows the object, (B, h, w) bool; and whether
+    it also has a depth that can be of the object, so that the point is true.
+    """
+    h, w = cells.valid.shape[1:]
+    on = mask[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:, :h, :w]
+    R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
+    truth = ((cells.point - t) @ R - center) / radius
+    return truth, on, on & cells.valid & (truth.norm(dim=-1) < 1.2)
+
+
 def coordinate_loss(
     said: Coordinates, cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float, reach: float
 ) -> tuple[Tensor, Tensor]:
@@ -84,10 +100,8 @@ def coordinate_loss(
     5 x binary cross-entropy for `is it the object`, and where it is and depth is known, cross-entropy of the fragments and
     0.3 x the true one's L1 error in units of their reach [radii]. mask: (B, 1, H, W) bool.
     """
-    on = mask[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:, : said.logit.shape[1], : said.logit.shape[2]]
-    R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
-    truth = ((cells.point - t) @ R - center) / radius
-    inside = (on & cells.valid & (truth.norm(dim=-1) < 1.2)).float()
+    truth, on, usable = true_coordinates(cells, mask, camera_from_object, center, radius)
+    inside = usable.float()
     count = inside.sum((1, 2)).clamp_min(1.0)
     mean = lambda x: (x * inside).sum((1, 2)) / count  # noqa: E731
     bce = F.binary_cross_entropy_with_logits(said.logit, on.float(), reduction="none").mean((1, 2))
