@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning import Trainer
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
@@ -14,14 +13,13 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
-from posefilter.run.build import instantiate
 from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.pieces import changed, changes
 from posefilter.run.results import record, show, write_json
-from posefilter.run.train import build_data, quiet, score
+from posefilter.run.train import build_data, make_trainer, quiet, score
 from posefilter.run.voice import typed
 from posefilter.types import ObjectModel
 
@@ -54,9 +52,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method.adopt(object_to_judge(data, method.model))
     records = Records(beliefs=True)
     callbacks = [records, progress(job.cfg.console)]
-    trainer = instantiate(job.cfg.trainer, "trainer", callbacks=callbacks, logger=False, enable_progress_bar=False)
-    assert isinstance(trainer, Trainer)
-    trainer.test(method, datamodule=data, verbose=False)
+    make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz"}
     native = data.reader.native_from_mesh
     if method.tells_pose:

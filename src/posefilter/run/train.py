@@ -36,11 +36,10 @@ def train(job: Job) -> float:
         return score(done)
     check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
-    method = build_method(recipe(job))  # first, since it is the sooner to complain
+    method, trainer = build_method(recipe(job)), build_trainer(job)  # first, since they are the sooner to complain
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
     method.adopt(data.object_model(0))
-    trainer = build_trainer(job)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
     start = start_from(job)
     before = int(read_checkpoint(start)["global_step"]) if start else 0
@@ -103,7 +102,18 @@ def build_trainer(job: Job) -> Trainer:
             story.settings = comparable(job)
     callbacks.append(progress(cfg.console))
     loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]
-    trainer = instantiate(cfg.trainer, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=False)
+    return make_trainer(cfg.trainer, callbacks, loggers)
+
+
+def make_trainer(node: DictConfig, callbacks: list[Callback], loggers: list[Logger] | None = None) -> Trainer:
+    """Build a trainer of its settings; refuse those that would blur poses."""
+    precision = node.get("precision", "32-true")
+    if str(precision) not in ("32-true", "32"):
+        raise UserError(
+            f"trainer.precision={precision}: half precision costs a pose millimetres, and double slows all down; "
+            "leave it at 32-true (networks take bfloat16 by themselves where that is fast and safe)"
+        )
+    trainer = instantiate(node, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=False)
     assert isinstance(trainer, Trainer)
     return trainer
 
@@ -145,4 +155,4 @@ def quiet() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     for text in (".*does not have many workers.*", ".*LeafSpec.*", ".*Checkpoint directory.*", ".*log_every_n_steps.*"):
         warnings.filterwarnings("ignore", text)
-    torch.set_float32_matmul_precision("high")
+    torch.set_float32_matmul_precision("highest")  # TF32 would cost a pose at 1 m half a millimetre
