@@ -41,6 +41,23 @@ def test_bars_are_for_terminals(capsys: pytest.CaptureFixture[str], monkeypatch:
     assert isinstance(progress("plain"), Lines)
 
 
+def test_a_long_training_gives_signs_of_life(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One a pause, also where a validation spoke last; earlier validations' figures are not told again."""
+    now = [0.0]
+    monkeypatch.setattr("posefilter.run.console.time.perf_counter", lambda: now[0])
+    trainer: Any = SimpleNamespace(global_step=0, max_steps=40, callback_metrics=METRICS, sanity_checking=False)
+    lines, module = Lines(pause=60), SimpleNamespace()
+    lines.on_train_start(trainer, module)  # type: ignore[arg-type]
+    for step, seconds in ((1, 30), (2, 61), (3, 100)):
+        trainer.global_step, now[0] = step, seconds
+        lines.on_train_batch_end(trainer, module)  # type: ignore[arg-type]
+    assert capsys.readouterr().out == "step 2 of 40: loss 1.25, 0.03 steps/s, 19 min 19 s left\n"
+    lines.on_validation_end(trainer, module)  # type: ignore[arg-type]
+    now[0] = 159
+    lines.on_train_batch_end(trainer, module)  # type: ignore[arg-type]
+    assert capsys.readouterr().out.count("\n") == 1
+
+
 @pytest.mark.parametrize("console", ["rich", "plain"])
 def test_a_validation_is_one_line(console: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Words for people, numbers for machines; parts of the images are in the log alone."""

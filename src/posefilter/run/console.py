@@ -20,7 +20,7 @@ SHOWN = (  # metric, what people call it, format
 
 
 def progress(console: str) -> Callback:
-    """Return the progress display: "rich" bars on a terminal, else a line at each validation ("plain": as JSON)."""
+    """Return the progress display: "rich" bars on a terminal, else lines ("plain": as JSON)."""
     return Bars() if console != PLAIN and sys.stdout.isatty() else Lines(console)
 
 
@@ -41,26 +41,34 @@ def is_whole(name: str) -> bool:
 
 
 class Lines(Callback):
-    """One line at each validation: step, loss, what was measured, speed, and how long it will still take."""
+    """A line at each validation, and a sign of life every `pause` seconds: step, loss, speed, and how long it still takes."""
 
-    def __init__(self, console: str = "rich") -> None:
-        self.console = console
-        self._began, self._step = 0.0, 0
+    def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
+        self.console, self.pause = console, pause
+        self._began, self._step, self._last = 0.0, 0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
         self._began, self._step = time.perf_counter(), trainer.global_step
+        self._last = self._began
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Print a line where nothing was said for long."""
+        if time.perf_counter() - self._last >= self.pause:
+            self._tell("training", trainer, {k: v for k, v in trainer.callback_metrics.items() if k == "train/total"})
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print the line."""
-        if trainer.sanity_checking:
-            return
-        step, steps, seen = trainer.global_step, trainer.max_steps, trainer.callback_metrics
-        rate = (step - self._step) / max(time.perf_counter() - self._began, 1e-9)
+        if not trainer.sanity_checking:
+            self._tell("validation", trainer, trainer.callback_metrics)
+
+    def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
+        step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
+        rate = (step - self._step) / max(self._last - self._began, 1e-9)
         left = f", {duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
-        sentence = f"step {step} of {steps}: {told(seen)}, {rate:.2f} steps/s{left}"
+        sentence = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
         numbers = {name: float(value) for name, value in seen.items() if name == "train/total" or is_whole(name)}
-        say(self.console, "validation", sentence, step=step, steps=steps, **numbers, steps_per_second=rate)
+        say(self.console, event, f"step {step} of {steps}: {sentence}", step=step, steps=steps, **numbers, steps_per_second=rate)
 
 
 class Bars(Callback):
