@@ -1,85 +1,65 @@
-"""Measure how long training waits for its data: `python bench/loader.py ROOT --object NAME --meshes builtin`.
+"""Measure how long training waits for its data: `python bench/loader.py [--steps N] [train.py's settings ...]`.
 
-A step of training is stood in for by `--step-ms` of computing on one core (give the step time of your method); between steps
-the next batch is asked for, and the time until it is there is what training waits. Augmentation is as strong as it gets.
+The method really trains, a few steps for each kind of cache and each number of loader processes, and `Speed` says which share of
+the time it waited. Epochs are short here, so that what their starts cost is in the share. Without settings: the default
+method on 400 rendered frames.
 """
 
 import argparse
+import tempfile
 import time
+from pathlib import Path
 
 import torch
+from omegaconf import OmegaConf
 
-from posefilter.data.augment import Blank, Colour, Compose, DepthNoise, PasteOccluder, RollAndZoom
-from posefilter.data.module import PoseDataModule
+from posefilter.callbacks.speed import Speed
+from posefilter.run.build import instantiate
+from posefilter.run.command import compose_job
+from posefilter.run.job import Job
+from posefilter.run.machine import settle
+from posefilter.run.method import build_method, recipe
+from posefilter.run.train import build_data, make_trainer, quiet
+
+HOME = Path(__file__).parents[1]
+FEW = ["data.generate.frames=400"]
 
 
-def compute(seconds: float) -> None:
-    """Keep one core busy, as a training step does."""
-    end = time.perf_counter() + seconds
-    matrix = torch.rand(128, 128)
-    while time.perf_counter() < end:
-        matrix = (matrix @ matrix).clamp(0, 1)
-
-
-def measure(module: PoseDataModule, step: float, steps: int) -> tuple[float, float]:
-    """Return the share of time spent waiting, and the first wait [s] (workers starting), which the share leaves out."""
-    waiting = working = first = 0.0
-    done = 0
-    loader = module.train_dataloader()
-    for epoch in range(steps):
-        loader.sampler.set_epoch(epoch)
-        batches = iter(loader)
-        while done <= steps:
-            began = time.perf_counter()
-            if next(batches, None) is None:
-                break
-            waited = time.perf_counter() - began
-            compute(step)
-            if done == 0:
-                first = waited
-            else:
-                waiting, working = waiting + waited, working + time.perf_counter() - began - waited
-            done += 1
-        if done > steps:
-            break
-    return waiting / (waiting + working), first
+def measure(job: Job, cache: str, workers: int, steps: int) -> tuple[float, float, float]:
+    """Train; return the time until the data was ready [s], steps a second, and the share of the time spent waiting."""
+    node = job.cfg.data.copy()
+    node.cache, node.workers = cache, workers
+    began = time.perf_counter()
+    data = build_data(node, "plain")
+    data.setup("fit")
+    ready = time.perf_counter() - began
+    method, speed = build_method(recipe(job)), Speed()
+    method.adopt(data.object_model(0))
+    brief = {"max_steps": steps, "limit_val_batches": 0, "log_every_n_steps": 2 * steps}
+    trainer = make_trainer(OmegaConf.merge(job.cfg.trainer, brief), [speed])
+    trainer.fit(method, datamodule=data)
+    found = speed.training()
+    return ready, found["train_steps_per_second"], found["waiting_share"]
 
 
 def main() -> None:
-    """Print a table: cache, workers, set-up time, share of time waiting."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("root")
-    parser.add_argument("--object", default=None)
-    parser.add_argument("--meshes", default="builtin")
-    parser.add_argument("--width", type=int, default=320)
-    parser.add_argument("--batch", type=int, default=6)
-    parser.add_argument("--step-ms", type=float, default=400.0)
-    parser.add_argument("--steps", type=int, default=25)
-    parser.add_argument("--workers", type=int, nargs="+", default=[0, 1, 2])
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    augment = Compose([RollAndZoom(), PasteOccluder(), Blank(), DepthNoise(), Colour()])
-    print(f"{'cache':8} {'workers':>7} {'set-up [s]':>10} {'first batch [s]':>15} {'waiting':>8}")
-    for cache in ("none", "memory", "disk"):
-        for workers in args.workers:
-            module = PoseDataModule(
-                "fat",
-                args.root,
-                args.object,
-                args.meshes,
-                image_width=args.width,
-                split={"train": 1.0},
-                batch_size=args.batch,
-                workers=workers,
-                augment=augment,
-                cache=cache,
-                progress=False,
-            )
-            began = time.perf_counter()
-            module.setup("fit")
-            ready = time.perf_counter() - began
-            share, first = measure(module, args.step_ms / 1000, args.steps)
-            print(f"{cache:8} {workers:7d} {ready:10.1f} {first:15.2f} {share:8.1%}", flush=True)
+    """Print a table: cache, processes, set-up, speed, share of the time spent waiting."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--workers", default="0,1,2")
+    known, settings = parser.parse_known_args()
+    quiet()
+    with tempfile.TemporaryDirectory() as folder:
+        job = compose_job("train", HOME / "conf", [*FEW, *settings], Path(folder))
+        settle(job.cfg.threads, job.cfg.seed)
+        job.cfg.trainer.default_root_dir = folder
+        instantiate(job.cfg.data, "data").prepare_data()
+        print(f"batches of {job.cfg.data.batch_size}, {torch.get_num_threads()} threads, {known.steps} steps each")
+        print(f"{'cache':8} {'workers':>7} {'set-up [s]':>10} {'steps/s':>8} {'waiting':>8}")
+        for cache in ("none", "memory", "disk"):
+            for workers in map(int, known.workers.split(",")):
+                ready, rate, share = measure(job, cache, workers, known.steps)
+                print(f"{cache:8} {workers:7d} {ready:10.1f} {rate:8.2f} {share:8.1%}", flush=True)
 
 
 if __name__ == "__main__":
