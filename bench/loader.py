@@ -1,8 +1,8 @@
 """Measure how long training waits for its data: `python bench/loader.py [--steps N] [train.py's settings ...]`.
 
-The method really trains, a few steps for each kind of cache and each number of loader processes, and `Speed` says which share of
-the time it waited. Epochs are short here, so that what their starts cost is in the share. Without settings: the default
-method on 400 rendered frames.
+The method really trains, a few steps for each kind of cache and each number of loader processes, and `Speed` says which
+share of the time it waited. Epochs are short here, so that what their starts cost is in the share. Without settings: the
+default method on 400 rendered frames.
 """
 
 import argparse
