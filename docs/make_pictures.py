@@ -27,7 +27,7 @@ from posefilter.errors import UserError
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, rasterise, strip, whole
+from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, whole
 from posefilter.pictures.cloud import draw_strip
 from posefilter.pictures.overlay import Shape, axes_legend, overlay
 from posefilter.run.machine import settle
@@ -43,7 +43,7 @@ WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
 TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_scenes": "scenes/preview.png",
     "tour_check": "check/contact_sheet.png",
-    "tour_train": "run/figures/validation_overlays.png",
+    "tour_train": "run/figures/validation_overlays.jpg",
     "tour_predict": "prediction/belief.png",
 }
 BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
@@ -91,13 +91,8 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     write(out / "predictions.jpg", predictions(found, method, shape))
     one = found[min(EXAMPLE, len(found) - 1)]
     sample, K = one.sample, one.sample.intrinsics
-    title = f"Belief about one image, {one.trace.belief.log_weights.shape[1]} particles"
-    write(
-        out / "belief.jpg",
-        rasterise(draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object, title)),
-    )
-    title = "Particles over the filter's iterations"
-    write(out / "particles.jpg", draw_strip(sample.rgb, K, one.trace, 0, method.space, title))
+    write(out / "belief.jpg", draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object))
+    write(out / "particles.jpg", draw_strip(sample.rgb, K, one.trace, 0, method.space))
 
 
 def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:

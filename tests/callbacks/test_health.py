@@ -65,12 +65,12 @@ def test_scalars_are_named_by_step() -> None:
 def test_figure_shows_the_numbers_where_its_axes_say() -> None:
     picture = draw_health({"spread_m": [0.1, 0.02], "ess": [0.25, 0.5]}, images=3)
     blue = (picture == (43, 108, 176)).all(-1)
-    half = picture.shape[1] // 2
+    half, high = picture.shape[1] // 2, 190 - 8 - 48  # of the panels, which have ticks and labels below
     for columns, first, last in ((slice(0, half), 100 / 108, 20 / 108), (slice(half, None), 0.25, 0.5)):
         rows, places = np.nonzero(blue[:, columns])
-        top = len(picture) - 6 - 44 - 150  # the panels' plots are 150 pixels high, above ticks and labels
-        assert (149 - (rows[places == places.min()].mean() - top)) / 149 == pytest.approx(first, abs=0.03)
-        assert (149 - (rows[places == places.max()].mean() - top)) / 149 == pytest.approx(last, abs=0.03)
+        top = len(picture) - 6 - 48 - high
+        assert 1 - (rows[places == places.min()].mean() - top) / (high - 1) == pytest.approx(first, abs=0.03)
+        assert 1 - (rows[places == places.max()].mean() - top) / (high - 1) == pytest.approx(last, abs=0.03)
     assert in_unit("spread_m", [0.1]).tolist() == [100.0]
     assert in_unit("spread_rad", [math.pi]).tolist() == [180.0]
 

@@ -1,38 +1,14 @@
 """Journeys: who stood where, and saw what."""
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 
-from posefilter.callbacks.journeys import followed, glimpses_of, journey_film, lineage, save_film
+from posefilter.callbacks.journeys import followed, glimpses_of, lineage
 from posefilter.nets.glimpse import IntegerCut
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
-
-
-def journey() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    mask = torch.zeros(1, 40, 60, dtype=torch.bool)
-    mask[0, 10:25, 20:45] = True
-    start = torch.tensor([[2.0, 3.0], [50.0, 35.0], [30.0, 15.0]])
-    end = torch.tensor([[30.0, 20.0], [58.0, 38.0], [30.0, 15.0]])
-    states = torch.stack([start + s * (end - start) for s in torch.linspace(0, 1, 5)])
-    return torch.full((3, 40, 60), 0.2), mask, states
-
-
-def test_film_moves_and_is_an_animation(tmp_path: Path) -> None:
-    rgb, mask, states = journey()
-    frames = journey_film(rgb, mask, states, between=2, scale=2)
-    assert len(frames) == 4 * 2 + 1 + 2
-    first, last = np.asarray(frames[0]), np.asarray(frames[-1])
-    assert tuple(first[7, 5]) == (255, 80, 60)  # particle 0 starts at (2, 3), off the object
-    assert tuple(last[41, 61]) == (60, 220, 90)  # and ends on it, at (30, 20)
-    save_film(frames, tmp_path / "films" / "a.webp")
-    with Image.open(tmp_path / "films" / "a.webp") as film:
-        assert film.format == "WEBP"
-        assert film.n_frames >= 9
 
 
 def test_a_journey_is_a_line_of_ancestors() -> None:

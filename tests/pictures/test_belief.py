@@ -5,13 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import exp_so3
-from posefilter.pictures.belief import draw_belief, longest_axis, sphere_map
-from posefilter.pictures.canvas import rasterise
+from posefilter.pictures.belief import dot_radii, draw_belief, draw_rotations, longest_axis, marginals, single
+from posefilter.pictures.canvas import halved
+from posefilter.pictures.mollweide import blank_map, on_map, sphere_map, turn_colours
+from posefilter.pictures.sheet import WIDTH
 from posefilter.types import Belief, ObjectModel
 
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
@@ -45,10 +45,6 @@ def two_modes(share: float = 0.3, count: int = 400) -> tuple[Belief, torch.Tenso
     return Belief(poses[None], weights.log()[None], a[None], torch.zeros(1)), a, b
 
 
-def map_of(figure: Figure) -> Axes:
-    return next(axes for axes in figure.axes if axes.name == "mollweide")
-
-
 @pytest.mark.parametrize(
     ("z_axis", "longitude", "latitude"),
     [((0, 0, -1), 0, 0), ((1, 0, 0), math.pi / 2, 0), ((-1, 0, 0), -math.pi / 2, 0), ((0, -1, 0), None, math.pi / 2)],
@@ -78,61 +74,89 @@ def test_longest_axis() -> None:
     assert longest_axis(model()._replace(hull=model().hull[:, [2, 1, 0]])) == 0
 
 
-def test_map_shows_each_mode_with_its_mass() -> None:
-    belief, _, _ = two_modes(share=0.3)
-    figure = draw_belief(belief, model(), RGB, K)
-    dots = max(map_of(figure).collections, key=lambda c: len(c.get_offsets()))
-    place, area = np.asarray(dots.get_offsets()), dots.get_sizes()
-    first = np.hypot(place[:, 0] - 0.5, place[:, 1] - 0.4) < 0.15
-    second = np.hypot(place[:, 0] + 1.4, place[:, 1] + 0.5) < 0.15
-    assert first.sum() == 200
-    assert second.sum() == 200
-    assert (area[second].mean() - 6) / (area[first].mean() - 6) == pytest.approx(0.3 / 0.7, rel=1e-6)
+def test_the_map_keeps_areas() -> None:
+    """A hundredth of the sphere is a hundredth of the map, near a pole or at the equator."""
+    ellipse = math.pi / 4 * 980 * 490  # on a map of 1000 pixels, rim aside
+    for latitude in (0.0, 0.6, 1.2):
+        height = 0.02 * math.pi / (math.pi / 4) / math.cos(latitude)  # of a patch a quarter of the way round
+        low, high = (math.sin(latitude) + side * height * math.cos(latitude) / 2 for side in (-1, 1))
+        edge = np.arcsin(np.linspace(low, high, 50))
+        right, left = (on_map(np.full(50, turn), edge, 1000) for turn in (math.pi / 4, -math.pi / 4))
+        area = np.trapezoid(right[:, 0] - left[:, 0], -right[:, 1])
+        assert area / ellipse == pytest.approx((high - low) / 2 / 4, rel=0.01)
+
+
+def test_corners_of_the_map_are_where_they_should_be() -> None:
+    places = on_map(np.array([0.0, math.pi, -math.pi, 2.0, 0.5]), np.array([0.0, 0.0, 0.0, math.pi / 2, -math.pi / 2]), 1000)
+    expected = [[500, 250], [990, 250], [10, 250], [500, 5], [500, 495]]
+    assert places == pytest.approx(np.array(expected), abs=0.5)
+
+
+def test_dots_areas_are_the_weights() -> None:
+    radii = dot_radii(np.array([0.0, 0.2, 0.4]), 3.0, 11.0)
+    assert radii[0] == pytest.approx(3)
+    assert radii[2] == pytest.approx(11)
+    assert (radii[1] ** 2 - 9) / (radii[2] ** 2 - 9) == pytest.approx(0.5)
 
 
 def test_pixels_of_the_map_are_coloured_where_the_belief_is_and_only_there() -> None:
-    belief, _, b = two_modes()
-    figure = draw_belief(belief, model(), RGB, K)
-    picture = rasterise(figure)
-    assert picture.shape[1] >= 1000
-    axes = map_of(figure)
-    longitude, latitude, tilt = (float(x) for x in sphere_map(b[:3, :3], 2))
+    belief, a, b = two_modes()
+    poses, weights, best = single(belief)
+    picture = draw_rotations(poses, weights, best, None, 2, 588).astype(int)
+    longitude, latitude, tilt = (x.numpy() for x in sphere_map(torch.stack([a, b])[:, :3, :3], 2))
+    places, colours = on_map(longitude, latitude, 588), turn_colours(tilt).astype(int)
+    empty = halved(blank_map(2 * 588)).astype(int)
+    drawn = np.argwhere(np.abs(picture - empty).max(-1) > 100)[:, ::-1]
+    near = np.linalg.norm(drawn[:, None] - places[None], axis=-1)
+    assert (near.min(1) < 40).all()  # nobody is anywhere else
+    assert (near[:, 1] < 25).sum() > 200
+    u, v = places[1].round().astype(int)
+    middle = picture[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3)
+    assert np.abs(np.median(middle, 0) - colours[1]).max() < 40
 
-    def at(u: float, v: float) -> np.ndarray:
-        x, y = axes.transData.transform((u, v))
-        middle = picture.shape[0] - 1 - round(y), round(x)
-        return picture[middle[0] - 3 : middle[0] + 4, middle[1] - 3 : middle[1] + 4].reshape(-1, 3).astype(int)
 
-    dots = max(axes.collections, key=lambda c: len(c.get_offsets()))
-    wanted = np.array(dots.cmap((tilt / math.pi + 1) / 2)[:3]) * 255
-    assert np.abs(np.median(at(longitude, latitude), 0) - wanted).max() < 40
-    assert (at(1.7, -0.8) > 200).all()  # nobody is there
+def test_the_heavier_mode_covers_more_of_the_map() -> None:
+    belief, a, b = two_modes(share=0.02)
+    poses, weights, _ = single(belief)
+    far = looking(2.6, -0.9)  # where the estimate is marked, out of the way
+    picture = draw_rotations(poses, weights, far, None, 2, 588).astype(int)
+    empty = halved(blank_map(2 * 588)).astype(int)
+    drawn = np.argwhere(np.abs(picture - empty).max(-1) > 60)[:, ::-1]
+    longitude, latitude, _ = (x.numpy() for x in sphere_map(torch.stack([a, b])[:, :3, :3], 2))
+    heavy, light = (int((np.linalg.norm(drawn - at, axis=1) < 40).sum()) for at in on_map(longitude, latitude, 588))
+    assert heavy > 1.5 * light > 100
+
+
+def test_sheet_shows_the_map_the_photograph_and_six_marginals() -> None:
+    belief, a, _ = two_modes()
+    picture = draw_belief(belief, model(), RGB, K, a.numpy())
+    assert picture.shape[1] == WIDTH
+    blue = (np.abs(picture.astype(int) - (122, 153, 196)).max(-1) < 3).any(0)
+    columns = np.nonzero(np.diff(blue.astype(int)) == 1)[0]
+    assert all(any(left < column < left + 190 for column in columns) for left in (60, 260, 460))
 
 
 def test_marginals_are_in_the_units_they_say() -> None:
     belief, a, _ = two_modes(share=0.0)
     truth = a.clone()
     truth[0, 3] += 0.007
-    figure = draw_belief(belief, model(), RGB, K, truth.numpy())
-    panels = {axes.get_title(): axes for axes in figure.axes}
-    shift = next(axes for title, axes in panels.items() if "camera x" in title)
-    assert "[mm]" in shift.get_xlabel()
-    estimate, true = (line.get_xdata()[0] for line in shift.lines)
-    assert true - estimate == pytest.approx(7.0)
-    mass, edges, _ = shift.patches[0].get_data()
-    assert abs(np.average((edges[1:] + edges[:-1]) / 2, weights=mass)) < 0.5  # the mean's own frame
-    turn = next(axes for title, axes in panels.items() if title.startswith("Turn") and title.endswith("z"))
-    mass, edges, _ = turn.patches[0].get_data()
-    width = np.sqrt(np.average(((edges[1:] + edges[:-1]) / 2) ** 2, weights=mass))
+    poses, weights, best = single(belief)
+    shifts, turns = marginals(poses, weights, best, truth, model().center.double())
+    estimate, true = shifts[0].marks
+    assert true - estimate == pytest.approx(7.0)  # [mm]
+    middle = lambda one: (one.edges[1:] + one.edges[:-1]) / 2  # noqa: E731
+    assert abs(np.average(middle(shifts[0]), weights=shifts[0].mass)) < 0.5  # the mean's own frame
+    width = np.sqrt(np.average(middle(turns[2]) ** 2, weights=turns[2].mass))
     assert width == pytest.approx(math.degrees(0.03), rel=0.2)
-    assert "[degrees]" in turn.get_xlabel()
+    assert shifts[0].edges[0] < min(shifts[0].marks) < max(shifts[0].marks) < shifts[0].edges[-1]
 
 
 def test_what_lies_beyond_a_histogram_is_told() -> None:
     belief, _, _ = two_modes(share=0.01)
-    figure = draw_belief(belief, model(), RGB, K)
-    said = [text.get_text() for axes in figure.axes for text in axes.texts if "beyond" in text.get_text()]
-    assert 1.0 <= max(float(text.split("%")[0]) for text in said) < 2.0  # the mode, and some of the tails
+    poses, weights, best = single(belief)
+    beyond = [one.beyond for row in marginals(poses, weights, best, None, model().center.double()) for one in row]
+    assert 0.01 <= max(beyond) < 0.02  # the mode, and some of the tails
+    assert all(one == pytest.approx(0, abs=0.06) for one in beyond)
 
 
 def test_a_batch_of_several_is_refused() -> None:

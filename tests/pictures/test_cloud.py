@@ -3,12 +3,22 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.pictures.canvas import whole
-from posefilter.pictures.cloud import caption_of, draw_cloud, draw_strip, spread_choice, steps_shown, weight_colours
+from posefilter.pictures.cloud import (
+    caption_of,
+    draw_cloud,
+    draw_strip,
+    off_frame,
+    spread_choice,
+    steps_shown,
+    weight_colours,
+)
+from posefilter.pictures.sheet import CAPTION, DETAIL, TITLE, WIDTH, tile_width
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 RGB = np.full((60, 80, 3), 128, np.uint8)
@@ -54,8 +64,13 @@ def test_colours_span_a_tenth_to_ten_times_the_mean() -> None:
 def test_strip_of_pixels_tells_who_left_the_frame() -> None:
     states = torch.tensor([[[10.0, 10.0], [30.0, 20.0]], [[12.0, 10.0], [300.0, 20.0]]])
     trace = trace_of(states, torch.full((2, 2), 0.5))
-    narrow, wide = (draw_strip(RGB, K, trace, 0, PixelSpace(), width=w) for w in (200, 400))
-    assert wide.shape[1] > 1.9 * narrow.shape[1]
+    sheet = draw_strip(RGB, K, trace, 0, PixelSpace())
+    assert sheet.shape[1] == WIDTH
+    title = round(TITLE * 1.25) + round(CAPTION * 1.25)
+    said = (sheet[title : title + round(DETAIL * 1.25)] < 128).all(-1)  # below "step 0" and "step 1"
+    assert said[:, 300:].sum() > 1.3 * said[:, :300].sum()
+    assert off_frame(states[1].numpy(), 60, 80) == 0.5
+    assert off_frame(np.array([[-0.4, 59.4], [79.6, 0.0], [0.0, -0.6]]), 60, 80) == pytest.approx(2 / 3)
     assert caption_of(trace, 0, 1, "px") == "step 1: noise 0.02 px, 100% effective"
 
 
@@ -63,14 +78,14 @@ def test_strip_of_poses_puts_dots_on_projected_centres() -> None:
     space = PoseSpace((0.0, 0.0, 0.1), 0.1)
     pose = make_pose(torch.eye(3), torch.tensor([0.1, -0.05, 0.7]))  # its centre at (0.1, -0.05, 0.8) -> (49.5, 24.5) px
     trace = trace_of(pose.expand(3, 50, 4, 4), torch.full((3, 50), 0.02))
-    sheet = draw_strip(RGB, K, trace, 0, space, width=400)
+    sheet = draw_strip(RGB, K, trace, 0, space)
     colour = weight_colours(np.full(50, 0.02))[0].astype(int)
     found = np.argwhere(np.abs(sheet.astype(int) - colour).max(-1) < 8)
-    u, v = whole(60, 80, 400).place(np.array([49.5, 24.5]))
-    frame = found[(found[:, 1] < 406) & (found[:, 0] < 380)]  # the first tile
+    u, v = whole(60, 80, tile_width(2)).place(np.array([49.5, 24.5]))
+    frame = found[(found[:, 1] < 290) & (found[:, 0] < 290)]  # the first tile
     top = frame[:, 0].mean() - v
     assert abs(frame[:, 1].mean() - 6 - u) < 2
-    assert 40 < top < 100  # below title and caption
+    assert abs(top - round(TITLE * 1.25) - round(CAPTION * 1.25)) < 3
     assert "noise 40 mm" in caption_of(trace, 0, 0, "mm")
 
 

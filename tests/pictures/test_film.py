@@ -12,6 +12,7 @@ from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.pictures.canvas import TRUTH, whole
 from posefilter.pictures.cloud import draw_strip, weight_colours
 from posefilter.pictures.film import Film, coverage, draw_silhouettes, hulls_on_image, outlines, to_gif
+from posefilter.pictures.sheet import WIDTH
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 H, W = 60, 80
@@ -67,26 +68,27 @@ def test_sheet_of_silhouettes_shows_the_true_outline_in_every_tile() -> None:
     trace = trace_of([pose(0.01 * t).expand(30, 4, 4) for t in range(6)], [list(range(30))] * 6)
     sheet = draw_silhouettes(RGB, K, trace, HULL, pose().numpy(), "silhouettes")
     green = (sheet == TRUTH).all(-1)
-    for column in range(4):
-        tile = green[:, 6 + column * 306 : 306 + column * 306]
-        assert tile[60:280].any()
-        assert tile[290:].any()
+    rows = np.nonzero(green[:, :290].any(1))[0]
+    steps = np.split(rows, np.nonzero(np.diff(rows) > 60)[0] + 1)[:4]
+    assert len(steps) == 4
+    for step in steps:
+        assert green[step[0] : step[-1], 300:].any()  # the close-up, beside it
     yellow = np.array([240, 240, 60])
     assert (np.abs(sheet.astype(int) - yellow).max(-1) < 70).sum() > 2000  # where every particle agrees
 
 
-def test_close_ups_are_below_their_frames_however_few_steps_there_are() -> None:
+def test_close_ups_are_beside_their_frames_however_few_steps_there_are() -> None:
     truth, hull = pose().numpy(), HULL
     for count in (2, 3):
         trace = trace_of([pose().expand(5, 4, 4)] * count, [[0] * 5] * count)
         sheets = [
             draw_silhouettes(RGB, K, trace, hull, truth, "silhouettes"),
-            draw_strip(RGB, K, trace, 0, PoseSpace((0.0, 0.0, 0.0), 0.14), "particles", width=300),
+            draw_strip(RGB, K, trace, 0, PoseSpace((0.0, 0.0, 0.0), 0.14), "particles"),
         ]
         for sheet in sheets:
-            assert sheet.shape[1] == count * 306 + 6
-            rows = sheet[60:-40]
-            assert (rows[len(rows) * 3 // 4, -150:-10] != 255).any()  # the last tile of the second row is not empty
+            assert sheet.shape[1] == WIDTH
+            filled = (sheet[:, 300:590] != 255).any(-1).mean(1) > 0.98  # rows of the close-ups, beside their frames
+            assert abs(filled.sum() - count * 218) < 10
 
 
 def test_pixels_move_from_their_parents_to_themselves() -> None:
@@ -97,9 +99,10 @@ def test_pixels_move_from_their_parents_to_themselves() -> None:
     assert len(frames) == 3
     view, colour = whole(H, W, 480), weight_colours(np.full(2, 0.5))[0].astype(int)
     top = int(np.nonzero((frames[0] == TRUTH).all(-1))[0].min()) - int(view.place(np.array([5.0, 5.0]))[1]) + 1
+    left = (WIDTH - view.width) // 2
 
     def is_at(frame: np.ndarray, u: float, v: float) -> bool:
-        column, row = view.place(np.array([u, v])).round().astype(int)
+        column, row = (view.place(np.array([u, v])) + np.array([left, 0])).round().astype(int)
         return bool(
             np.abs(frame[top + row - 1 : top + row + 2, column - 1 : column + 2].astype(int) - colour).min(-1).min() < 12
         )
@@ -115,8 +118,9 @@ def test_film_of_poses_shows_frame_and_close_up() -> None:
     target = outlines(hulls_on_image(pose()[None], HULL, K))
     frames = list(Film(RGB, K, trace, PoseSpace((0.0, 0.0, 0.0), 0.14), HULL, target).frames(between=1))
     green = (frames[-1] == TRUTH).all(-1)
-    assert frames[-1].shape[1] == 640
-    left, right = green[:, :320].any(0), green[:, 320:].any(0)
+    assert frames[-1].shape[1] == WIDTH
+    green = green[: len(green) * 2 // 3]  # the legend is below
+    left, right = green[:, :300].any(0), green[:, 300:].any(0)
     assert right.sum() > 1.3 * left.sum()
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from posefilter.pictures.journeys import OFF, ON, START, draw_glimpses, draw_journeys, enlarged, hits
+from posefilter.pictures.sheet import legend
 
 MASK = np.zeros((40, 60), bool)
 MASK[10:25, 20:45] = True
@@ -23,8 +24,8 @@ def test_who_stands_on_the_mask() -> None:
 
 
 def test_ends_are_green_on_the_object_and_red_off_it() -> None:
-    picture = draw_journeys(RGB, MASK, STATES, "journeys", width=600)
-    top = len(picture) - 400 - 28  # two lines of writing above, the legend below
+    picture = draw_journeys(RGB, MASK, STATES, "journeys")
+    top = len(picture) - 400 - len(legend([("start", START), ("on the object", ON), ("off it", OFF)]))
     at = lambda u, v: picture[top + round((v + 0.5) * 10), round((u + 0.5) * 10)]  # noqa: E731
     assert tuple(at(30, 20)) == ON
     assert tuple(at(58, 38)) == OFF
@@ -32,8 +33,8 @@ def test_ends_are_green_on_the_object_and_red_off_it() -> None:
 
 
 def test_the_frame_grows_where_particles_leave_it() -> None:
-    inside = draw_journeys(RGB, MASK, STATES, "journeys", width=600)
-    outside = draw_journeys(RGB, MASK, STATES - 100, "journeys", width=600)
+    inside = draw_journeys(RGB, MASK, STATES, "journeys")
+    outside = draw_journeys(RGB, MASK, STATES - 100, "journeys")
     grey = (outside == 200).all(-1).sum()
     assert (inside == 200).all(-1).sum() < 50
     assert grey > 0.6 * 600 * 400
@@ -44,12 +45,12 @@ def test_glimpses_are_shown_whole_and_framed_by_where_they_were() -> None:
     patches[2, 1, 0, 2] = (10, 20, 250)  # a sample of particle 1 at step 2: top right
     sheet = draw_glimpses(RGB, MASK, STATES, patches, "glimpses")
     blue = places(sheet, (10, 20, 250), slice(None))
-    assert 15 * 15 < len(blue) < 21 * 21
+    assert 25 * 25 < len(blue) < 28 * 28  # a third of a cell
     row, column = blue.mean(0)
-    cell = sheet[int(row) - 14 : int(row) + 60, int(column) - 60 : int(column) + 20]
+    cell = sheet[int(row) - 20 : int(row) + 80, int(column) - 80 : int(column) + 20]
     assert (cell == OFF).all(-1).any()  # at step 2 it is off the object
     on = np.array([hits(MASK, s) for s in STATES]).sum()
-    table = sheet[:, 480:]
+    table = sheet[-3 * 90 :]
     assert abs((table == ON).all(-1).sum() / ((table == OFF).all(-1).sum()) - on / (15 - on)) < 0.25
 
 

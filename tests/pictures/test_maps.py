@@ -6,6 +6,7 @@ import torch
 
 from posefilter.pictures.canvas import TRUTH, whole
 from posefilter.pictures.maps import Proposals, draw_proposals, draw_relevance, heat_over, points_as_colours, relevance_on
+from posefilter.pictures.sheet import WIDTH, tile_width
 
 H, W = 48, 64
 RGB = np.full((H, W, 3), 100, np.uint8)
@@ -45,13 +46,20 @@ def test_sheet_of_relevance_shows_map_rim_and_both_clouds() -> None:
     weights = np.full(20, 0.05)
     start, end = np.tile([8.0, 8.0], (20, 1)), np.tile([40.0, 24.0], (20, 1))
     sheet = draw_relevance(relevance, RGB, MASK, (start, weights), (end, weights), "relevance")
-    assert 1000 < sheet.shape[1] < 1300
-    top = int(np.nonzero((sheet == TRUTH).all(-1))[0].min()) - round(16 * 400 / 64)  # of the tiles' photographs
-    dot = lambda tile, place: sheet[top + round(place[1] * 6.25), 6 + tile * 406 + round(place[0] * 6.25)].astype(int)  # noqa: E731
-    ground = dot(1, (60.0, 44.0))
-    assert np.abs(dot(1, (8.0, 8.0)) - ground).max() > 50
-    assert np.abs(dot(2, (8.0, 8.0)) - ground).max() < 5
-    assert np.abs(dot(2, (40.0, 24.0)) - ground).max() > 50
+    assert sheet.shape[1] == WIDTH
+    green = np.nonzero((sheet == TRUTH).all(-1).any(1))[0]
+    top = int(green[green > 480].min()) - round(16 * tile_width(2) / 64)  # of the clouds' photographs, below the map
+    scale = tile_width(2) / 64
+
+    def dot(tile: int, u: float, v: float) -> int:
+        """Return how far the picture there is from the grey ground."""
+        row, column = top + round(v * scale), 6 + tile * 297 + round(u * scale)
+        near = sheet[row - 2 : row + 3, column - 2 : column + 3].astype(int)
+        return int(np.abs(near - sheet[top + round(44 * scale), 6 + tile * 297 + round(60 * scale)]).max())
+
+    assert dot(0, 8.0, 8.0) > 50
+    assert dot(1, 8.0, 8.0) < 5
+    assert dot(1, 40.0, 24.0) > 50
 
 
 def test_sheet_of_proposals_shows_them_where_they_are() -> None:
@@ -66,7 +74,9 @@ def test_sheet_of_proposals_shows_them_where_they_are() -> None:
     hull = torch.tensor([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
     sheet = draw_proposals(said, RGB, K, truth, hull, 0.14, "proposals")
     red, cyan = (sheet == (255, 0, 0)).all(-1), (sheet == (0, 255, 255)).all(-1)
-    assert red[:, :500].sum() == cyan[:, 490:].sum() == 120 * 120  # the predicted and the true points, 16 x 16 pixels
-    orange = (np.abs(sheet.astype(int) - (255, 190, 40)).max(-1) < 12)[:450, 490:]
+    side = 16 * tile_width(2) / 64
+    assert red[:, :300].sum() == pytest.approx(side**2, rel=0.03)  # the predicted and the true points, 16 x 16 pixels
+    assert cyan[:, 300:].sum() == pytest.approx(side**2, rel=0.03)
+    orange = (np.abs(sheet.astype(int) - (255, 190, 40)).max(-1) < 12)[:330, 303:]
     assert orange.any()
-    assert abs(np.nonzero(orange)[1].mean() - 2 - 10 * 7.5) < 8
+    assert abs(np.nonzero(orange)[1].mean() - 10 * tile_width(2) / 64) < 8

@@ -12,16 +12,17 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import FileWriter
 
-from posefilter.pictures.canvas import to_png
+from posefilter.pictures.canvas import to_jpeg
 
 
 def post(trainer: Trainer, tag: str, drawn: np.ndarray | bytes, file: Path | None) -> None:
     """Show a picture (H, W, 3) uint8, or a film as the bytes of a GIF, under a tag at the trainer's step.
 
     file: where it is written too, its suffix aside (None: nowhere). It is packed once for all: `add_image` would pack it
-    again for each logger, slowly, and knows no films.
+    again for each logger, slowly, and knows no films. As a JPEG: TensorBoard reckons a checksum byte by byte in Python,
+    which for a PNG takes longer than most figures take to draw.
     """
-    packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_png(drawn), ".png")
+    packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_jpeg(drawn), ".jpg")
     width, height = size_of(drawn)
     image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
     for writer in writers(trainer):

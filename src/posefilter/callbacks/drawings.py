@@ -1,6 +1,6 @@
 """The figures of a validation, one function each: an occasion in, a picture out; None where it does not apply.
 
-Pictures (H, W, 3) uint8 become PNGs; bytes are a film, a GIF.
+Pictures are (H, W, 3) uint8; bytes are a film, a GIF.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,6 @@ from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
 from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.canvas import rasterise
 from posefilter.pictures.cloud import draw_strip, weights_of
 from posefilter.pictures.field import draw_point_field, draw_pose_field
 from posefilter.pictures.film import Film, draw_silhouettes, hulls_on_image, outlines, to_gif
@@ -46,8 +45,8 @@ class Occasion(NamedTuple):
         return isinstance(self.method.space, PoseSpace)
 
     def title(self, what: str) -> str:
-        """Return a figure's title."""
-        return f"{what}, image {self.one.frame_id}, {self.when}"
+        """Return a figure's title, and below it what it is of."""
+        return f"{what}\nimage {self.one.frame_id}, {self.when}"
 
     def mask(self) -> np.ndarray:
         """Return the object's visible part, (H, W) bool."""
@@ -64,33 +63,32 @@ def overlays(o: Occasion) -> Drawn:
 
 def best(o: Occasion) -> Drawn:
     """Draw the best images."""
-    return _gallery(o, "best", f"The {len(o.kept['best'])} best of the images")
+    return _gallery(o, "best", f"The {len(o.kept['best'])} best images")
 
 
 def worst(o: Occasion) -> Drawn:
     """Draw the worst images."""
-    return _gallery(o, "worst", f"The {len(o.kept['worst'])} worst of the images")
+    return _gallery(o, "worst", f"The {len(o.kept['worst'])} worst images")
 
 
 def particles(o: Occasion) -> Drawn:
     """Draw the clouds on the image, coloured by weight."""
-    title = o.title("Particles over the iterations")
-    return draw_strip(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title, width=300)
+    title = o.title("Particles by iteration")
+    return draw_strip(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
 
 
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
     if not o.method.tells_pose:
         return None
-    args = (o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief"))
-    return rasterise(draw_belief(*args))
+    return draw_belief(o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief"))
 
 
 def silhouettes(o: Occasion) -> Drawn:
     """Draw the silhouettes of particles that are poses."""
     if not o.posed:
         return None
-    title = o.title("Silhouettes of the particles")
+    title = o.title("Silhouettes")
     return draw_silhouettes(o.one.rgb, o.one.intrinsics, o.trace, o.method.model.hull.cpu(), o.one.truth, title)
 
 
@@ -102,7 +100,7 @@ def field(o: Occasion) -> Drawn:
     found = pose_field(o.method, o.scene, o.batch.camera_from_object[0], model, few_levels(o.trace.steps))
     center = model.center.cpu().double().numpy()
     shift = (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center + o.one.estimate[:3, 3] - o.one.truth[:3, 3]
-    return draw_pose_field(found, o.title("Likelihood about the true pose"), o.one.truth[:3, :3].T @ shift)
+    return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
 
 
 def points(o: Occasion) -> Drawn:
@@ -116,7 +114,7 @@ def points(o: Occasion) -> Drawn:
         for depthwise in ((False, True) if on else (False,))
     ]
     surface = (model.points - model.center).cpu().double().numpy()
-    return draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of single points")) if slices else None
+    return draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points")) if slices else None
 
 
 def proposals(o: Occasion) -> Drawn:
@@ -124,7 +122,7 @@ def proposals(o: Occasion) -> Drawn:
     said = proposals_of(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
     if said is None:
         return None
-    title = o.title("What the proposal network says")
+    title = o.title("Proposals")
     return draw_proposals(said, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title)
 
 
@@ -134,7 +132,7 @@ def relevance(o: Occasion) -> Drawn:
         return None
     clouds = [(c.state[0].double().numpy(), weights_of(c, 0).numpy()) for c in (o.trace.clouds[0], o.trace.clouds[-1])]
     seen = o.scene.relevance[0, 0].detach().float().cpu().numpy()
-    return draw_relevance(seen, o.one.rgb, o.mask(), clouds[0], clouds[1], o.title("Map of relevance"))
+    return draw_relevance(seen, o.one.rgb, o.mask(), clouds[0], clouds[1], o.title("Relevance"))
 
 
 def journeys(o: Occasion) -> Drawn:
@@ -155,16 +153,30 @@ def glimpses(o: Occasion) -> Drawn:
 
 def film(o: Occasion) -> Drawn:
     """Film the filter at work."""
-    hull, K = o.method.model.hull.cpu(), o.one.intrinsics
-    target = outlines(hulls_on_image(torch.as_tensor(o.one.truth)[None], hull, K)) if o.posed else outline(o.mask())
-    between = 2 if len(o.trace.clouds) <= 8 else 1
-    scenes = Film(o.one.rgb, K, o.trace, o.method.space, hull, target, o.title("The filter at work"))
-    return to_gif(list(scenes.frames(between)))
+    scene = Filmed(o.one.rgb, o.one.intrinsics, o.one.truth, o.mask())
+    return filmed(o.method, o.trace, scene, o.title("The filter at work"))
+
+
+class Filmed(NamedTuple):
+    """The image that a film is of."""
+
+    rgb: np.ndarray  # (H, W, 3) uint8
+    intrinsics: np.ndarray  # (3, 3) [px]
+    truth: np.ndarray  # (4, 4)
+    mask: np.ndarray  # (H, W) bool
+
+
+def filmed(method: PoseEstimator, trace: Trace, scene: Filmed, title: str) -> bytes:
+    """Film the filter on one image, whose trace this is.  -> a GIF."""
+    hull, K = method.model.hull.cpu(), scene.intrinsics
+    posed = isinstance(method.space, PoseSpace)
+    target = outlines(hulls_on_image(torch.as_tensor(scene.truth)[None], hull, K)) if posed else outline(scene.mask)
+    return to_gif(list(Film(scene.rgb, K, trace, method.space, hull, target, title).frames()))
 
 
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
     images = o.kept[kind]
-    return draw_gallery(images, o.shape, o.method.tells_pose, f"{title} {o.when}") if images else None
+    return draw_gallery(images, o.shape, o.method.tells_pose, f"{title}\n{o.when}") if images else None
 
 
 DRAWINGS: dict[str, Callable[[Occasion], Drawn]] = {

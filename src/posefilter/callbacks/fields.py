@@ -42,8 +42,8 @@ def pose_field(
     truth: Tensor,
     model: ObjectModel,
     sigmas: Sequence[float],
-    pixels: int = 64,
-    cells: int = 11,
+    pixels: int = 48,
+    cells: int = 9,
 ) -> PoseField:
     """Score slices through the truth of one image, at each noise level, with the same image points at all of them.
 
@@ -91,7 +91,7 @@ def point_field(
     on: bool,
     sigmas: Sequence[float],
     depthwise: bool = False,
-    cells: int = 41,
+    cells: int = 31,
 ) -> PointField:
     """Judge one pixel of one image at places in the object's frame, its colour and ray as they are.
 

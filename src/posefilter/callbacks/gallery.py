@@ -12,13 +12,14 @@ from posefilter.data.meshes import MeshStore
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, to_picture, whole
+from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, to_picture, whole
 from posefilter.pictures.cloud import draw_cloud, weight_scale
 from posefilter.pictures.overlay import Shape, axes_legend, overlay, view_of_poses
+from posefilter.pictures.sheet import DETAIL, headed, legend, sheet, tile_width
 from posefilter.types import Batch, Belief, Cloud, Reading, Trace
 
-_TILE = 256  # [px]; five in a row are as wide as a browser shows without shrinking
-_COLUMNS = 5
+_COLUMNS = 3
+_TILE = tile_width(_COLUMNS)
 
 
 class Shown(NamedTuple):
@@ -81,12 +82,10 @@ def shape_of(trainer: Trainer, method: PoseEstimator) -> Shape:
 
 def draw_gallery(kept: Sequence[Shown], shape: Shape, tells_pose: bool, title: str) -> np.ndarray:
     """Draw images side by side, in rows, under a title and above what the lines mean."""
-    sheet = grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
-    width = max(sheet.shape[1], 2 * _TILE)
-    sheet = np.pad(sheet, ((0, 0), (0, width - sheet.shape[1]), (0, 0)), constant_values=255)
-    legend = [("truth", TRUTH), ("estimate", ESTIMATE), *((f"axis {name}", colour) for name, colour in axes_legend())]
-    foot = strip(width, "", legend) if tells_pose else weight_scale(width, [], 15)
-    return np.concatenate([strip(width, title, size=20), sheet, foot])
+    tiles = grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
+    if not tells_pose:
+        return sheet(title, tiles, weight_scale())
+    return sheet(title, tiles, legend([("truth", TRUTH), ("estimate", ESTIMATE), *axes_legend()]))
 
 
 def draw_tile(one: Shown, shape: Shape, tells_pose: bool) -> np.ndarray:
@@ -95,8 +94,8 @@ def draw_tile(one: Shown, shape: Shape, tells_pose: bool) -> np.ndarray:
     if tells_pose:
         view = view_of_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
         picture = overlay(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
-        caption = f"image {one.frame_id}, ADD {1000 * one.error:.3g} mm"
+        caption = f"ADD {1000 * one.error:.3g} mm"
     else:
         picture = draw_cloud(one.rgb, one.pixels, one.weights, whole(height, width, _TILE))
-        caption = f"image {one.frame_id}, {1 - one.error:.0%} on the object"
-    return np.concatenate([strip(_TILE, caption), picture])
+        caption = f"{1 - one.error:.0%} on the object"
+    return headed(headed(picture, f"image {one.frame_id}", DETAIL), caption)

@@ -55,7 +55,7 @@ class FilterHealth(Callback):
             logger.log_metrics(scalars(curves, self.most), trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
-                picture = draw_health(curves, self._images, f"Filter health after {trainer.global_step} steps of training")
+                picture = draw_health(curves, self._images, f"Filter health\nafter {trainer.global_step} steps of training")
                 post(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health")
 
     def curves(self) -> dict[str, list[float]]:

@@ -7,8 +7,11 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from posefilter.callbacks.board import Budget, post
-from posefilter.callbacks.journeys import journey_film, lineage, save_film
+from posefilter.callbacks.drawings import Filmed, filmed
+from posefilter.callbacks.gallery import one_image
+from posefilter.callbacks.journeys import lineage
 from posefilter.metrics.signs import SignsOfFailure
+from posefilter.models.base import PoseEstimator
 from posefilter.pictures.canvas import AXES, Colour, to_picture
 from posefilter.pictures.curves import draw_shares
 from posefilter.pictures.journeys import draw_journeys
@@ -51,7 +54,7 @@ class Signs(Callback):
             logger.log_metrics({f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
-                title = f"Signs of failure after {trainer.global_step} steps of training"
+                title = f"Signs of failure\nafter {trainer.global_step} steps of training"
                 self._post(trainer, "figures/signs", "validation_signs", draw_signs(found, title))
 
     def on_test_batch_end(
@@ -59,20 +62,19 @@ class Signs(Callback):
     ) -> None:
         """Draw and film the first batch's journeys."""
         if batch_idx == 0 and on_pixels(outputs):
-            self.draw(trainer, outputs, batch)
+            self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
 
-    def draw(self, trainer: Trainer, trace: Trace, batch: Batch) -> None:
-        """Draw the journeys of a batch's first images."""
+    def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
+        """Draw and film the journeys of a batch's first images."""
         states = lineage(trace.clouds)
         for i in range(min(self.images, len(states))):
-            mask = batch.mask[i, 0].cpu().numpy()
-            title = f"Journeys, image {int(batch.frame_id[i])} of the test"
-            picture = draw_journeys(to_picture(batch.rgb[i]), mask, states[i].cpu().numpy(), title)
+            rgb, mask, number = to_picture(batch.rgb[i]), batch.mask[i, 0].cpu().numpy(), int(batch.frame_id[i])
+            picture = draw_journeys(rgb, mask, states[i].cpu().numpy(), f"Journeys\nimage {number} of the test")
             self._post(trainer, f"journeys/test_{i}", f"test_journeys_{i}", picture)
-            if self.folder is not None:
-                between = max(1, 24 // states.shape[1])
-                film = journey_film(batch.rgb[i], batch.mask[i], states[i], between)
-                save_film(film, self.folder / f"test_journeys_{i}.webp")
+            K, truth = (x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object))
+            scene = Filmed(rgb, K, truth, mask)
+            film = filmed(method, one_image(trace, i), scene, f"The filter at work\nimage {number} of the test")
+            self._post(trainer, f"journeys/film_{i}", f"test_film_{i}", film)
 
     def _post(self, trainer: Trainer, tag: str, file: str, picture: Any) -> None:
         post(trainer, tag, picture, self.folder and self.folder / file)

@@ -1,6 +1,7 @@
 """What a mesh is here, and the small pure functions on it.  Numpy throughout: rendering and labels live on the CPU."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -36,7 +37,7 @@ class Mesh:
     corner_normals: np.ndarray  # (F, 3, 3) float32, unit
     symmetries: np.ndarray = field(default_factory=_identity)  # (S, 4, 4) object_from_object, the identity first
 
-    @property
+    @cached_property
     def bounds(self) -> np.ndarray:
         """Return the corners of the axis-aligned box, least and greatest.  (2, 3) [m]."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])

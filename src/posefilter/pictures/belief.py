@@ -5,25 +5,26 @@ a colour for the turn about that axis. Ours looks along the camera: the centre i
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.gridspec import GridSpec
-from matplotlib.lines import Line2D
 
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import log_so3
-from posefilter.pictures.canvas import new_figure
+from posefilter.pictures.canvas import Colour, View, draw_dots, grid, halved
+from posefilter.pictures.cloud import faded, weight_colours, weight_scale
+from posefilter.pictures.curves import even_ticks
+from posefilter.pictures.mollweide import blank_map, on_map, sphere_map, turn_colours, turn_scale
+from posefilter.pictures.panels import Axis, beside, draw_mark, mass_panel
+from posefilter.pictures.sheet import CAPTION, DETAIL, headed, legend, lettered, sheet, tile_width
 from posefilter.types import Belief, ObjectModel
 
-_TILT = colormaps["hsv"]
-_MASS = "#4a6fa5"
-_TRUE, _BEST = "#159947", "#d6219c"  # darker than on photographs: these are read on white
+_TRUE: Colour = (21, 153, 71)  # darker than on photographs: these are read on white
+_BEST: Colour = (214, 33, 156)
 _NAMES = "xyz"
+_AWAY = ("right", "down", "away")  # camera axes
 
 
 def draw_belief(
@@ -34,8 +35,8 @@ def draw_belief(
     truth: np.ndarray | None = None,
     title: str = "",
     axis: int | None = None,
-) -> Figure:
-    """Draw the belief of one image: its centres on the photograph, its rotations on a map, and six marginals.
+) -> np.ndarray:
+    """Draw the belief of one image: its rotations on a map, its centres on the photograph, and six marginals.
 
     belief: of one image, with its leading dimension of 1 or without; rgb (H, W, 3) uint8; K (3, 3) [px]; truth (4, 4);
     axis: the object's axis on the map (its longest, if None).
@@ -43,20 +44,30 @@ def draw_belief(
     poses, weights, best = single(belief)
     true = None if truth is None else torch.as_tensor(np.asarray(truth), dtype=torch.float64)
     axis = longest_axis(model) if axis is None else axis
-    figure = new_figure(1100, 1040)
-    top = figure.add_gridspec(1, 6, left=0.065, right=0.975, bottom=0.55, top=0.91, wspace=0.9)
-    below = figure.add_gridspec(2, 6, left=0.065, right=0.975, bottom=0.06, top=0.47, hspace=0.55, wspace=0.9)
-    draw_centres(figure.add_subplot(top[0, :2]), poses, weights, best, true, model, rgb, K)
-    draw_rotations(figure.add_subplot(top[0, 2:], projection="mollweide"), poses, weights, best, true, axis)
-    draw_marginals(figure, below, poses, weights, best, true, model)
     ess = float(1 / weights.square().sum())
-    title = title or f"Belief about {model.name}: {len(weights)} particles, {ess:.0f} of them effective"
-    figure.suptitle(title, fontsize=14, x=0.02, y=0.985, ha="left")
-    handles = [Line2D([], [], color=_BEST, linestyle="-", marker="s", mfc="none", markersize=9, label="estimate")]
-    if true is not None:
-        handles.append(Line2D([], [], color=_TRUE, linestyle="--", marker="o", mfc="none", markersize=9, label="truth"))
-    figure.legend(handles=handles, loc="upper right", ncols=2, fontsize=11, frameon=False)
-    return figure
+    title = title or f"Belief\n{model.name}"
+    entries = [("estimate", _BEST), *([] if true is None else [("truth", _TRUE)])]
+    half = tile_width(2)
+    said = np.concatenate(
+        [
+            legend(entries, half),
+            lettered(f"{len(weights)} particles, {ess:.0f} effective", CAPTION, half),
+            lettered("The photograph: where they put the object's centre, coloured by weight.", DETAIL, half),
+            lettered(
+                f"Map, above: where the object's {_NAMES[axis]} axis points, coloured by the turn about it.", DETAIL, half
+            ),
+            lettered("Below: shares of the belief. Shifts are from its mean; turns are from the estimate.", DETAIL, half),
+        ]
+    )
+    return sheet(
+        title,
+        lettered(f"where the object's {_NAMES[axis]} axis points", CAPTION),
+        draw_rotations(poses, weights, best, true, axis, tile_width(1)),
+        turn_scale(),
+        beside([grid([draw_centres(poses, weights, best, true, model, rgb, K, half)], 1), said]),
+        weight_scale(),
+        *draw_marginals(poses, weights, best, true, model),
+    )
 
 
 def single(belief: Belief) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -75,49 +86,32 @@ def longest_axis(model: ObjectModel) -> int:
     return max(range(3), key=lambda i: (round(size[i], 4), i))
 
 
-def sphere_map(rotations: torch.Tensor, axis: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return where an axis of the object points, and the turn about it.  (*, 3, 3) camera_from_object -> (*) x 3 [rad].
-
-    Longitude: 0 towards the camera, positive to the image's right; latitude: positive upwards in the image; tilt: the angle
-    of the object's next axis from "up" at that point of the sphere, clockwise as seen from outside it.
-    """
-    direction, other = rotations[..., axis], rotations[..., (axis + 1) % 3]
-    longitude = torch.atan2(direction[..., 0], -direction[..., 2])
-    latitude = torch.asin((-direction[..., 1]).clamp(-1, 1))
-    east = torch.stack([longitude.cos(), torch.zeros_like(longitude), longitude.sin()], -1)
-    north = torch.linalg.cross(direction, east)
-    return longitude, latitude, torch.atan2((other * east).sum(-1), (other * north).sum(-1))
-
-
 def draw_rotations(
-    axes: Axes, poses: torch.Tensor, weights: torch.Tensor, best: torch.Tensor, true: torch.Tensor | None, axis: int
-) -> None:
+    poses: torch.Tensor, weights: torch.Tensor, best: torch.Tensor, true: torch.Tensor | None, axis: int, width: int
+) -> np.ndarray:
     """Draw rotations on a Mollweide map: place = where the axis points, colour = turn about it, area = weight."""
+    fine = 2 * width  # drawn at twice the size and shrunk: OpenCV's smallest discs are no discs
+    picture = blank_map(fine)
     longitude, latitude, tilt = (x.numpy() for x in sphere_map(rotation_of(poses), axis))
-    order = np.argsort(weights.numpy())
-    area = 6 + 60 * weights.numpy() / weights.max().item()
-    dots = axes.scatter(longitude[order], latitude[order], s=area[order], c=tilt[order], cmap=_TILT, linewidths=0)
-    dots.set_clim(-math.pi, math.pi)
-    for pose, marker, size in ((true, "o", 900), (best, "s", 500)):
+    order = np.argsort(weights.numpy(), kind="stable")
+    places = on_map(longitude, latitude, fine)[order]
+    draw_dots(picture, places, turn_colours(tilt)[order], dot_radii(weights.numpy())[order])
+    for pose, colour, shape, reach in ((true, _TRUE, "ring", 36), (best, _BEST, "square", 24)):
         if pose is not None:
-            u, v, turn = (float(x) for x in sphere_map(rotation_of(pose), axis))
-            inner = _TILT((turn / math.pi + 1) / 2)
-            edge = _TRUE if marker == "o" else _BEST
-            axes.scatter(u, v, s=size, marker=marker, facecolors="none", edgecolors=[edge], linewidths=5)
-            axes.scatter(u, v, s=size, marker=marker, facecolors="none", edgecolors=[inner], linewidths=2)
-    axes.grid(alpha=0.3)
-    axes.set_xticks(np.deg2rad([-90, 0, 90]), ["left", "to camera", "right"], fontsize=9)
-    axes.set_yticks(np.deg2rad([-60, -30, 0, 30, 60]), ["60° down", "30° down", "0°", "30° up", "60° up"], fontsize=8)
-    axes.set_title(
-        f"Rotations: place = where the object's {_NAMES[axis]} axis points, colour = turn about it", fontsize=11, pad=10
-    )
-    bar = axes.figure.colorbar(dots, ax=axes, orientation="horizontal", shrink=0.5, aspect=40, pad=0.06)
-    bar.set_ticks([-math.pi, -math.pi / 2, 0, math.pi / 2, math.pi], labels=["-180°", "-90°", "0°", "90°", "180°"])
-    bar.set_label(f"the object's {_NAMES[(axis + 1) % 3]} axis, clockwise from upwards", fontsize=9)
+            u, v, turn = (x.numpy() for x in sphere_map(rotation_of(pose)[None], axis))
+            at = on_map(u, v, fine)[0]
+            draw_mark(picture, at, colour, shape, reach, 14)
+            draw_mark(picture, at, (*turn_colours(turn)[0].tolist(),), shape, reach, 4)
+    return halved(picture)
+
+
+def dot_radii(weights: np.ndarray, least: float = 3.0, most: float = 11.0) -> np.ndarray:
+    """Return radii of discs whose areas grow with weights (N,): `least` at none, `most` at the heaviest.  -> (N,) [px]."""
+    share = weights / max(float(weights.max()), 1e-300)
+    return np.asarray(np.sqrt(least**2 + (most**2 - least**2) * share))
 
 
 def draw_centres(
-    axes: Axes,
     poses: torch.Tensor,
     weights: torch.Tensor,
     best: torch.Tensor,
@@ -125,22 +119,22 @@ def draw_centres(
     model: ObjectModel,
     rgb: np.ndarray,
     K: np.ndarray,
-) -> None:
+    size: int,
+) -> np.ndarray:
     """Draw on the photograph where particles put the object's centre, cut to the object as the estimate has it."""
     camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
     center = model.center.cpu().double()
-    at = lambda pose: project(origin_of(pose, center)[None], camera)[0].tolist()  # noqa: E731
+    at = lambda pose: project(origin_of(pose, center)[None], camera).numpy()  # noqa: E731
     dots = project(origin_of(poses, center), camera).numpy()
-    order = np.argsort(weights.numpy())
-    axes.imshow(rgb)
-    axes.scatter(dots[order, 0], dots[order, 1], s=8, c=weights[order], cmap="plasma", linewidths=0, alpha=0.9)
+    order = np.argsort(weights.numpy(), kind="stable")
+    left, top, right, _ = window(dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2])
+    view = View(left, top, 2 * size / (right - left), 2 * size, 2 * size)
+    picture = faded(view.show(rgb), 0.4)
+    draw_dots(picture, view.place(dots[order]), weight_colours(weights.numpy())[order], 5)
     if true is not None:
-        axes.scatter([at(true)[0]], [at(true)[1]], s=300, marker="o", facecolors="none", edgecolors=[_TRUE], linewidths=2)
-    axes.scatter([at(best)[0]], [at(best)[1]], s=180, marker="s", facecolors="none", edgecolors=[_BEST], linewidths=2)
-    left, top, right, bottom = window(dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2])
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="u [px]", ylabel="v [px]")
-    axes.locator_params(nbins=4)
-    axes.set_title("Centres on the photograph", fontsize=11)
+        draw_mark(picture, view.place(at(true))[0], _TRUE, "ring", 26, 6)
+    draw_mark(picture, view.place(at(best))[0], _BEST, "square", 18, 6)
+    return halved(picture)
 
 
 def window(
@@ -167,40 +161,54 @@ def shifts_and_turns(
     return origin_of(poses, center) - mean, turn
 
 
-def draw_marginals(
-    figure: Figure,
-    layout: GridSpec,
-    poses: torch.Tensor,
-    weights: torch.Tensor,
-    best: torch.Tensor,
-    true: torch.Tensor | None,
-    model: ObjectModel,
-) -> None:
-    """Draw six weighted histograms: shifts from the mean, camera axes; turns from the estimate, object axes."""
-    center = model.center.cpu().double()
+class Marginal(NamedTuple):
+    """One axis of the belief."""
+
+    mass: np.ndarray  # (M,) shares of the belief
+    edges: np.ndarray  # (M + 1,)
+    marks: tuple[float, ...]  # the estimate's value, and the truth's where it is known
+    beyond: float  # share of the belief outside the edges
+
+
+def marginals(
+    poses: torch.Tensor, weights: torch.Tensor, best: torch.Tensor, true: torch.Tensor | None, center: torch.Tensor
+) -> tuple[list[Marginal], list[Marginal]]:
+    """Return three shifts from the mean, camera axes [mm], and three turns from the estimate, object axes [degrees]."""
     mean = (weights[:, None] * origin_of(poses, center)).sum(0)
     parts = [shifts_and_turns(p, best, mean, center) for p in (poses, best, true) if p is not None]
-    labels = ("right", "down", "away")
-    for row, (scale, unit) in enumerate(((1000.0, "mm"), (180 / math.pi, "degrees"))):
+    out: tuple[list[Marginal], list[Marginal]] = ([], [])
+    for kind, unit in enumerate((1000.0, 180 / math.pi)):
         for i in range(3):
-            axes = figure.add_subplot(layout[row, 2 * i : 2 * i + 2])
-            marks = [float(part[row][i]) * scale for part in parts[1:]]
-            histogram(axes, parts[0][row][:, i].numpy() * scale, weights.numpy(), marks)
-            if row == 0:
-                axes.set_title(f"Shift of the centre {labels[i]} (camera {_NAMES[i]})", fontsize=11)
-                axes.set_xlabel(f"from the belief's mean [{unit}]", fontsize=9)
-            else:
-                axes.set_title(f"Turn about the object's {_NAMES[i]}", fontsize=11)
-                axes.set_xlabel(f"from the estimate [{unit}]", fontsize=9)
-            if i == 0:
-                axes.set_ylabel("share of the belief", fontsize=9)
+            marks = [float(part[kind][i]) * unit for part in parts[1:]]
+            out[kind].append(histogram(parts[0][kind][:, i].numpy() * unit, weights.numpy(), marks))
+    return out
 
 
-def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 25) -> None:
-    """Draw a weighted histogram of the middle 95 % and a margin; what lies beyond is told in words.
+def draw_marginals(
+    poses: torch.Tensor, weights: torch.Tensor, best: torch.Tensor, true: torch.Tensor | None, model: ObjectModel
+) -> list[np.ndarray]:
+    """Draw six weighted histograms, in two rows with what they are above them."""
+    shifts, turns = marginals(poses, weights, best, true, model.center.cpu().double())
+    names = [[f"{_AWAY[i]} [mm]" for i in range(3)], [f"about {name} [degrees]" for name in _NAMES]]
+    out = []
+    for kind, row, labels in (("shift of the centre", shifts, names[0]), ("turn about the object's axes", turns, names[1])):
+        out.append(lettered(kind, CAPTION))
+        out.append(grid([draw_marginal(one, label) for one, label in zip(row, labels, strict=True)], 3))
+    return out
 
-    marks: the estimate's value, and the truth's where it is known; both are always within the picture.
-    """
+
+def draw_marginal(one: Marginal, label: str) -> np.ndarray:
+    """Draw one histogram."""
+    low, high = float(one.edges[0]), float(one.edges[-1])
+    top = 1.1 * max(float(one.mass.max()), 1e-6)
+    x, y = Axis(label, low, high, even_ticks(low, high, 3)), Axis("share", 0, top, even_ticks(0, top, 2))
+    marks = list(zip(one.marks, (_BEST, _TRUE), strict=False))[::-1]
+    said = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
+    return headed(mass_panel(one.mass, one.edges, marks, x, y, tile_width(3), 160), said, DETAIL)
+
+
+def histogram(values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 25) -> Marginal:
+    """Return a weighted histogram of the middle 95 % and a margin, wide enough for the marks."""
     order = np.argsort(values)
     mass = np.cumsum(weights[order])
     low, high = (float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)]) for q in (0.025, 0.975))
@@ -208,15 +216,5 @@ def histogram(axes: Axes, values: np.ndarray, weights: np.ndarray, marks: list[f
     low, high = min(low - margin, *marks), max(high + margin, *marks)
     pad = 0.02 * (high - low)
     mass, edges = np.histogram(values, np.linspace(low - pad, high + pad, bins + 1), weights=weights)
-    axes.stairs(mass, edges, fill=True, color=_MASS)  # one patch: bars of their own take ten times as long
-    for value, colour, style in zip(marks, (_BEST, _TRUE), ("-", "--"), strict=False):
-        axes.axvline(value, color=colour, linestyle=style, linewidth=1.8)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
-    if beyond >= 5e-4:
-        said = axes.text(0.98, 0.96, f"{beyond:.1%} beyond", transform=axes.transAxes, ha="right", va="top", fontsize=8)
-        said.set_bbox({"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 1})
-    axes.set_xlim(low - pad, high + pad)
-    axes.set_ylim(0, 1.15 * max(float(mass.max()), 1e-6))
-    axes.locator_params(nbins=4)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
+    return Marginal(mass, edges, (*marks,), beyond)

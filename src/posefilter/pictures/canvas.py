@@ -99,18 +99,34 @@ def draw_lines(
     cv2.polylines(picture, fixed, closed, colour, width, cv2.LINE_AA, _SHIFT)
 
 
-def draw_dots(picture: np.ndarray, pixels: np.ndarray, colours: np.ndarray, radius: float) -> None:
-    """Draw anti-aliased discs, later ones on top.  (P, 2) [px], (P, 3) uint8."""
+def draw_dots(picture: np.ndarray, pixels: np.ndarray, colours: np.ndarray, radius: float | np.ndarray) -> None:
+    """Draw anti-aliased discs, later ones on top.  (P, 2) [px], (P, 3) uint8, one radius or (P,) [px]."""
     at = np.round(np.clip(pixels, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(int)
-    size = round(radius * 2**_SHIFT)
-    for (u, v), colour in zip(at.tolist(), colours.tolist(), strict=True):
+    sizes = np.broadcast_to(np.round(np.asarray(radius) * 2**_SHIFT).astype(int), len(at))
+    for (u, v), colour, size in zip(at.tolist(), colours.tolist(), sizes.tolist(), strict=True):
         cv2.circle(picture, (u, v), size, colour, -1, cv2.LINE_AA, _SHIFT)
 
 
+def stamp_dots(picture: np.ndarray, pixels: np.ndarray, colours: np.ndarray, radius: int) -> None:
+    """Draw discs at whole pixels and without smooth rims, many at once, later ones on top.  (P, 2) [px], (P, 3) uint8."""
+    line = np.arange(-radius, radius + 1)
+    disc = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+    disc = disc[(disc * disc).sum(1) <= radius * (radius + 0.5)]
+    at = (np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)[:, None] + disc).reshape(-1, 2)
+    seen = ((at >= 0) & (at < [picture.shape[1], picture.shape[0]])).all(1)
+    picture[at[seen, 1], at[seen, 0]] = np.repeat(colours, len(disc), axis=0)[seen]
+
+
+def halved(picture: np.ndarray) -> np.ndarray:
+    """Return a picture at half its size, each pixel the mean of four: what was drawn at twice the size is smooth."""
+    return np.asarray(cv2.resize(picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA))
+
+
 @cache
-def font(size: int) -> ImageFont.FreeTypeFont:
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """Return the lettering that comes with matplotlib."""
-    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
 
 def strip(width: int, text: str, entries: Sequence[tuple[str, Colour]] = (), size: int = 15) -> np.ndarray:
@@ -168,6 +184,13 @@ def to_png(picture: np.ndarray) -> bytes:
     """Return a picture as the bytes of a PNG, packed quickly rather than tightly."""
     stream = BytesIO()
     Image.fromarray(picture).save(stream, "PNG", compress_level=2)
+    return stream.getvalue()
+
+
+def to_jpeg(picture: np.ndarray, quality: int = 85) -> bytes:
+    """Return a picture as the bytes of a JPEG, its colours as sharp as its brightness: lines are thin."""
+    stream = BytesIO()
+    Image.fromarray(picture).save(stream, "JPEG", quality=quality, subsampling=0)
     return stream.getvalue()
 
 

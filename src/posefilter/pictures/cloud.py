@@ -1,7 +1,6 @@
 """Draw clouds of particles on the image, coloured by weight: one step, or a strip of steps over the filter's run."""
 
 import math
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -12,8 +11,9 @@ from posefilter.contracts import Space
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.pictures.canvas import AXES, Colour, View, close_up, draw_dots, font, grid, strip, whole
+from posefilter.pictures.canvas import AXES, View, close_up, draw_dots, grid, halved, whole
 from posefilter.pictures.overlay import axes_legend
+from posefilter.pictures.sheet import CAPTION, DETAIL, TITLE, WIDTH, headed, legend, lettered, scale, sheet, tile_width
 from posefilter.types import Cloud, Trace
 
 _WEIGHT = colormaps["plasma"]
@@ -27,29 +27,38 @@ def weight_colours(weights: np.ndarray) -> np.ndarray:
     return np.asarray(_WEIGHT(level)[:, :3] * 255).round().astype(np.uint8)
 
 
-def draw_cloud(
-    rgb: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View, axes: np.ndarray | None = None, fade: float = 0.4
-) -> np.ndarray:
+def draw_cloud(rgb: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View) -> np.ndarray:
     """Draw particles on a faded photograph, the heaviest on top.
 
-    rgb (H, W, 3) uint8; pixels (N, 2) [px]; weights (N,) summing to 1; axes (M, 4, 2) [px]: centre and the ends of x, y and
-    z of the poses whose axes are drawn. -> (view.height, view.width, 3) uint8.
+    rgb (H, W, 3) uint8; pixels (N, 2) [px]; weights (N,) summing to 1. -> (view.height, view.width, 3) uint8.
     """
-    fine = view.finer(2)  # drawn at twice the size and shrunk: OpenCV's smallest discs are no discs
-    picture = fine.show(faded(rgb, fade))
+    return draw_particles(ground(rgb, view), pixels, weights, view)
+
+
+def ground(rgb: np.ndarray, view: View) -> np.ndarray:
+    """Return the faded photograph that particles are drawn on, at twice the size: OpenCV's smallest discs are no discs."""
+    return view.finer(2).show(faded(rgb, 0.4))
+
+
+def draw_particles(
+    below: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View, axes: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw the same on a `ground` that is there already.
+
+    axes (M, 4, 2) [px]: centre and the ends of x, y and z of the poses whose axes are drawn.
+    """
+    fine, picture = view.finer(2), below.copy()
     if axes is not None:
         draw_many_axes(picture, fine.place(axes))
     order = np.argsort(weights, kind="stable")
-    dots = fine.place(pixels[order])
-    radius = max(3.0, fine.width / 200)
-    draw_dots(picture, dots, weight_colours(weights)[order], radius)
-    return np.asarray(cv2.resize(picture, (view.width, view.height), interpolation=cv2.INTER_AREA))
+    draw_dots(picture, fine.place(pixels[order]), weight_colours(weights)[order], max(3.0, fine.width / 200))
+    return halved(picture)
 
 
 def faded(rgb: np.ndarray, share: float) -> np.ndarray:
     """Return a picture mixed with its own grey, darkened, so that colours drawn on it show."""
-    grey = rgb.mean(-1, keepdims=True)
-    return np.asarray(((1 - share) * rgb + share * grey) * (1 - 0.5 * share)).round().astype(np.uint8)
+    mix = (1 - share) * np.eye(3) + share / 3
+    return np.asarray(cv2.transform(rgb, (1 - 0.5 * share) * mix))
 
 
 def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.6) -> None:
@@ -68,39 +77,42 @@ def project_axes(poses: torch.Tensor, center: torch.Tensor, length: float, K: to
     return project(torch.stack([origin_of(poses, end) for end in ends], dim=1), K).numpy()
 
 
-def draw_strip(
-    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = "", width: int = 400
-) -> np.ndarray:
+def draw_strip(rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = "") -> np.ndarray:
     """Draw the clouds of one image at several of the filter's steps, the first and the last included.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's; width: of a tile [px]. Particles in pixel space are
-    dots, in eight tiles. Those in pose space are dots at the object's centre, with the axes of a few drawn by weight, in
-    four tiles above four close-ups of the object: the last clouds are too small to be seen on the whole photograph.
+    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are dots, at eight steps. Those
+    in pose space are dots at the object's centre, with the axes of a few drawn by weight, at four steps: on the whole
+    photograph, and beside it on a close-up of the object, since the last clouds are too small to be seen otherwise.
     """
     height, wide = rgb.shape[:2]
+    width = tile_width(2)
     frame = whole(height, wide, width)
+    parts: list[np.ndarray] = []
     if isinstance(space, PoseSpace):
         steps = [PoseStep(K, trace, image, number, space) for number in steps_shown(len(trace.clouds), 4)]
-        near = close_up(steps[-1].extent(), height, wide, width, margin=0.1)
-        tiles = [headed(one.draw(rgb, frame), one.caption) for one in steps] + [one.draw(rgb, near) for one in steps]
-        legend, columns = axes_legend(), len(steps)
+        views = (frame, close_up(steps[-1].extent(), height, wide, width, margin=0.1))
+        grounds = [ground(rgb, view) for view in views]
+        for one in steps:
+            tiles = [one.draw(below, view) for below, view in zip(grounds, views, strict=True)]
+            parts += [lettered(one.caption, CAPTION), grid(tiles, 2)]
+        parts.append(legend(axes_legend()))
     else:
-        tiles = []
+        below, tiles = ground(rgb, frame), []
         for number in steps_shown(len(trace.clouds), 8):
             cloud = trace.clouds[number]
             state, weights = cloud.state[image].detach().cpu().numpy(), weights_of(cloud, image).numpy()
-            off = ((state < -0.5) | (state > [wide - 0.5, height - 0.5])).any(1).mean()
-            caption = caption_of(trace, image, number, "px") + (f", {off:.0%} off the frame" if off else "")
-            tiles.append(headed(draw_cloud(rgb, state, weights, frame), caption))
-        legend, columns = [], 4
-    sheet = grid(tiles, columns)
-    head = strip(sheet.shape[1], title or "Particles over the filter's iterations", size=22)
-    return np.concatenate([head, sheet, weight_scale(sheet.shape[1], legend)])
+            off = off_frame(state, height, wide)
+            head, rest = caption_of(trace, image, number, "px").split(", ")
+            said = rest + (f", {off:.0%} off the frame" if off else "")
+            tile = headed(draw_particles(below, state, weights, frame), said, DETAIL)
+            tiles.append(headed(tile, head))
+        parts.append(grid(tiles, 2))
+    return sheet(title or "Particles by iteration", *parts, weight_scale())
 
 
-def headed(tile: np.ndarray, caption: str) -> np.ndarray:
-    """Put a caption above a tile."""
-    return np.concatenate([strip(tile.shape[1], caption, size=14), tile])
+def off_frame(pixels: np.ndarray, height: int, width: int) -> float:
+    """Return the share of places (N, 2) [px] that lie beyond the frame's edges."""
+    return float(((pixels < -0.5) | (pixels > [width - 0.5, height - 0.5])).any(1).mean())
 
 
 def caption_of(trace: Trace, image: int, number: int, unit: str) -> str:
@@ -140,9 +152,9 @@ class PoseStep:
         middle = self.weights @ self.pixels
         return np.stack([middle - 0.7 * self.reach, middle + 0.7 * self.reach])
 
-    def draw(self, rgb: np.ndarray, view: View) -> np.ndarray:
-        """Draw it."""
-        return draw_cloud(rgb, self.pixels, self.weights, view, self.axes)
+    def draw(self, below: np.ndarray, view: View) -> np.ndarray:
+        """Draw it on a view's `ground`."""
+        return draw_particles(below, self.pixels, self.weights, view, self.axes)
 
 
 def spread_choice(weights: torch.Tensor, count: int) -> torch.Tensor:
@@ -151,13 +163,7 @@ def spread_choice(weights: torch.Tensor, count: int) -> torch.Tensor:
     return torch.searchsorted(weights.cumsum(0), at).clamp(max=len(weights) - 1)
 
 
-def weight_scale(width: int, legend: Sequence[tuple[str, Colour]], size: int = 18) -> np.ndarray:
+def weight_scale(width: int = WIDTH, size: int = TITLE) -> np.ndarray:
     """Return a strip that explains the colours."""
-    sheet = strip(width, "weight over the mean weight:   1/10", legend, size).copy()
-    left = int(18 + font(size).getlength("weight over the mean weight:   1/10"))
-    long = max(10, min(240, width - left - 60))
-    end = strip(50, "10", size=size)
-    ramp = (_WEIGHT(np.linspace(0, 1, long))[None, :, :3] * 255).astype(np.uint8)
-    sheet[8 : len(end) - 8, left : left + long] = ramp
-    sheet[: len(end), left + long : left + long + 50] = end
-    return sheet
+    ramp = (_WEIGHT(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
+    return scale("weight: mean / 10", ramp, "x 10", width, size)

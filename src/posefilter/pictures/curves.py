@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from posefilter.pictures.canvas import Colour, grid, strip
+from posefilter.pictures.canvas import Colour, grid
 from posefilter.pictures.panels import Axis, curve_panel
+from posefilter.pictures.sheet import DETAIL, WIDTH, headed, legend, lettered, sheet, tile_width
 
 _TITLES = {
     "ess": ("effective particles", "share of all"),
@@ -17,7 +18,7 @@ _TITLES = {
     "best_log_likelihood": ("best log-likelihood", "nat"),
 }
 _LINE: Colour = (43, 108, 176)
-_WIDTH, _HEIGHT = 270, 150  # [px] of a plot
+_HEIGHT = 190  # [px] of a panel
 
 
 def in_unit(name: str, values: Sequence[float]) -> np.ndarray:
@@ -32,16 +33,16 @@ def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str =
     curves: by name, one number an iteration, means over `images` images; units as the names' endings say.
     """
     panels = []
+    width = tile_width(2)
     for name, values in curves.items():
         label, unit = _TITLES.get(name, (name.replace("_", " "), ""))
         shown = in_unit(name, values)
         places = np.arange(len(shown), dtype=float)
         low, high = bounds(name, shown)
         y = Axis(unit, low, high, even_ticks(low, high))
-        panels.append(curve_panel([(shown, _LINE)], places, iterations(len(shown)), y, label, _WIDTH, _HEIGHT))
-    sheet = grid(panels, 3)
-    said = f"{title}: means over {images} image{'s' * (images != 1)}"
-    return np.concatenate([strip(sheet.shape[1], said, size=20), sheet])
+        panel = curve_panel([(shown, _LINE)], places, iterations(len(shown)), y, width, _HEIGHT, thick=3)
+        panels.append(headed(panel, label))
+    return sheet(title, lettered(f"means over {images} image{'s' * (images != 1)}", DETAIL), grid(panels, 2))
 
 
 def draw_shares(curves: Mapping[str, tuple[Sequence[float], Colour]], title: str, foot: str) -> np.ndarray:
@@ -49,10 +50,9 @@ def draw_shares(curves: Mapping[str, tuple[Sequence[float], Colour]], title: str
     count = max(len(values) for values, _ in curves.values())
     lines = [(100 * np.asarray(values, float), colour) for values, colour in curves.values()]
     y = Axis("share of the particles [%]", -2, 102, (0, 25, 50, 75, 100))
-    panel = curve_panel(lines, np.arange(count, dtype=float), iterations(count), y, "", 620, 320)
-    legend = [(name.replace("_", " "), colour) for name, (_, colour) in curves.items()]
-    width = panel.shape[1]
-    return np.concatenate([strip(width, title, size=20), panel, strip(width, "", legend), strip(width, foot)])
+    panel = curve_panel(lines, np.arange(count, dtype=float), iterations(count), y, WIDTH, 380, thick=4)
+    entries = [(name.replace("_", " "), colour) for name, (_, colour) in curves.items()]
+    return sheet(title, panel, legend(entries), lettered(foot, DETAIL))
 
 
 def iterations(count: int) -> Axis:

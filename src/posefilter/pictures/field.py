@@ -6,25 +6,15 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from posefilter.pictures.canvas import AXES, ESTIMATE, TRUTH, Colour, draw_dots, strip, whole
+from posefilter.pictures.canvas import AXES, ESTIMATE, TRUTH, Colour, draw_dots, grid, whole
 from posefilter.pictures.overlay import axes_legend
-from posefilter.pictures.panels import (
-    BOTTOM,
-    SURFACE,
-    TOP,
-    Axis,
-    Mark,
-    beside,
-    colours,
-    curve_panel,
-    heat_panel,
-    upright_bar,
-)
+from posefilter.pictures.panels import SURFACE, Axis, Mark, colour_scale, colours, curve_panel, heat_panel
+from posefilter.pictures.sheet import CAPTION, DETAIL, headed, legend, lettered, sheet, tile_width
 
 PLANES = ((0, 1), (0, 2), (1, 2))  # of object axes
 _NAMES = "xyz"
 _ABOVE: Colour = (15, 15, 15)  # no colour of the scale, and plain on its bright end, where it matters
-_SIZE = 190  # [px] a slice
+_COLUMN = tile_width(3)  # [px] one for each noise level, of which there are three at most
 _FINE = 5  # times finer than the cells that were judged: what lies between is interpolated
 
 
@@ -52,36 +42,31 @@ class PointField(NamedTuple):
 
 
 def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = None) -> np.ndarray:
-    """Draw a row a noise level: three planes of shifts, and the turns about the object's axes.
+    """Draw a column a noise level: three planes of shifts, and the turns about the object's axes.
 
     estimate: (3,) where the estimate's centre lies, from the true one, along the object's axes [m].
     """
-    rows = []
+    rows: list[list[np.ndarray]] = [[], [], [], []]
     for k, (sigma, reach) in enumerate(zip(field.sigmas, field.reaches, strict=True)):
         own = np.concatenate([field.planes[k].ravel(), field.turns[k].ravel()])
         low = min(float(np.percentile(own, 2)), -1e-3)
-        panels = []
-        for (a, b), values in zip(PLANES, field.planes[k], strict=True):
+        for row, (a, b), values in zip(rows[:3], PLANES, field.planes[k], strict=True):
             x, y = (shift_axis(f"shift in {_NAMES[axis]} [mm]", reach) for axis in (a, b))
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
                 marks.append(Mark(1000 * float(estimate[a]), 1000 * float(estimate[b]), ESTIMATE, "square"))
-            panels.append(
-                heat_panel(score_colours(values, low), x, y, f"object's {_NAMES[a]}-{_NAMES[b]} plane", _SIZE, marks)
-            )
-        high = max(float(own.max()), 0.0)
-        x = Axis("turn about an axis [degrees]", -180, 180, (-180, -90, 0, 90, 180))
-        y = Axis("", low, max(1.15 * high, -0.06 * low), (round_down(low), 0))
+            row.append(heat_panel(score_colours(values, low), x, y, _COLUMN, marks))
+        ends = colour_scale(f"{low:.3g}", "0", width=_COLUMN, size=DETAIL)
+        rows[0][-1] = headed(np.concatenate([ends, rows[0][-1]]), f"{1000 * sigma:.3g} mm")
+        x = Axis("turn [degrees]", -180, 180, (-180, 0, 180))
+        y = Axis("score", low, max(1.15 * max(float(own.max()), 0.0), -0.06 * low), (round_down(low), 0))
         lines = [(curve, colour) for curve, colour in zip(field.turns[k], AXES, strict=True)]
-        bar = upright_bar(f"{low:.3g}", "0", "score", _SIZE)
-        panels += [bar, curve_panel(lines, field.degrees, x, y, "score of turns", 230, _SIZE)]
-        row = beside(panels)
-        rows += [strip(row.shape[1], f"Noise level {1000 * sigma:.3g} mm", size=18), row]
-    width = rows[0].shape[1]
-    legend = [("truth", TRUTH), *([] if estimate is None else [("estimate", ESTIMATE)]), ("outscores the truth", _ABOVE)]
-    legend += [(f"turn about {name}", colour) for name, colour in axes_legend()]
-    foot = strip(width, "score: log-likelihood less the truth's [nat]", legend, size=15)
-    return np.concatenate([strip(width, title, size=20), *rows, foot])
+        rows[3].append(curve_panel(lines, field.degrees, x, y, _COLUMN, 170))
+    entries = [("truth", TRUTH), *([] if estimate is None else [("estimate", ESTIMATE)])]
+    entries += [("beats truth", _ABOVE), *((f"turn {name}" if name == "x" else name, c) for name, c in axes_legend())]
+    said = "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along the object's axes"
+    parts = [lettered("at noise levels of", CAPTION), *(grid(row, len(row)) for row in rows), lettered(said, DETAIL)]
+    return sheet(title, *parts, legend(entries))
 
 
 def score_colours(values: np.ndarray, low: float) -> np.ndarray:
@@ -111,47 +96,42 @@ def round_down(value: float) -> float:
 
 
 def draw_point_field(fields: Sequence[PointField], rgb: np.ndarray, surface: np.ndarray, title: str) -> np.ndarray:
-    """Draw a row a slice, a column a noise level; beside each row the photograph with the pixel.
+    """Draw a row a slice, a column a noise level, below photographs of the points that they are about.
 
     rgb (H, W, 3) uint8; surface (P, 3): points of the object's surface from its centre [m]; those near a slice are shown.
     """
-    rows = []
+    pixels = {field.on: field.pixel for field in fields}
+    photographs = [
+        headed(photograph(rgb, pixel), "a point on it" if on else "a point off it") for on, pixel in pixels.items()
+    ]
+    parts = [grid(photographs, 2)]
     for field in fields:
         a, b = field.plane
         (normal,) = {0, 1, 2} - {a, b}
         near = np.abs(surface[:, normal] - field.place[normal]) < 0.06 * field.reach
         dots = 1000 * surface[near][:, [a, b]]
+        marks = [Mark(1000 * float(field.place[a]), 1000 * float(field.place[b]), TRUTH)]
+        x, y = (shift_axis(f"object's {_NAMES[axis]} [mm]", field.reach) for axis in (a, b))
         most = max(float(np.abs(field.judged).max()), float(np.abs(field.own).max()), 1e-6)
-        panels = [photograph(rgb, field)]
-        for k, sigma in enumerate(field.sigmas):
-            x, y = (shift_axis(f"object's {_NAMES[axis]} [mm]", field.reach) for axis in (a, b))
-            marks = [Mark(1000 * float(field.place[a]), 1000 * float(field.place[b]), TRUTH)]
-            cells = colours(field.judged[k], -most, most, "RdBu_r")
-            panels.append(
-                heat_panel(
-                    cells, x, y, f"noise {1000 * sigma:.3g} mm: {field.own[k]:+.2f} at the ring", _SIZE + 20, marks, dots
-                )
-            )
-        panels.append(upright_bar(f"{-most:.2g}", f"{most:+.2g}", "judged", _SIZE + 20, "RdBu_r"))
-        row = beside(panels)
-        what = "A point on the object" if field.on else "A point off the object"
-        place = f"{_NAMES[normal]} = {1000 * field.place[normal]:.0f} mm"
-        rows += [
-            strip(row.shape[1], f"{what}: what it would be worth elsewhere in the object's plane {place}", size=17),
-            row,
+        tiles = []
+        for sigma, judged, own in zip(field.sigmas, field.judged, field.own, strict=True):
+            panel = heat_panel(colours(judged, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots)
+            tiles.append(headed(headed(panel, f"at the ring: {own:+.2f}", DETAIL), f"{1000 * sigma:.3g} mm"))
+        place = f"plane {_NAMES[normal]} = {1000 * field.place[normal]:.0f} mm"
+        parts += [
+            lettered(f"{'On' if field.on else 'Off'} it: {place}, at noise levels of", CAPTION),
+            grid(tiles, len(tiles)),
         ]
-    width = rows[0].shape[1]
-    legend = [("where the point is under the true pose", TRUTH), ("surface near the slice", SURFACE)]
-    return np.concatenate([strip(width, title, size=20), *rows, strip(width, "", legend, size=15)])
+        parts.append(colour_scale(f"judged: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION))
+    entries = [("where the truth puts it", TRUTH), ("surface near the slice", SURFACE)]
+    return sheet(title, *parts, legend(entries))
 
 
-def photograph(rgb: np.ndarray, field: PointField) -> np.ndarray:
-    """Return the photograph as high as the row's slices, with a ring round the pixel."""
-    size = _SIZE + 20
-    view = whole(rgb.shape[0], rgb.shape[1], round(size * rgb.shape[1] / rgb.shape[0]))
+def photograph(rgb: np.ndarray, pixel: tuple[int, int]) -> np.ndarray:
+    """Return the photograph with a ring round a pixel (u, v)."""
+    view = whole(rgb.shape[0], rgb.shape[1], tile_width(2))
     picture = view.show(rgb)
-    at = view.place(np.array([field.pixel]))
+    at = view.place(np.array([pixel]))
     draw_dots(picture, at, np.array([[0, 0, 0]]), 7)
     draw_dots(picture, at, np.array([TRUTH]), 5)
-    head, foot = (np.full((rows, picture.shape[1], 3), 255, np.uint8) for rows in (TOP, BOTTOM))
-    return np.concatenate([head, picture, foot])
+    return picture

@@ -14,18 +14,10 @@ from posefilter.contracts import Space
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, transform
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.pictures.canvas import INK, PAPER, TRUTH, View, close_up, draw_dots, draw_lines, grid, strip, whole
-from posefilter.pictures.cloud import (
-    caption_of,
-    faded,
-    headed,
-    spread_choice,
-    steps_shown,
-    weight_colours,
-    weight_scale,
-    weights_of,
-)
-from posefilter.pictures.panels import beside, flat_bar
+from posefilter.pictures.canvas import INK, PAPER, TRUTH, View, close_up, draw_lines, grid, stamp_dots, whole
+from posefilter.pictures.cloud import caption_of, faded, spread_choice, steps_shown, weight_colours, weight_scale, weights_of
+from posefilter.pictures.panels import beside, colour_scale
+from posefilter.pictures.sheet import CAPTION, WIDTH, headed, legend, lettered, middled, sheet, tile_width
 from posefilter.types import Trace
 
 _LINE = (255, 225, 120)
@@ -56,48 +48,54 @@ def coverage(pixels: np.ndarray, weights: np.ndarray, view: View) -> np.ndarray:
     total = np.zeros((view.height, view.width), np.float32)
     for one, weight in zip(pixels, weights, strict=True):
         if np.isfinite(one).all():
-            layer = np.zeros(total.shape, np.uint8)
-            cv2.fillConvexPoly(layer, cv2.convexHull(np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)), 1)
-            total += float(weight) * layer
+            corners = cv2.convexHull(np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32))
+            (left, top), (right, bottom) = corners.min((0, 1)).clip(0), corners.max((0, 1)) + 1
+            part = total[top:bottom, left:right]  # no more of the picture is looked at than the silhouette needs
+            if part.size:
+                layer = np.zeros(part.shape, np.uint8)
+                cv2.fillConvexPoly(layer, corners - [left, top], 1)
+                part += np.float32(weight) * layer
     return total
 
 
 def draw_silhouettes(
-    rgb: np.ndarray, K: np.ndarray, trace: Trace, hull: torch.Tensor, truth: np.ndarray, title: str, width: int = 300
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, hull: torch.Tensor, truth: np.ndarray, title: str
 ) -> np.ndarray:
     """Draw where the poses of one image put the object, at four of the filter's steps: on the frame, and close up.
 
     trace: of one image. Colour is the weight of the particles whose silhouette covers a pixel; lines are some outlines.
     """
     height, wide = rgb.shape[:2]
-    steps = steps_shown(len(trace.clouds), 4)
+    width = tile_width(2)
     places = torch.as_tensor(np.asarray(truth))[None]
     true = hulls_on_image(places, hull, K)
     frame = whole(height, wide, width)
     near = close_up(true[0], height, wide, width, margin=0.4) if np.isfinite(true).all() else frame
-    rows: list[list[np.ndarray]] = [[], []]
-    for number in steps:
+    grounds = [faded(view.show(rgb), 0.6) for view in (frame, near)]
+    parts: list[np.ndarray] = []
+    for number in steps_shown(len(trace.clouds), 4):
         weights = weights_of(trace.clouds[number], 0)
         chosen = trace.clouds[number].state[0].detach().cpu().double()[spread_choice(weights, 64)]
         pixels = hulls_on_image(chosen, hull, K)
-        for row, view in zip(rows, (frame, near), strict=True):
+        tiles = []
+        for view, ground in zip((frame, near), grounds, strict=True):
             share = coverage(pixels, np.full(len(pixels), 1 / len(pixels)), view)
-            picture = cover(faded(view.show(rgb), 0.6), share)
+            picture = cover(ground, share)
             draw_lines(picture, [view.place(line) for line in outlines(pixels[::4])], _LINE, 1, closed=True, halo=False)
             draw_lines(picture, [view.place(line) for line in outlines(true)], TRUTH, 2, closed=True)
-            row.append(picture)
-        rows[0][-1] = headed(rows[0][-1], caption_of(trace, 0, number, "mm").partition(",")[0])
-    sheet = grid([*rows[0], *rows[1]], len(steps))
-    legend = strip(420, "", [("true outline", TRUTH), ("outlines of 16 particles", _LINE)])
-    foot = beside([flat_bar("weight that covers the pixel", "0", "1", "plasma"), legend], sheet.shape[1])
-    return np.concatenate([strip(sheet.shape[1], title, size=20), sheet, foot])
+            tiles.append(picture)
+        parts += [lettered(caption_of(trace, 0, number, "mm"), CAPTION), grid(tiles, 2)]
+    foot = [legend([("truth", TRUTH), ("16 outlines", _LINE)]), colour_scale("weight: 0", "1", "plasma")]
+    return sheet(title, *parts, *foot)
 
 
 def cover(picture: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Return a picture under a map (h, w) in [0, 1], the more opaque the higher."""
-    paint = colormaps["plasma"](np.clip(share, 0, 1))[..., :3] * 255
-    opacity = 0.75 * np.clip(share * 2, 0, 1)[..., None]
-    return np.asarray(picture * (1 - opacity) + paint * opacity).round().astype(np.uint8)
+    out, on = picture.copy(), share > 0
+    paint = colormaps["plasma"](np.clip(share[on], 0, 1))[:, :3] * 255
+    opacity = 0.75 * np.clip(share[on] * 2, 0, 1)[:, None]
+    out[on] = (picture[on] * (1 - opacity) + paint * opacity).round()
+    return out
 
 
 class Film:
@@ -122,29 +120,40 @@ class Film:
         self.trace, self.space, self.hull, self.target = trace, space, hull, target
         height, wide = rgb.shape[:2]
         self.posed = isinstance(space, PoseSpace)
-        self.views = [whole(height, wide, 320 if self.posed else 480)]
+        self.views = [whole(height, wide, WIDTH // 2 if self.posed else 480)]
         if self.posed and target:
-            self.views.append(close_up(np.concatenate(list(target)), height, wide, 320, margin=0.4))
+            self.views.append(close_up(np.concatenate(list(target)), height, wide, WIDTH // 2, margin=0.4))
         self.grounds = [faded(view.show(rgb), 0.5) for view in self.views]
-        width = sum(view.width for view in self.views)
-        legend = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
-        self.head = strip(width, title, size=14 if width > 600 else 13)
-        self.foot = np.concatenate([strip(width, "", legend, size=13), weight_scale(width, [], 13)])
+        self.head = sheet(title)
+        entries = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
+        self.foot = np.concatenate([legend(entries), weight_scale()])
 
-    def frames(self, between: int = 2) -> Iterator[np.ndarray]:
-        """Yield the pictures, `between` of them from each cloud to the next."""
-        for number, cloud in enumerate(self.trace.clouds):
-            weights = weights_of(cloud, 0)
+    def frames(self, between: int | None = None, most: int = 15) -> Iterator[np.ndarray]:
+        """Yield the pictures, `between` of them from each cloud to the next; None: two where clouds are few, else one.
+
+        most: clouds that are shown, evenly chosen, the first and the last among them.
+        """
+        shown = steps_shown(len(self.trace.clouds), most)
+        between = between or (2 if len(shown) <= 8 else 1)
+        for before, number in zip([shown[0], *shown], shown, strict=False):
+            weights = weights_of(self.trace.clouds[number], 0)
             few = spread_choice(weights, 24).unique()
-            parents = cloud.ancestors[0].cpu()
+            parents = self.ancestors(number, before)
             ends = self.drawn(number, torch.arange(len(weights)), few)
-            starts = self.drawn(number - 1, parents, parents[few]) if number else ends
+            starts = self.drawn(before, parents, parents[few])
             told = caption_of(self.trace, 0, number, "mm" if self.posed else "px").partition(",")[0]
             caption = told.replace(":", f" of {len(self.trace.clouds) - 1}:", 1)
             for k in range(between if number else 1):
                 share = (k + 1) / between
                 dots, lines = (a + share * (b - a) for a, b in zip(starts, ends, strict=True))
                 yield self.frame(dots, lines, weights.numpy(), caption)
+
+    def ancestors(self, number: int, before: int) -> torch.Tensor:
+        """Return which particles of an earlier cloud a cloud's own stem from; themselves, if that is the same.  -> (N,)."""
+        index = torch.arange(self.trace.clouds[number].state.shape[1])
+        for cloud in self.trace.clouds[number:before:-1]:
+            index = cloud.ancestors[0].cpu()[index]
+        return index
 
     def drawn(self, number: int, dots: torch.Tensor, lines: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Return chosen particles' dots (N, 2), and the corners of others' outlines (n, V, 2), none for pixels.  [px]"""
@@ -162,20 +171,21 @@ class Film:
         parts = []
         for view, ground in zip(self.views, self.grounds, strict=True):
             picture = ground.copy()
-            draw_dots(picture, view.place(dots[order]), colours, 2 if self.posed else 3)
+            stamp_dots(picture, view.place(dots[order]), colours, 2 if self.posed else 3)
             draw_lines(picture, [view.place(x) for x in outlines(corners)], _LINE, 1, closed=True, halo=False)
             draw_lines(picture, [view.place(x) for x in self.target], TRUTH, 2, closed=True)
             parts.append(picture)
-        return np.concatenate([self.head, headed(beside(parts), caption), self.foot])
+        return np.concatenate([self.head, headed(middled(beside(parts)), caption), self.foot])
 
 
 def to_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 1500, colours: int = 120) -> bytes:
     """Return frames as an animated GIF that loops, the one film that TensorBoard plays; the last is held."""
-    ground = Image.fromarray(frames[-1]).quantize(colours - len(_KEPT), Image.Quantize.MEDIANCUT).getpalette() or []
+    few = np.ascontiguousarray(frames[-1][::3, ::3])  # as good for choosing colours, and nine times sooner
+    ground = Image.fromarray(few).quantize(colours - len(_KEPT), Image.Quantize.MEDIANCUT).getpalette() or []
     palette = np.concatenate([_KEPT, np.reshape(ground, (-1, 3))[: colours - len(_KEPT)]]).astype(np.uint8)
     palette = np.pad(palette, ((0, colours - len(palette)), (0, 0)))
     table = nearest_colours(palette)
-    indexed = [table[tuple((frame >> 3).transpose(2, 0, 1))] for frame in frames]
+    indexed = [table[(frame >> 3) @ np.array([1024, 32, 1], np.uint16)] for frame in frames]
     images = []
     for before, frame in zip([None, *indexed[:-1]], indexed, strict=True):
         kept = frame if before is None else np.where(frame == before, np.uint8(colours), frame)  # `colours`: see-through
@@ -189,9 +199,9 @@ def to_gif(frames: Sequence[np.ndarray], milliseconds: int = 220, hold: int = 15
 
 
 def nearest_colours(palette: np.ndarray) -> np.ndarray:
-    """Return which of at most 255 colours (P, 3) is nearest to each colour of 5 bits a channel.  -> (32, 32, 32) uint8."""
+    """Return which of at most 255 colours (P, 3) is nearest to each colour of 5 bits a channel.  -> (32^3,) uint8."""
     line = np.arange(32, dtype=np.float32) * 8 + 4
     places = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
     own = palette.astype(np.float32)
     far = (own * own).sum(1) - 2 * places @ own.T  # less the place's own square, which is the same for all
-    return far.argmin(1).astype(np.uint8).reshape(32, 32, 32)
+    return far.argmin(1).astype(np.uint8)

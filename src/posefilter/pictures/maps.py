@@ -5,12 +5,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from posefilter.pictures.canvas import TRUTH, Colour, View, draw_dots, draw_lines, grid, strip, whole
-from posefilter.pictures.cloud import draw_cloud, draw_many_axes, headed, weight_scale
+from posefilter.pictures.canvas import TRUTH, Colour, View, draw_dots, draw_lines, grid, halved, whole
+from posefilter.pictures.cloud import draw_cloud, draw_many_axes, weight_scale
 from posefilter.pictures.overlay import Shape, axes_legend, outline, outlines_of
-from posefilter.pictures.panels import beside, colours, flat_bar
+from posefilter.pictures.panels import colour_scale, colours
+from posefilter.pictures.sheet import DETAIL, headed, legend, lettered, sheet, tile_width
 
-_TILE = 480  # [px]
 _PROPOSED: Colour = (255, 190, 40)
 
 
@@ -29,33 +29,27 @@ def draw_proposals(
     said: Proposals, rgb: np.ndarray, K: np.ndarray, truth: np.ndarray, shape: Shape, radius: float, title: str
 ) -> np.ndarray:
     """Draw the chance map, the object's points as colours beside the true ones, and poses drawn from them."""
-    view = whole(rgb.shape[0], rgb.shape[1], _TILE)
+    view = whole(rgb.shape[0], rgb.shape[1], tile_width(2))
     edge = outlines_of(truth, shape, view.camera(K), view.height, view.width)
     chance = heat_over(rgb, said.chance, view)
     draw_lines(chance, edge, TRUTH, 2, closed=True)
     drawn = view.finer(2).show(rgb)
     draw_many_axes(drawn, view.finer(2).place(said.axes), 0.8)
     draw_dots(drawn, view.finer(2).place(said.axes[:, 0]), np.tile(np.array([_PROPOSED]), (len(said.axes), 1)), 5)
-    drawn = np.asarray(cv2.resize(drawn, (view.width, view.height), interpolation=cv2.INTER_AREA))
+    drawn = halved(drawn)
     draw_lines(drawn, edge, TRUTH, 2, closed=True)
-    mean = f", {1000 * said.error:.0f} mm off on average" if np.isfinite(said.error) else ""
+    mean = f"{1000 * said.error:.0f} mm off on average" if np.isfinite(said.error) else "of the object's own frame"
     tiles = [
-        headed(chance, "chance of the object, and its true outline"),
-        headed(drawn, f"{len(said.axes)} poses drawn from these maps"),
-        headed(points_as_colours(said.coordinates, said.chance, view), f"predicted object points{mean}"),
-        headed(points_as_colours(said.true, said.on.astype(float), view), "true object points"),
+        headed(headed(chance, "that a cell shows the object", DETAIL), "chance"),
+        headed(headed(drawn, "from these maps", DETAIL), f"{len(said.axes)} poses drawn"),
+        headed(headed(points_as_colours(said.coordinates, said.chance, view), mean, DETAIL), "points, predicted"),
+        headed(
+            headed(points_as_colours(said.true, said.on.astype(float), view), "by depth and pose", DETAIL), "points, true"
+        ),
     ]
-    sheet = grid(tiles, 2)
-    reach = f"{1000 * radius:.0f} mm"
-    legend = [("true outline", TRUTH), ("centre of a drawn pose", _PROPOSED), *((f"axis {n}", c) for n, c in axes_legend())]
-    bars = beside(
-        [
-            flat_bar("chance", "0", "1", "magma", long=120),
-            strip(420, f"points: red, green, blue = x, y, z, -{reach} to {reach}"),
-        ],
-        sheet.shape[1],
-    )
-    return np.concatenate([strip(sheet.shape[1], title, size=20), sheet, strip(sheet.shape[1], "", legend), bars])
+    entries = [("true outline", TRUTH), ("pose's centre", _PROPOSED), *axes_legend()]
+    reach = f"points: red, green, blue are the object's x, y, z, from -{1000 * radius:.0f} to {1000 * radius:.0f} mm"
+    return sheet(title, grid(tiles, 2), legend(entries), colour_scale("chance: 0", "1", "magma"), lettered(reach, DETAIL))
 
 
 def points_as_colours(points: np.ndarray, chance: np.ndarray, view: View) -> np.ndarray:
@@ -85,20 +79,17 @@ def draw_relevance(
 
     mask (H, W) bool: the object's visible part, whose rim is drawn.
     """
-    view = whole(rgb.shape[0], rgb.shape[1], _TILE - 80)
-    rim = [view.place(line) for line in outline(mask)]
-    heat = heat_over(rgb, relevance, view)
-    mean = relevance_on(relevance, mask), relevance_on(relevance, ~mask)
-    tiles = [headed(heat, f"relevance: {mean[0]:.2f} on the object, {mean[1]:.2f} elsewhere")]
+    wide, half = (whole(rgb.shape[0], rgb.shape[1], tile_width(columns)) for columns in (1, 2))
+    heat = heat_over(rgb, relevance, wide)
+    draw_lines(heat, [wide.place(line) for line in outline(mask)], TRUTH, 3, closed=True)
+    mean = f"{relevance_on(relevance, mask):.2f} on the object, {relevance_on(relevance, ~mask):.2f} elsewhere"
+    tiles = []
     for name, (pixels, weights) in (("first", first), ("last", last)):
-        tiles.append(headed(draw_cloud(rgb, pixels, weights, view), f"the {name} cloud"))
-    for tile in tiles:
-        draw_lines(tile[-view.height :], rim, TRUTH, 2, closed=True)
-    sheet = grid(tiles, 3)
-    bars = beside([flat_bar("relevance", "0", "1", "magma", long=120), strip(240, "", [("rim of the mask", TRUTH)])])
-    return np.concatenate(
-        [strip(sheet.shape[1], title, size=20), sheet, beside([bars], sheet.shape[1]), weight_scale(sheet.shape[1], [], 15)]
-    )
+        picture = draw_cloud(rgb, pixels, weights, half)
+        draw_lines(picture, [half.place(line) for line in outline(mask)], TRUTH, 2, closed=True)
+        tiles.append(headed(picture, f"the {name} cloud"))
+    foot = [legend([("rim of the mask", TRUTH)]), colour_scale("relevance: 0", "1", "magma"), weight_scale()]
+    return sheet(title, headed(heat, mean), grid(tiles, 2), *foot)
 
 
 def relevance_on(relevance: np.ndarray, mask: np.ndarray) -> float:

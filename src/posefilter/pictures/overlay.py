@@ -74,7 +74,7 @@ def overlay(
 
 def view_of_poses(poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, height: int, width: int, shown: int) -> View:
     """Return a close-up of where poses put the object; the whole frame where that is nowhere."""
-    bounds = np.stack([vertices_of(shape).min(0), vertices_of(shape).max(0)])
+    bounds = bounds_of(shape)
     corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     found = []
     for pose in poses:
@@ -101,8 +101,7 @@ def draw_pose(
 
 def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, colour: Colour, width: int = 2) -> None:
     """Draw the object's axes at the centre of its box: x red, y green, z blue, the farthest first; knobs in `colour`."""
-    points = vertices_of(shape)
-    low, high = points.min(0), points.max(0)
+    low, high = bounds_of(shape)
     length = 0.3 * float(np.linalg.norm(high - low))
     ends = (low + high) / 2 + length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     camera = ends @ pose[:3, :3].T + pose[:3, 3]
@@ -120,6 +119,8 @@ def outlines_of(pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, widt
     if isinstance(shape, Mesh):
         view = View(-0.5, -0.5, 1 / coarse, -(-width // coarse), -(-height // coarse))
         found = outline(silhouette(shape, pose, view.camera(K), view.height, view.width))
+        if coarse > 1:  # straight edges are no stairs
+            found = [cv2.approxPolyDP(line, 0.7, closed=True)[:, 0] for line in found]
         return [(line + 0.5) * coarse - 0.5 for line in found]
     camera = _before_camera(vertices_of(shape) @ pose[:3, :3].T + pose[:3, 3])
     if len(camera) < 3:
@@ -144,6 +145,13 @@ def vertices_of(shape: Shape) -> np.ndarray:
     if isinstance(shape, Mesh):
         return shape.vertices
     return np.asarray(shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape, np.float64)
+
+
+def bounds_of(shape: Shape) -> np.ndarray:
+    """Return the least and greatest corners of the object's box.  -> (2, 3) [m]."""
+    if isinstance(shape, Mesh):
+        return shape.bounds
+    return np.stack([vertices_of(shape).min(0), vertices_of(shape).max(0)])
 
 
 def _project(camera: np.ndarray, K: np.ndarray) -> np.ndarray:

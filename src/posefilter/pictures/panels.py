@@ -1,6 +1,6 @@
 """Small plots with a frame, ticks and labels, drawn straight onto pixels: a hundred times sooner than a plotting library.
 
-A panel's place for the plot is `size` pixels square; round it are margins for the title, the ticks and the labels.
+Round a panel's plot are margins for the ticks and the labels; what it shows is said above it (`headed`).
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,13 @@ from matplotlib import colormaps
 from PIL import Image, ImageDraw
 
 from posefilter.pictures.canvas import INK, PAPER, Colour, draw_dots, draw_lines, font
+from posefilter.pictures.sheet import DETAIL, TITLE, WIDTH, scale
 
-LEFT, TOP, RIGHT, BOTTOM = 58, 28, 18, 44  # margins [px]
+LEFT, TOP, RIGHT, BOTTOM = 62, 8, 14, 48  # margins [px]
 SURFACE: Colour = (110, 114, 120)
 _GRID: Colour = (225, 228, 232)
-_LETTERS = 13
+_MASS: Colour = (122, 153, 196)
+_REACH = 9  # [px] of a ring
 
 
 class Axis(NamedTuple):
@@ -45,47 +47,71 @@ def colours(values: np.ndarray, low: float, high: float, name: str = "viridis") 
 
 
 def heat_panel(
-    cells: np.ndarray, x: Axis, y: Axis, title: str, size: int, marks: Sequence[Mark] = (), dots: np.ndarray | None = None
+    cells: np.ndarray, x: Axis, y: Axis, width: int, marks: Sequence[Mark] = (), dots: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw a grid of colours (G, G, 3) uint8, row i at the i-th of even values of y from `low` to `high`, upwards.
 
     The cells' centres run from end to end of the axes, and smoothing lies between them. dots: (P, 2) places that are
-    pricked in. -> picture.
+    pricked in. -> picture, its square plot as large as `width` allows.
     """
+    size = width - LEFT - RIGHT
     plot = cv2.resize(cells[::-1], (size, size), interpolation=cv2.INTER_NEAREST)
     if dots is not None and len(dots):
         draw_dots(plot, _at(dots, x, y, size), np.tile(np.array([SURFACE]), (len(dots), 1)), 1.2)
     for mark in marks:
-        _point(plot, mark, x, y, size)
-    return framed(plot, x, y, title)
+        at = _at(np.array([[mark.x, mark.y]]), x, y, size)[0]
+        draw_mark(plot, np.clip(at, _REACH, size - 1 - _REACH), mark.colour, mark.shape)
+    return framed(plot, x, y)
 
 
 def curve_panel(
-    lines: Sequence[tuple[np.ndarray, Colour]], places: np.ndarray, x: Axis, y: Axis, title: str, width: int, height: int
+    lines: Sequence[tuple[np.ndarray, Colour]], places: np.ndarray, x: Axis, y: Axis, width: int, height: int, thick: int = 2
 ) -> np.ndarray:
-    """Draw curves (P,) each over the same places (P,); what lies beyond the axes is cut at their ends."""
+    """Draw curves (P,) each over the same places (P,); what lies beyond the axes is cut at their ends.
+
+    width, height: of the whole panel [px].
+    """
+    plot = _ruled(x, y, width, height)
+    for values, colour in lines:
+        path = _at(np.stack([places, np.clip(values, y.low, y.high)], 1), x, y, plot.shape[1], plot.shape[0])
+        draw_lines(plot, [path], colour, thick, halo=False)
+    return framed(plot, x, y)
+
+
+def mass_panel(
+    mass: np.ndarray, edges: np.ndarray, marks: Sequence[tuple[float, Colour]], x: Axis, y: Axis, width: int, height: int
+) -> np.ndarray:
+    """Draw a histogram (M,) between edges (M + 1,), and upright lines; width, height: of the whole panel [px]."""
+    plot = _ruled(x, y, width, height)
+    corners = _at(np.stack([edges, np.append(mass, 0)], 1), x, y, plot.shape[1], plot.shape[0]).round().astype(int)
+    for share, (left, top), right in zip(mass, corners[:-1].tolist(), corners[1:, 0].tolist(), strict=True):
+        if share > 0:
+            plot[max(top, 0) :, left : max(right, left + 1)] = _MASS
+    for value, colour in marks:
+        (u, _), (_, low) = _at(np.array([[value, y.high], [value, y.low]]), x, y, plot.shape[1], plot.shape[0])
+        draw_lines(plot, [np.array([[u, 0], [u, low]])], colour, 2)
+    return framed(plot, x, y)
+
+
+def _ruled(x: Axis, y: Axis, width: int, height: int) -> np.ndarray:
+    """Return an empty plot with lines at its ticks."""
+    width, height = width - LEFT - RIGHT, height - TOP - BOTTOM
     plot = np.full((height, width, 3), PAPER, np.uint8)
     for value in y.ticks:
-        v = round((y.high - value) / (y.high - y.low) * (height - 1))
-        plot[v] = _GRID
+        plot[round((y.high - value) / (y.high - y.low) * (height - 1))] = _GRID
     for value in x.ticks:
         plot[:, round((value - x.low) / (x.high - x.low) * (width - 1))] = _GRID
-    for values, colour in lines:
-        u = (places - x.low) / (x.high - x.low) * (width - 1)
-        v = (y.high - np.clip(values, y.low, y.high)) / (y.high - y.low) * (height - 1)
-        draw_lines(plot, [np.stack([u, v], 1)], colour, 2, halo=False)
-    return framed(plot, x, y, title)
+    return plot
 
 
-def framed(plot: np.ndarray, x: Axis, y: Axis, title: str) -> np.ndarray:
-    """Put title, ticks and labels round a plot."""
+def framed(plot: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
+    """Put ticks and labels round a plot."""
     height, width = plot.shape[:2]
     sheet = np.full((height + TOP + BOTTOM, width + LEFT + RIGHT, 3), PAPER, np.uint8)
     sheet[TOP : TOP + height, LEFT : LEFT + width] = plot
     image = Image.fromarray(sheet)
-    pen, letters = ImageDraw.Draw(image), font(_LETTERS)
+    pen, letters = ImageDraw.Draw(image), font(DETAIL)
     pen.rectangle([LEFT - 1, TOP - 1, LEFT + width, TOP + height], outline=INK)
-    pen.text((LEFT + width / 2, TOP / 2), title, fill=INK, font=font(_LETTERS + 1), anchor="mm")
     for value in x.ticks:
         u = LEFT + (value - x.low) / (x.high - x.low) * (width - 1)
         pen.line([(u, TOP + height), (u, TOP + height + 4)], fill=INK)
@@ -94,40 +120,17 @@ def framed(plot: np.ndarray, x: Axis, y: Axis, title: str) -> np.ndarray:
         v = TOP + (y.high - value) / (y.high - y.low) * (height - 1)
         pen.line([(LEFT - 5, v), (LEFT - 1, v)], fill=INK)
         pen.text((LEFT - 7, v), f"{value:g}", fill=INK, font=letters, anchor="rm")
-    pen.text((LEFT + width / 2, TOP + height + 24), x.label, fill=INK, font=letters, anchor="mt")
-    side = Image.new("RGB", (height, 20), PAPER)
-    ImageDraw.Draw(side).text((height / 2, 10), y.label, fill=INK, font=letters, anchor="mm")
-    image.paste(side.rotate(90, expand=True), (0, TOP))
+    pen.text((LEFT + width / 2, TOP + height + 25), x.label, fill=INK, font=letters, anchor="mt")
+    if y.label:
+        side = Image.new("RGB", (height, 20), PAPER)
+        ImageDraw.Draw(side).text((height / 2, 10), y.label, fill=INK, font=letters, anchor="mm")
+        image.paste(side.rotate(90, expand=True), (0, TOP))
     return np.asarray(image)
 
 
-def upright_bar(low: str, high: str, title: str, size: int, name: str = "viridis", width: int = 84) -> np.ndarray:
-    """Return a colour scale as high as a panel of `size`, its ends named."""
-    sheet = np.full((size + TOP + BOTTOM, width, 3), PAPER, np.uint8)
-    ramp = colours(np.linspace(1, 0, size), 0, 1, name)
-    sheet[TOP : TOP + size, 6:24] = ramp[:, None]
-    image = Image.fromarray(sheet)
-    pen, letters = ImageDraw.Draw(image), font(_LETTERS)
-    pen.rectangle([5, TOP - 1, 24, TOP + size], outline=INK)
-    pen.text((4, TOP / 2), title, fill=INK, font=letters, anchor="lm")
-    pen.text((29, TOP + 7), high, fill=INK, font=letters, anchor="lm")
-    pen.text((29, TOP + size - 8), low, fill=INK, font=letters, anchor="lm")
-    return np.asarray(image)
-
-
-def flat_bar(label: str, low: str, high: str, name: str, size: int = 15, long: int = 160) -> np.ndarray:
-    """Return a colour scale that lies in a strip of writing: label, low end, colours, high end."""
-    letters = font(size)
-    before, after = f"{label}   {low}", high
-    left = 8 + letters.getlength(before) + 8
-    line = round(size * 1.9)
-    image = Image.new("RGB", (round(left + long + 8 + letters.getlength(after) + 18), line), PAPER)
-    pen = ImageDraw.Draw(image)
-    pen.text((8, line / 2), before, fill=INK, font=letters, anchor="lm")
-    pen.text((left + long + 8, line / 2), after, fill=INK, font=letters, anchor="lm")
-    out = np.asarray(image).copy()
-    out[6:-6, round(left) : round(left) + long] = colours(np.linspace(0, 1, long), 0, 1, name)[None]
-    return out
+def colour_scale(before: str, after: str, name: str = "viridis", width: int = WIDTH, size: int = TITLE) -> np.ndarray:
+    """Return a scale of a map's colours between what its ends mean."""
+    return scale(before, colours(np.linspace(0, 1, 256), 0, 1, name), after, width, size)
 
 
 def beside(parts: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
@@ -140,16 +143,18 @@ def beside(parts: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
     return np.pad(row[:, :width], ((0, 0), (0, max(0, width - row.shape[1])), (0, 0)), constant_values=255)
 
 
-def _at(places: np.ndarray, x: Axis, y: Axis, size: int) -> np.ndarray:
+def draw_mark(
+    picture: np.ndarray, at: np.ndarray, colour: Colour, shape: str = "ring", reach: float = 0, width: int = 2
+) -> None:
+    """Draw a ring or a square round a place (2,) [px], in place; reach: how far it goes from there (0: as in panels)."""
+    reach = reach or (_REACH if shape == "ring" else 2 * _REACH / 3)
+    turn = np.linspace(0, 2 * np.pi, 33)[:-1] if shape == "ring" else np.pi / 4 + np.arange(4) * np.pi / 2
+    length = reach if shape == "ring" else reach * 2**0.5
+    draw_lines(picture, [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)], colour, width, closed=True)
+
+
+def _at(places: np.ndarray, x: Axis, y: Axis, width: int, height: int = 0) -> np.ndarray:
+    """Return where places (P, 2) lie on a plot, a square one without a height.  -> (P, 2) [px]."""
     u = (places[:, 0] - x.low) / (x.high - x.low)
     v = (y.high - places[:, 1]) / (y.high - y.low)
-    return np.stack([u, v], 1) * (size - 1)
-
-
-def _point(plot: np.ndarray, mark: Mark, x: Axis, y: Axis, size: int) -> None:
-    """Draw a ring or a square, in place; on the rim where it lies beyond."""
-    reach = 9 if mark.shape == "ring" else 6
-    at = np.clip(_at(np.array([[mark.x, mark.y]]), x, y, size), reach, size - 1 - reach)[0]
-    turn = np.linspace(0, 2 * np.pi, 25)[:-1] if mark.shape == "ring" else np.pi / 4 + np.arange(4) * np.pi / 2
-    length = reach if mark.shape == "ring" else reach * 2**0.5
-    draw_lines(plot, [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)], mark.colour, 2, closed=True)
+    return np.stack([u, v], 1) * [width - 1, (height or width) - 1]

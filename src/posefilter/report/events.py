@@ -61,6 +61,6 @@ def event_files(folder: Path) -> Iterator[Path]:
 
 
 def not_yet_in(pictures: list[Picture], files: list[Picture]) -> list[Picture]:
-    """Return the logged pictures that no file shows: `figures/belief` is what `validation_belief.png` is."""
+    """Return the logged pictures that no file shows: `figures/belief` is what `validation_belief.jpg` is."""
     known = {words(picture.name) - PLACES for picture in files}
     return [picture for picture in pictures if words(picture.name) - PLACES not in known]

@@ -18,7 +18,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.models.base import PoseEstimator
 from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.canvas import rasterise, save_picture
+from posefilter.pictures.canvas import save_picture
 from posefilter.pictures.overlay import draw_overlay
 from posefilter.pictures.recording import check_viewer, record
 from posefilter.pictures.shown import what_is_shown
@@ -65,7 +65,7 @@ def predict(job: Job) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     caption = f"{method.model.name}, score {float(belief.score[0]):.2f}"
     save_picture(draw_overlay(rgb, K.numpy(), pose, shape, caption=caption), folder / "overlay.png")
-    save_picture(rasterise(draw_belief(belief, method.model, rgb, K.numpy())), folder / "belief.png")
+    save_picture(draw_belief(belief, method.model, rgb, K.numpy()), folder / "belief.png")
     np.savez_compressed(folder / "belief.npz", poses=belief.poses[0].numpy(), weights=weights.float().numpy())
     answer = told(pose, belief_numbers(weights), float(belief.score[0]), seconds, method, job)
     write_json(folder / "pose.json", answer)
