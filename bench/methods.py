@@ -40,9 +40,9 @@ def plan() -> list[Line]:
     memorise = f"{FOUR} experiment=memorise"
     lines = [
         Line("memorise", f"{memorise} variant=working seed=0"),
+        Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
         Line("memorise", f"{memorise} variant=paper seed=0"),
-        Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
     ]
     for table, swept in AT_TEST_TIME.items():
         lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]

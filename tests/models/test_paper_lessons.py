@@ -70,3 +70,9 @@ def test_the_pixels_motion_ends_as_it_was_drawn() -> None:
     same = {part for part in ("latent", "pose", "likelihood", "motion")
             if all(torch.equal(drawn[n], p) for n, p in method.net.named_parameters() if n.startswith(part))}  # fmt: skip
     assert same == {"likelihood", "motion"}
+
+
+def test_what_no_loss_reads_is_asked_for_no_gradient() -> None:
+    """Not even for one of zeros: where a place reaches no loss, most of the backward pass would be spent on it."""
+    method = taught(paper(PixelPF, 1))
+    assert all(p.grad is None for part in ("likelihood", "motion") for p in getattr(method.net, part).parameters())

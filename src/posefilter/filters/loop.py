@@ -106,8 +106,8 @@ def inherit(values: Tensor, children: Children, space: Space | None = None) -> T
     Where children are mixes, values are averaged by their shares: as `space` averages states, or plainly if it is None.
     """
     if children.shares is None:
-        rows = torch.arange(len(values), device=values.device)[:, None]
-        return values[rows, children.parents]
+        index = children.parents[(...,) + (None,) * (values.dim() - 2)]
+        return values.gather(1, index.expand(*children.parents.shape, *values.shape[2:]))
     if space is not None:
         return space.mean(values[:, None], children.shares)
     return children.shares @ values

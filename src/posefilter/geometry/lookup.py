@@ -40,8 +40,8 @@ def sample(image: Tensor, pixels: Tensor, stride: int = 1, padding: str = "zeros
 
 def touches(mask: Tensor, pixels: Tensor, size: int = 1) -> Tensor:
     """Tell whether a size x size glimpse meets the mask.  (B, 1, H, W) bool, (B, P, 2) [px] -> (B, P) bool."""
-    met = F.max_pool2d(F.pad(mask.float(), (size,) * 4), size, stride=1)  # a glimpse beyond the edge may still meet it
-    return pick(met, nearest_pixel(pixels) + size - (size - 1) // 2)[..., 0] > 0
+    index = nearest_pixel(pixels)[:, :, None] + window(size, pixels.device)  # far fewer pixels than the frame has
+    return pick(mask, index.flatten(1, 2)).unflatten(1, index.shape[1:3]).flatten(2).any(-1)
 
 
 def shrink(mask: Tensor, margin_px: int) -> Tensor:

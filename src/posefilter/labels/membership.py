@@ -16,7 +16,9 @@ class OnObject:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N) in {0, 1}."""
-        return torch.stack([touches(batch.mask, cloud.state, self.size) for cloud in trace.clouds]).float()
+        counts = [cloud.state.shape[1] for cloud in trace.clouds]
+        met = touches(batch.mask, torch.cat([cloud.state for cloud in trace.clouds], dim=1), self.size).float()
+        return torch.stack(met.split(counts, dim=1))
 
 
 class Quality:

@@ -235,7 +235,7 @@ class PoseEstimator(LightningModule):
 
 
 def score_of(results: dict[str, Any]) -> float:
-    """Return one figure in [0, 100], more is better: the ADD AUC, or of a detector the mean of particles on the object and box IoU.
+    """Return one figure in [0, 100], more is better: ADD AUC, or a detector's mean of particles on the object and box IoU.
 
     Particles may all be on the object long before the box that they tell fits it.
     """

@@ -125,6 +125,8 @@ class ImageSpace(PoseEstimator):
 
     def place(self, scene: ImageScene, state: Tensor) -> Tensor:
         """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its location in [-1, 1]."""
+        if not self.place_width:
+            return state.detach()[..., :0]  # nothing to learn: else all that decided the place would be asked for zeros
         height, width = scene.image.shape[-2:]
         half = state.new_tensor([(width - 1) / 2, (height - 1) / 2])
         return (state / half - 1)[..., : self.place_width]

@@ -47,8 +47,8 @@ class NoContext(nn.Module):
         return ContextMap((), (), None)
 
     def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """(B, N, 2) -> (B, N, 0)."""
-        return pixels[..., :0]
+        """(B, N, 2) -> (B, N, 0), without gradient: else all that decided the place would be asked for zeros."""
+        return pixels.detach()[..., :0]
 
 
 class Pyramid(nn.Module):

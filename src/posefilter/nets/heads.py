@@ -132,7 +132,14 @@ def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
     (B, 1, H, W) [m], 0 where unknown -> (B, 1, H, W) [m].
     """
     known = (depth > 0).to(depth.dtype)
-    near = F.avg_pool2d(depth, size, 1, size // 2) / F.avg_pool2d(known, size, 1, size // 2).clamp_min(1e-6)
+    total, count = _window_mean(torch.cat([depth, known]), size).chunk(2)
+    near = total / count.clamp_min(1e-6)
     flat = torch.where(depth > 0, depth, torch.nan).flatten(1).nanmedian(1).values
     median = torch.nan_to_num(flat, nan=1.0)[:, None, None, None]
     return torch.where(depth > 0, depth, torch.where(near > 0, near, median))
+
+
+def _window_mean(x: Tensor, size: int) -> Tensor:
+    """Average over a square about each pixel, zeros beyond the frame, an axis at a time.  (B, C, H, W) -> the same."""
+    rows = F.avg_pool2d(x, (size, 1), 1, (size // 2, 0))
+    return F.avg_pool2d(rows, (1, size), 1, (0, size // 2))

@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
+from posefilter.nets.linear import Linear
 
 
 class Said(NamedTuple):
@@ -41,17 +42,26 @@ class ParticleNorm(nn.Module):
         self.inner: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(*, width) -> (*, width)."""
-        return self.inner(x.reshape(-1, x.shape[-1])).reshape(x.shape)
+        """(rows, width) -> (rows, width)."""
+        return self.inner(x)
 
 
-def mlp(inputs: int, outputs: int, width: int, layers: int, normalisation: str) -> nn.Sequential:
+class Mlp(nn.Sequential):
+    """Layers over rows: the leading axes are folded into one once: on a view, a ReLU in place costs copies of its gradient."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(*, inputs) -> (*, outputs)."""
+        out: Tensor = super().forward(x.flatten(0, -2))
+        return out.unflatten(0, x.shape[:-1])
+
+
+def mlp(inputs: int, outputs: int, width: int, layers: int, normalisation: str) -> Mlp:
     """Return `layers` linear layers, each but the last followed by a normalisation and a ReLU."""
     parts: list[nn.Module] = []
     for _ in range(layers - 1):
-        parts += [nn.Linear(inputs, width), ParticleNorm(normalisation, width), nn.ReLU(inplace=True)]
+        parts += [Linear(inputs, width), ParticleNorm(normalisation, width), nn.ReLU(inplace=True)]
         inputs = width
-    return nn.Sequential(*parts, nn.Linear(inputs, outputs))
+    return Mlp(*parts, Linear(inputs, outputs))
 
 
 class LatentNet(nn.Module):
@@ -110,7 +120,7 @@ class PatchNet(nn.Module):
         self.convolve = nn.Sequential(*blocks)
         features = width * size * size + extra
         outputs = 3 + memory_width
-        self.tell = mlp(features, outputs, hidden, 3, normalisation) if hidden else nn.Linear(features, outputs)
+        self.tell = mlp(features, outputs, hidden, 3, normalisation) if hidden else Linear(features, outputs)
 
     def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; the memory is written anew, not read."""
