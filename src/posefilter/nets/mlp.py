@@ -47,7 +47,7 @@ class ParticleNorm(nn.Module):
 
 
 class Mlp(nn.Sequential):
-    """Layers over rows: the leading axes are folded into one once: on a view, a ReLU in place costs copies of its gradient."""
+    """Layers over rows: leading axes are folded into one, once: a ReLU in place on a view costs copies of its gradient."""
 
     def forward(self, x: Tensor) -> Tensor:
         """(*, inputs) -> (*, outputs)."""
