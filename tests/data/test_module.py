@@ -10,7 +10,7 @@ from dataset_trees import HEIGHT, HIGH, LOW, WIDTH, K, bop_scene, fat_folder, fa
 from torch.utils.data import default_collate
 
 from posefilter.data.meshes import MeshStore
-from posefilter.data.module import PoseDataModule
+from posefilter.data.module import PoseDataModule, spare_cores
 from posefilter.data.resize import network_size, resize_depth, resize_mask
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
@@ -318,3 +318,17 @@ def test_an_open_mesh_store_may_be_given(root):
     dm = module(root, meshes=MeshStore(root / "meshes"), split={"test": 1.0})
     assert dm.objects == ("toy",)
     assert dm.object_model(0).name == "toy"
+
+
+@pytest.mark.parametrize(("cores", "threads", "workers"), [(2, 2, 0), (4, 3, 1), (16, 8, 4), (1, 2, 0)])
+def test_loader_processes_take_the_cores_that_are_spare(monkeypatch, cores, threads, workers):
+    monkeypatch.setattr("posefilter.data.module.os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setattr("posefilter.data.module.torch.get_num_threads", lambda: threads)
+    monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: False)
+    assert spare_cores() == workers
+
+
+def test_a_gpu_leaves_the_cores_to_the_loader(monkeypatch):
+    monkeypatch.setattr("posefilter.data.module.os.sched_getaffinity", lambda _: set(range(4)), raising=False)
+    monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: True)
+    assert spare_cores() == 3

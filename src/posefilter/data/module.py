@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -35,6 +36,16 @@ log = logging.getLogger(__name__)
 _STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",), None: NAMES}
 
 
+def spare_cores(most: int = 4) -> int:
+    """Return how many loader processes fit beside a training: the cores that torch's threads leave, or with a GPU all but one.
+
+    The threads of one operation wait for each other, so a process that takes one's core away holds up all of them.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    busy = 1 if torch.cuda.is_available() else torch.get_num_threads()
+    return max(0, min(most, cores - busy))
+
+
 class PoseDataModule(LightningDataModule):
     """Frames of one dataset with the objects asked for, split by scene, resized, cached and augmented."""
 
@@ -53,7 +64,7 @@ class PoseDataModule(LightningDataModule):
         min_visibility_test: float = 0.0,
         batch_size: int = 8,
         batch_size_test: int | None = None,
-        workers: int = 0,
+        workers: int | None = 0,
         seed: int = 0,
         augment: "Augment | None" = None,
         cache: str = "memory",
@@ -73,7 +84,7 @@ class PoseDataModule(LightningDataModule):
         source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all. meshes: "builtin", a folder
         or a mesh store; mesh_scale: metres a unit of its files (0.001 for BOP's models, else 1). image_width alone keeps the
         aspect. split: what part of the scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
-        split_seed shuffles the scenes. min_visibility: of training frames; min_visibility_test: of val and test frames
+        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`. min_visibility: of training frames; min_visibility_test: of val and test frames
         (unknown visibility passes). cache: "memory", "none", or "disk" (in `cache_dir`, by default the dataset's own
         `.cache`). on_error: "raise", or "skip" broken frames and count them. limit_*: the first so many frames of a fixed
         shuffle. points: surface points for ADD; model_points: a folder with <class>/points.xyz in the dataset's own frame
@@ -92,7 +103,8 @@ class PoseDataModule(LightningDataModule):
         self._least = {"train": min_visibility, "val": min_visibility_test, "test": min_visibility_test}
         self._limits = {"train": limit_train, "val": limit_val, "test": limit_test}
         self._batch_size, self._batch_size_test = batch_size, batch_size_test or batch_size
-        self._workers, self._seed, self._augment, self._on_error = workers, seed, augment, on_error
+        self._workers = spare_cores() if workers is None else workers
+        self._seed, self._augment, self._on_error = seed, augment, on_error
         self._cache_kind, self._cache_dir = cache, cache_dir
         self._points, self._model_points, self._progress = points, model_points, progress
         self._datasets: dict[str, FrameDataset] = {}
