@@ -37,7 +37,7 @@ _STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "pr
 
 
 def spare_cores(most: int = 4) -> int:
-    """Return how many loader processes fit beside a training: the cores that torch's threads leave, or with a GPU all but one.
+    """Return how many loader processes fit beside a training: what cores torch's threads leave, or with a GPU all but one.
 
     The threads of one operation wait for each other, so a process that takes one's core away holds up all of them.
     """
@@ -84,11 +84,12 @@ class PoseDataModule(LightningDataModule):
         source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all. meshes: "builtin", a folder
         or a mesh store; mesh_scale: metres a unit of its files (0.001 for BOP's models, else 1). image_width alone keeps the
         aspect. split: what part of the scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
-        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`. min_visibility: of training frames; min_visibility_test: of val and test frames
-        (unknown visibility passes). cache: "memory", "none", or "disk" (in `cache_dir`, by default the dataset's own
-        `.cache`). on_error: "raise", or "skip" broken frames and count them. limit_*: the first so many frames of a fixed
-        shuffle. points: surface points for ADD; model_points: a folder with <class>/points.xyz in the dataset's own frame
-        instead. generate: called with the root where scenes are yet to be rendered. options: the reader's own.
+        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`. min_visibility: of training
+        frames; min_visibility_test: of val and test frames (unknown visibility passes). cache: "memory", "none", or "disk"
+        (in `cache_dir`, by default the dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them.
+        limit_*: the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a folder with
+        <class>/points.xyz in the dataset's own frame instead. generate: called with the root where scenes are yet to be
+        rendered. options: the reader's own.
         """
         super().__init__()
         if cache not in CACHES:

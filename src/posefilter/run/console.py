@@ -41,7 +41,7 @@ def is_whole(name: str) -> bool:
 
 
 class Lines(Callback):
-    """A line at each validation, and a sign of life every `pause` seconds: step, loss, speed, and how long it still takes."""
+    """A line at each validation, and a sign of life every `pause` seconds: step, loss, speed, and what time is left."""
 
     def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
         self.console, self.pause = console, pause
@@ -66,9 +66,10 @@ class Lines(Callback):
         step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
         rate = (step - self._step) / max(self._last - self._began, 1e-9)
         left = f", {duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
-        sentence = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
+        words = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
         numbers = {name: float(value) for name, value in seen.items() if name == "train/total" or is_whole(name)}
-        say(self.console, event, f"step {step} of {steps}: {sentence}", step=step, steps=steps, **numbers, steps_per_second=rate)
+        numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}
+        say(self.console, event, f"step {step} of {steps}: {words}", **numbers)
 
 
 class Bars(Callback):
