@@ -16,7 +16,7 @@ Chart = tuple[str, list[str]]
 # Regular expressions of tags, one line each in a chart. What a method does not log, its charts leave out.
 STORY: dict[str, dict[str, Chart]] = {
     "1  Does it work?": {
-        "score on validation (ADD AUC, or percent of the particles on the object)": ("Multiline", ["val/score$"]),
+        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": ("Multiline", ["val/score$"]),
         "AUC of ADD and ADD-S": ("Multiline", [r"val/add/auc$", r"val/add_s/auc$"]),
         "median error [mm]": ("Multiline", [r"val/add/median_mm$", r"val/add_s/median_mm$"]),
         "found: share of the images [%]": ("Multiline", [r"val/add/recall_01d$", r"val/add/recall_2cm$"]),

@@ -49,3 +49,12 @@ def summary(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
         "recall_2cm": recall(errors, 0.02),
         "median_mm": median_mm(errors),
     }
+
+
+def overall(add_auc: float | None, on_object: float, iou: float) -> float:
+    """Return the one figure that chooses between checkpoints and between runs, in [0, 100]; more is better.
+
+    The ADD AUC where poses are told; of a detector (None) the mean of particles on the object and box IoU, both shares:
+    its particles may all be on the object long before the box that they tell fits it.
+    """
+    return 50.0 * (on_object + iou) if add_auc is None else add_auc

@@ -18,6 +18,7 @@ from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+from posefilter.metrics.scores import overall
 from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
@@ -235,13 +236,9 @@ class PoseEstimator(LightningModule):
 
 
 def score_of(results: dict[str, Any]) -> float:
-    """Return one figure in [0, 100], more is better: ADD AUC, or a detector's mean of particles on the object and box IoU.
-
-    Particles may all be on the object long before the box that they tell fits it.
-    """
-    if results["add"]:
-        return float(results["add"]["auc"])
-    return 50.0 * float(results["particles_on_object"] + results["iou"])
+    """Return the one figure of results in the form of metrics.json (see `overall`)."""
+    auc = float(results["add"]["auc"]) if results["add"] else None
+    return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
 
 
 def flatten(results: dict[str, Any], prefix: str = "") -> dict[str, float]:

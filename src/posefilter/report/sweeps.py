@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
+from posefilter.metrics.scores import overall
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
 from posefilter.report.signs import flatten
 
@@ -154,8 +155,9 @@ def groups(sweep: Sweep) -> list[Group]:
 
 
 def score(numbers: dict[str, float]) -> float:
-    """Return what sweeps maximise: ADD AUC, or the share of particles on the object where no pose is told [%]."""
-    return numbers["add/auc"] if "add/auc" in numbers else 100 * numbers.get("particles_on_object", float("-inf"))
+    """Return what sweeps maximise (see `overall`)."""
+    least = float("-inf")
+    return overall(numbers.get("add/auc"), numbers.get("particles_on_object", least), numbers.get("iou", least))
 
 
 def best_job(sweep: Sweep) -> Job:

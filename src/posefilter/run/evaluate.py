@@ -13,13 +13,14 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.models.base import score_of
 from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.pieces import changed, changes
 from posefilter.run.results import record, show, write_json
-from posefilter.run.train import build_data, make_trainer, quiet, score
+from posefilter.run.train import build_data, make_trainer, quiet
 from posefilter.run.voice import typed
 from posefilter.types import ObjectModel
 
@@ -39,7 +40,7 @@ def evaluate(job: Job) -> float:
     files = {"metrics": job.folder / "metrics.json", **files}
     following = [typed("report", run=job.folder)] if (job.folder / ".hydra").is_dir() and not job.swept else []
     show(metrics, str(job.cfg.estimates or job.cfg.checkpoint), job.cfg.console, "evaluated", files, following)
-    return score(metrics)
+    return score_of(metrics)
 
 
 def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:

@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from posefilter.callbacks.story import Story
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
+from posefilter.models.base import score_of
 from posefilter.run.build import instantiate
 from posefilter.run.comparing import comparable
 from posefilter.run.console import progress
@@ -33,7 +34,7 @@ def train(job: Job) -> float:
         say(
             job.cfg.console, "skipped", f"{job.folder}: done before; delete its metrics.json to run it again", run=job.folder
         )
-        return score(done)
+        return score_of(done)
     check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
     method, trainer = build_method(recipe(job)), build_trainer(job)  # first, since they are the sooner to complain
@@ -55,7 +56,7 @@ def train(job: Job) -> float:
     files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
     following = [] if job.swept else [typed("report", run=job.folder), typed("evaluate", checkpoint=best), "make board"]
     show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console, "trained", files, following)
-    return score(metrics)
+    return score_of(metrics)
 
 
 def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | None]:
@@ -141,13 +142,6 @@ def finished(job: Job) -> dict[str, Any] | None:
         return None
     metrics: dict[str, Any] = json.loads(path.read_text())
     return metrics if sorted(metrics["overrides"]) == sorted(job.overrides) else None
-
-
-def score(metrics: dict[str, Any]) -> float:
-    """Return what sweeps maximise: ADD AUC, or the particles on the object where no pose is told."""
-    if metrics["add"]:
-        return float(metrics["add"]["auc"])
-    return 100 * float(metrics["particles_on_object"])
 
 
 def quiet() -> None:
