@@ -26,6 +26,8 @@ from posefilter.run.results import record, show, write_json
 from posefilter.run.resume import last_checkpoint
 from posefilter.run.voice import PLAIN, say, typed
 
+_HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")
+
 
 def train(job: Job) -> float:
     """Train and test; write metrics.json into the job's folder.  Returns the score that sweeps maximise."""
@@ -135,13 +137,18 @@ def start_from(job: Job) -> str | None:
 
 
 def finished(job: Job) -> dict[str, Any] | None:
-    """Return the metrics of a sweep's job that was done before, with the same overrides."""
+    """Return the metrics of a sweep's job that was done before, with the same overrides where they decide a result."""
     kept, path = job.folder / "metrics_train.json", job.folder / "metrics.json"
     path = kept if kept.is_file() else path
     if not (job.swept and path.is_file()):
         return None
     metrics: dict[str, Any] = json.loads(path.read_text())
-    return metrics if sorted(metrics["overrides"]) == sorted(job.overrides) else None
+    return metrics if deciding(metrics["overrides"]) == deciding(job.overrides) else None
+
+
+def deciding(overrides: list[str]) -> list[str]:
+    """Return what was typed, in one order, less what says where and with how many hands a run is done."""
+    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in _HANDS)
 
 
 def quiet() -> None:
