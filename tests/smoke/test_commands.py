@@ -5,6 +5,7 @@ import importlib.util
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -41,7 +42,9 @@ def test_a_run_leaves_what_was_promised(trained: Path) -> None:
     for name in (".hydra/config.yaml", "checkpoints/best.ckpt", "checkpoints/last.ckpt", "metrics.json"):
         assert (trained / name).is_file(), name
     assert list(trained.glob("events.out.tfevents.*"))
-    assert list((trained / "figures").rglob("*.png"))
+    figures = list((trained / "figures").rglob("*.jpg"))
+    assert figures
+    assert all(cv2.imread(str(figure)) is not None for figure in figures)
     metrics = read(trained)
     assert metrics["instances"] > 0
     assert set(metrics["add"]) == set(metrics["add_s"]) == {"auc", "recall_01d", "recall_2cm", "median_mm"}
