@@ -173,10 +173,10 @@ class DepthNoise:
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with noisy depth; unknown pixels stay unknown."""
         d = sample.depth
-        coarse = rng.normal(size=(d.shape[0] // 2, d.shape[1] // 2)).astype(np.float32)
+        coarse = rng.standard_normal((d.shape[0] // 2, d.shape[1] // 2), dtype=np.float32)
         grain = cv2.resize(coarse, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        noisy = d * (1 + rng.normal() * self.scale) + d * d * grain * (self.noise * rng.uniform())
-        return dataclasses.replace(sample, depth=np.where(d > 0, noisy, 0).astype(np.float32))
+        factor, noise = np.float32(1 + rng.normal() * self.scale), np.float32(self.noise * rng.uniform())
+        return dataclasses.replace(sample, depth=d * (factor + d * grain * noise))  # 0, unknown, stays 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,12 +200,11 @@ def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray
     levels = np.arange(256) / 255.0
     curves = [0.5 + (np.clip(levels * g, 1e-4, 1) ** gamma - 0.5) * contrast for g in gain]
     table = (np.clip(np.stack(curves, -1), 0, 1) * 255).astype(np.uint8)[None]
-    out = cv2.LUT(rgb, table).astype(np.float32)
-    grey = out.mean(-1, keepdims=True)
-    out = grey + (out - grey) * saturation
+    mix = np.eye(3) * saturation + (1 - saturation) / 3  # towards or away from the grey of each pixel
+    out = cv2.transform(cv2.LUT(rgb, table).astype(np.float32), mix)
     if rng.random() < 0.4 * k:
         out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.1))
     if rng.random() < 0.5:
-        half = rng.normal(size=(rgb.shape[0], rgb.shape[1], 1)) * 0.7 + rng.normal(size=rgb.shape) * 0.7
-        out = out + half.astype(np.float32) * (255 * 0.06 * k * rng.random() ** 2)
+        each, common = (rng.standard_normal((*rgb.shape[:2], n), dtype=np.float32) for n in (3, 1))
+        out += (each + common) * np.float32(0.7 * 255 * 0.06 * k * rng.random() ** 2)
     return np.clip(out, 0, 255).astype(np.uint8)

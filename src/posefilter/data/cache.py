@@ -17,6 +17,7 @@ from posefilter.errors import UserError
 
 CACHES = ("memory", "disk", "none")
 _UNITS = 10_000.0  # a metre
+_LAYOUT = 2  # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class DiskCache:
 
     def __init__(self, folder: Path, version: str) -> None:
         """Use a folder; `version` says all that decides the content beside the source files (size, class list, meshes)."""
-        self.folder = folder / hashlib.sha256(version.encode()).hexdigest()[:16]
+        self.folder = folder / hashlib.sha256(f"{_LAYOUT} {version}".encode()).hexdigest()[:16]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "README").write_text(f"decoded frames; may be deleted at any time\n{version}\n")
@@ -179,18 +180,18 @@ def prepare(sample: Sample) -> Prepared:
 
 
 def pack_image(sample: Sample) -> np.ndarray:
-    """Return colour and depth in one array.  -> (H, W, 5) uint8."""
+    """Return colour and depth in one array, one after the other.  -> (5 H W,) uint8."""
     units = np.round(sample.depth * _UNITS)
     depth = np.where(units > 65535, 0, units).astype("<u2")
-    return np.concatenate([sample.rgb, depth[..., None].view(np.uint8)], axis=-1)
+    return np.concatenate([sample.rgb.ravel(), depth.ravel().view(np.uint8)])
 
 
 def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     """Return the sample that was packed."""
     height, width = one.shape
-    depth = np.ascontiguousarray(image[..., 3:]).view("<u2")[..., 0].astype(np.float32) / np.float32(_UNITS)
+    rgb, depth = np.split(image, [3 * height * width])
+    rgb, depth = rgb.reshape(height, width, 3).copy(), depth.view("<u2").reshape(height, width) / np.float32(_UNITS)
     mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
-    rgb = np.ascontiguousarray(image[..., :3])
     return Sample(
         rgb, depth, mask, one.intrinsics.copy(), one.camera_from_object.copy(), one.object_id, frame_id, one.visibility
     )
