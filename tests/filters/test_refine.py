@@ -1,4 +1,4 @@
-"""Refinement: the careful second look, and the climb, on a score whose top is known."""
+"""Refinement: the careful second look, the mean shift and the climb, on a score whose top is known."""
 
 import math
 
@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.refine import Chain, Gradient, NoRefine, Rescore
+from posefilter.filters.refine import Chain, Gradient, MeanShift, NoRefine, Rescore
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
@@ -104,6 +104,50 @@ def test_images_climb_apart_and_alike() -> None:
     torch.testing.assert_close(single.best, whole.best[1:2], atol=1e-5, rtol=0)
 
 
+def test_a_mean_shift_finds_the_top() -> None:
+    method, belief = Peak(), belief_around(0.015)
+    found = MeanShift(rounds=12, pairs=200, start=0.02, end=0.01)(belief, truth(), method, Generator().manual_seed(0))
+    assert off(belief).min() > 0.005
+    assert off(found).max() < 0.002
+    assert is_rigid(found.best, 1e-4)
+    assert method.asked == [(400, 0.004, 256)] * 12 + [(1, 0.004, 256)]
+    assert torch.equal(found.poses, belief.poses)
+    assert not found.best.requires_grad
+
+
+class Bumpy(Peak):
+    """A peak with bumps of 3 mm on it, steep enough to hold whatever climbs."""
+
+    def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+        smooth = super().score_poses(scene, poses, sigma, generator, pixels)
+        return smooth + (origin_of(poses, CENTER) * (2 * math.pi / 0.003)).sin().sum(-1)
+
+
+def test_a_mean_shift_walks_over_the_bumps_that_hold_a_climb() -> None:
+    belief = belief_around(0.015)
+    shifted = MeanShift(rounds=12, pairs=500, start=0.02, end=0.01)(belief, truth(), Bumpy(), Generator().manual_seed(0))
+    climbed = Gradient(steps=60, lr=1e-3, sigma=0.004)(belief, truth(), Bumpy(), Generator().manual_seed(0))
+    assert off(shifted).max() < 0.003
+    assert off(climbed).mean() > 2 * off(shifted).mean()
+
+
+def test_a_mean_shift_on_even_ground_stays() -> None:
+    class Flat(Peak):
+        def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+            return torch.zeros(poses.shape[:2])
+
+    belief = belief_around(0.015)
+    found = MeanShift()(belief, truth(), Flat(), Generator().manual_seed(0))
+    torch.testing.assert_close(found.best, belief.best, atol=1e-5, rtol=0)
+    assert (found.score == 0).all()
+
+
+@pytest.mark.parametrize("wrong", [{"rounds": 0}, {"pairs": 0}, {"start": 0.005}, {"end": 0.0}])
+def test_a_mean_shift_to_nowhere_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(UserError, match="mean shift needs"):
+        MeanShift(**wrong)
+
+
 def test_chains_and_nothing() -> None:
     belief = belief_around(0.02)
     assert NoRefine()(belief, truth(), Peak(), Generator()) is belief
@@ -115,7 +159,7 @@ def test_what_cannot_be_refined_is_said() -> None:
     class Blind:
         space = PixelSpace()
 
-    for piece in (Rescore(), Gradient()):
+    for piece in (Rescore(), MeanShift(), Gradient()):
         with pytest.raises(UserError, match="Blind cannot score poses"):
             piece(belief_around(0.02), truth(), Blind(), Generator())
     with torch.inference_mode(), pytest.raises(UserError, match="inference_mode"):
