@@ -206,5 +206,5 @@ def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray
         out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.1))
     if rng.random() < 0.5:
         each, common = (rng.standard_normal((*rgb.shape[:2], n), dtype=np.float32) for n in (3, 1))
-        out += (each + common) * np.float32(0.7 * 255 * 0.06 * k * rng.random() ** 2)
+        out = out + (each + common) * np.float32(0.7 * 255 * 0.06 * k * rng.random() ** 2)
     return np.clip(out, 0, 255).astype(np.uint8)
