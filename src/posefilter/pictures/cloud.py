@@ -102,10 +102,9 @@ def draw_strip(rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: 
             cloud = trace.clouds[number]
             state, weights = cloud.state[image].detach().cpu().numpy(), weights_of(cloud, image).numpy()
             off = off_frame(state, height, wide)
-            head, rest = caption_of(trace, image, number, "px").split(", ")
-            said = rest + (f", {off:.0%} off the frame" if off else "")
+            said = effective_of(trace, image, number) + (f", {off:.0%} off the frame" if off else "")
             tile = headed(draw_particles(below, state, weights, frame), said, DETAIL)
-            tiles.append(headed(tile, head))
+            tiles.append(headed(tile, f"step {number}: {noise_of(trace, image, number, 'px')}"))
         parts.append(grid(tiles, 2))
     return sheet(title or "Particles by iteration", *parts, weight_scale())
 
@@ -117,10 +116,20 @@ def off_frame(pixels: np.ndarray, height: int, width: int) -> float:
 
 def caption_of(trace: Trace, image: int, number: int, unit: str) -> str:
     """Tell which step it is, its noise level, and how many particles are effective."""
+    return f"step {number}: {noise_of(trace, image, number, unit)}, {effective_of(trace, image, number)}"
+
+
+def noise_of(trace: Trace, image: int, number: int, unit: str) -> str:
+    """Tell a step's noise level, in mm of what is kept in metres, or in px."""
     sigma = trace.steps[number].sigma
     level = float(sigma if sigma.ndim == 0 else sigma[image]) * (1000 if unit == "mm" else 1)
+    return f"noise {level:.3g} {unit}"
+
+
+def effective_of(trace: Trace, image: int, number: int) -> str:
+    """Tell the effective share of a step's particles."""
     weights = weights_of(trace.clouds[number], image)
-    return f"step {number}: noise {level:.3g} {unit}, {float(1 / weights.square().sum() / len(weights)):.0%} effective"
+    return f"{float(1 / weights.square().sum() / len(weights)):.0%} effective"
 
 
 def weights_of(cloud: Cloud, image: int) -> torch.Tensor:

@@ -15,7 +15,16 @@ from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, transform
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.pictures.canvas import INK, PAPER, TRUTH, View, close_up, draw_lines, grid, stamp_dots, whole
-from posefilter.pictures.cloud import caption_of, faded, spread_choice, steps_shown, weight_colours, weight_scale, weights_of
+from posefilter.pictures.cloud import (
+    caption_of,
+    faded,
+    noise_of,
+    spread_choice,
+    steps_shown,
+    weight_colours,
+    weight_scale,
+    weights_of,
+)
 from posefilter.pictures.panels import beside, colour_scale
 from posefilter.pictures.sheet import CAPTION, WIDTH, headed, legend, lettered, middled, sheet, tile_width
 from posefilter.types import Trace
@@ -141,8 +150,8 @@ class Film:
             parents = self.ancestors(number, before)
             ends = self.drawn(number, torch.arange(len(weights)), few)
             starts = self.drawn(before, parents, parents[few])
-            told = caption_of(self.trace, 0, number, "mm" if self.posed else "px").partition(",")[0]
-            caption = told.replace(":", f" of {len(self.trace.clouds) - 1}:", 1)
+            noise = noise_of(self.trace, 0, number, "mm" if self.posed else "px")
+            caption = f"step {number} of {len(self.trace.clouds) - 1}: {noise}"
             for k in range(between if number else 1):
                 share = (k + 1) / between
                 dots, lines = (a + share * (b - a) for a, b in zip(starts, ends, strict=True))
