@@ -1,6 +1,6 @@
 """Run every run behind docs/methods.md, the most telling first, and bring its tables up to date after each line of the plan.
 
-    python bench/methods.py [--only NAME ...] [--list] [--root outputs/methods] [PATTERN=VALUE ...]
+    python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]   # --only may be repeated
 
 Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines, and is printed as it could
 be typed. Started again, it goes on: train.py skips the jobs that are done and resumes the one that was cut short. What is
@@ -88,7 +88,7 @@ def main() -> int:
     """Run the plan; the status is that of the worst line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("more", nargs="*")
-    parser.add_argument("--only", nargs="+", choices=sorted({line.table for line in plan()}), default=None)
+    parser.add_argument("--only", action="append", choices=sorted({line.table for line in plan()}))
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
     parser.add_argument("--root", type=Path, default=Path("outputs/methods"))
     options = parser.parse_args()
