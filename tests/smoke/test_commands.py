@@ -108,8 +108,10 @@ def test_unknown_pieces_are_told(trained: Path, tmp_path: Path, capfd: pytest.Ca
 def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_scenes: Path) -> None:
     weights = tmp_path / "carton.ckpt"
     typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", f"out={weights}"]
-    assert run_command("export", HOME, typed) == 0
+    assert run_command("export", HOME, [*typed, "refine=none", "filter.particles=9"]) == 0
     assert weights.stat().st_size < 5e6
+    recipe = torch.load(weights, weights_only=True)["recipe"]
+    assert recipe["choices"]["refine"] == "none"
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     out = tmp_path / "prediction"
@@ -122,7 +124,7 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     assert np.allclose(R @ R.T, np.eye(3), atol=1e-4)
     assert told["object"] == "carton"
     belief = np.load(out / "belief.npz")
-    assert belief["poses"].shape[1:] == (4, 4)
+    assert belief["poses"].shape == (9, 4, 4)
     assert belief["weights"].sum() == pytest.approx(1, abs=1e-4)
     assert (out / "overlay.png").is_file()
     assert (out / "belief.png").is_file()

@@ -18,7 +18,7 @@ from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
-from posefilter.run.pieces import changed, changes
+from posefilter.run.pieces import changed, changes, chosen
 from posefilter.run.results import record, show, write_json
 from posefilter.run.train import build_data, make_trainer, quiet
 from posefilter.run.voice import typed
@@ -60,7 +60,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
-    told = Job(job.cfg, {**checkpoint["recipe"]["choices"], **_chosen(job)}, job.overrides, job.folder, job.name, job.swept)
+    told = Job(job.cfg, {**checkpoint["recipe"]["choices"], **chosen(job)}, job.overrides, job.folder, job.name, job.swept)
     return record(method.results(), told, data.describe(), Path(job.cfg.checkpoint)), files
 
 
@@ -163,7 +163,3 @@ def keep_training_metrics(folder: Path) -> None:
     path, kept = folder / "metrics.json", folder / "metrics_train.json"
     if path.is_file() and not kept.is_file() and '"command"' not in path.read_text():
         shutil.copy2(path, kept)
-
-
-def _chosen(job: Job) -> dict[str, str]:
-    return {group: choice for group, choice in job.choices.items() if choice not in ("None", "null")}

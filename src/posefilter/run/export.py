@@ -1,4 +1,4 @@
-"""Strip a checkpoint to what predicts: weights, recipe and object."""
+"""Strip a checkpoint to what predicts: weights, recipe (with pieces of the filter chosen anew, if wished) and object."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from posefilter.models.compact import pack, unpack
 from posefilter.run.evaluate import OF_THE_CHECKPOINT
 from posefilter.run.job import Job
 from posefilter.run.method import method_of, read_checkpoint
+from posefilter.run.pieces import changed, changes, chosen
 from posefilter.run.voice import ended, typed
 
 _KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
@@ -23,6 +24,9 @@ def export(job: Job) -> None:
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
     stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
+    recipe = stripped["recipe"]
+    recipe["settings"] = changed(recipe["settings"], changes(job.cfg))
+    recipe["choices"] = {**recipe["choices"], **chosen(job)}
     method_of(stripped)  # raises where it could not be used
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.name}.part")

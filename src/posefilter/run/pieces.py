@@ -6,10 +6,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.errors import UserError
 from posefilter.run.build import hint
+from posefilter.run.job import Job
 
 PIECES = ("filter", "initialise", "schedule", "reweigh", "resample", "propose", "estimate", "refine", "model")
 OWN = (*PIECES, "data")
-LOOSE = ("evaluate", "predict")
+LOOSE = ("evaluate", "predict", "export")
 
 
 def loosen(arguments: list[str], name: str) -> list[str]:
@@ -23,6 +24,11 @@ def changes(cfg: DictConfig) -> dict[str, Any]:
     """Return what a test-time configuration says of the pieces."""
     said = {name: OmegaConf.to_container(cfg[name], resolve=False) for name in PIECES if cfg.get(name) is not None}
     return {name: value for name, value in said.items() if value}
+
+
+def chosen(job: Job) -> dict[str, str]:
+    """Return the choices that were made at test time, by group."""
+    return {group: choice for group, choice in job.choices.items() if choice not in ("None", "null")}
 
 
 def changed(trained: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
