@@ -28,7 +28,8 @@ def changes(cfg: DictConfig) -> dict[str, Any]:
 
 def chosen(job: Job) -> dict[str, str]:
     """Return the choices that were made at test time, by group."""
-    return {group: choice for group, choice in job.choices.items() if choice not in ("None", "null")}
+    made = {group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")}
+    return {group: choice for group, choice in made.items() if choice not in ("None", "null")}
 
 
 def changed(trained: dict[str, Any], wanted: dict[str, Any]) -> dict[str, Any]:
