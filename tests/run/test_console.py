@@ -58,6 +58,19 @@ def test_a_long_training_gives_signs_of_life(capsys: pytest.CaptureFixture[str],
     assert capsys.readouterr().out.count("\n") == 1
 
 
+def test_a_long_test_gives_signs_of_life(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("posefilter.run.console.time.perf_counter", lambda: now[0])
+    trainer: Any = SimpleNamespace(num_test_batches=[30])
+    lines, module = Lines(pause=60), SimpleNamespace()
+    lines.on_test_start(trainer, module)  # type: ignore[arg-type]
+    for batch in range(10):
+        now[0] += 30
+        lines.on_test_batch_end(trainer, module, None, None, batch)  # type: ignore[arg-type]
+    told_at = [line.split(":")[0] for line in capsys.readouterr().out.splitlines()]
+    assert told_at == [f"batch {done} of 30" for done in (2, 4, 6, 8, 10)]
+
+
 @pytest.mark.parametrize("console", ["rich", "plain"])
 def test_a_validation_is_one_line(console: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Words for people, numbers for machines; parts of the images are in the log alone."""

@@ -41,7 +41,7 @@ def is_whole(name: str) -> bool:
 
 
 class Lines(Callback):
-    """A line at each validation, and a sign of life every `pause` seconds: step, loss, speed, and what time is left."""
+    """A line at each validation; in a training or a test a sign of life every `pause` seconds: how far, what time is left."""
 
     def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
         self.console, self.pause = console, pause
@@ -61,6 +61,19 @@ class Lines(Callback):
         """Print the line."""
         if not trainer.sanity_checking:
             self._tell("validation", trainer, trainer.callback_metrics)
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock again."""
+        self._began = self._last = time.perf_counter()
+
+    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *past: Any) -> None:
+        """Print a line where nothing was said for long."""
+        now = time.perf_counter()
+        if now - self._last < self.pause:
+            return
+        self._last, done, batches = now, int(past[2]) + 1, sum(map(int, trainer.num_test_batches))
+        left = duration((now - self._began) / done * (batches - done))
+        say(self.console, "testing", f"batch {done} of {batches}: {left} left", batch=done, batches=batches)
 
     def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
         step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
