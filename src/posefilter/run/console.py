@@ -41,7 +41,7 @@ def is_whole(name: str) -> bool:
 
 
 class Lines(Callback):
-    """A line at each validation; in a training or a test a sign of life every `pause` seconds: how far, what time is left."""
+    """A line at each validation; in a training or a test a sign of life every `pause` seconds: how far, how long still."""
 
     def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
         self.console, self.pause = console, pause
