@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from posefilter.nets.linear import Linear
+
 
 def fast_bfloat16(device: torch.device) -> bool:
     """Tell whether bfloat16 is worth while on a device: where the processor only emulates it, it is several times slower."""
@@ -24,8 +26,8 @@ class ResnetFC(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.inner = nn.Linear(width, width)
-        self.outer = nn.Linear(width, width)
+        self.inner = Linear(width, width)
+        self.outer = Linear(width, width)
         nn.init.zeros_(self.outer.weight)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from posefilter.geometry.camera import project, rays
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, ask, lay_out_context
 from posefilter.nets.layers import ResnetFC, fourier
+from posefilter.nets.linear import Linear
 
 
 class Pixels(NamedTuple):
@@ -111,7 +112,7 @@ class PoseLikelihood(nn.Module):
         self.context = context
         self.octaves, self.scale, self.sigma = octaves, scale, (float(sigma[0]), float(sigma[1]))
         surroundings = 0 if context is None else 9 + context
-        self.enter = nn.Linear(3 * (2 * octaves + 1) + 7 + surroundings, width)
+        self.enter = Linear(3 * (2 * octaves + 1) + 7 + surroundings, width)
         self.modulate = nn.Sequential(nn.Linear(9, width), nn.ReLU(), nn.Linear(width, 2 * width))
         self.blocks = nn.ModuleList([ResnetFC(width) for _ in range(blocks)])
         self.leave = nn.Linear(width, 1)

@@ -24,7 +24,7 @@ class Linear(nn.Linear):
         if not takes_onednn(x, self.weight):
             return F.linear(x, self.weight, self.bias)
         out: Tensor = _OneDnnLinear.apply(x.reshape(-1, x.shape[-1]), self.weight, self.bias)
-        return out.unflatten(0, x.shape[:-1])
+        return out.view(*x.shape[:-1], out.shape[-1])
 
 
 def takes_onednn(x: Tensor, weight: Tensor) -> bool:

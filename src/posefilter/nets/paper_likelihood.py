@@ -5,6 +5,7 @@ from torch import Generator, Tensor, nn
 
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.likelihood import Pixels, look
+from posefilter.nets.linear import Linear
 
 
 class PaperLikelihood(nn.Module):
@@ -17,7 +18,7 @@ class PaperLikelihood(nn.Module):
     def __init__(self, width: int = 128, blocks: int = 5, spread: float = 0.6) -> None:
         super().__init__()
         self.spread = spread
-        self.net = nn.Sequential(nn.Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1))
+        self.net = nn.Sequential(Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1))
 
     def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
         """Judge points (*, 3) in the object frame [m], from the mesh's origin, with colours (*, 3) in [0, 1].  -> (*)."""
