@@ -1,5 +1,6 @@
 """Threads, seeds, and what to remember of the machine and the code that made a result."""
 
+import ctypes
 import platform
 import subprocess
 import sys
@@ -13,11 +14,27 @@ import torch
 _PACKAGES = ("posefilter", "torch", "lightning", "hydra-core", "torchmetrics", "numpy", "scipy", "opencv-python-headless")
 
 
+_MALLOC = {-1: 2**31 - 1, -2: 2**26, -3: 2**30}  # glibc's M_TRIM_THRESHOLD, M_TOP_PAD and M_MMAP_THRESHOLD [bytes]
+
+
 def settle(threads: int | None, seed: int) -> None:
     """Use so many threads (null: what torch finds, OMP_NUM_THREADS included, at most 8), and seed what is not explicit."""
+    keep_freed_memory()
     torch.set_num_threads(threads or min(8, torch.get_num_threads()))
     cv2.setNumThreads(1)
     lightning.seed_everything(seed, workers=True, verbose=False)
+
+
+def keep_freed_memory() -> bool:
+    """Have the C library keep what is freed for the tensors to come; tell whether it can (glibc).
+
+    By default each large tensor is mapped anew and given back, and the system fills its pages with zeros every time: more
+    than half of a filter's time on a processor.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt = ctypes.CDLL(None).mallopt
+    return all([mallopt(option, value) == 1 for option, value in _MALLOC.items()])
 
 
 def versions() -> dict[str, str]:
