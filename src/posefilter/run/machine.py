@@ -34,7 +34,8 @@ def keep_freed_memory() -> bool:
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt
-    return all([mallopt(option, value) == 1 for option, value in _MALLOC.items()])
+    taken = [mallopt(option, value) == 1 for option, value in _MALLOC.items()]
+    return all(taken)
 
 
 def versions() -> dict[str, str]:
