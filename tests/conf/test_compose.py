@@ -38,11 +38,12 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, varia
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_what_a_deviation_sets_holds(model: str, variant: str, tmp_path: Path) -> None:
+def test_what_a_deviation_and_a_size_set_holds(model: str, variant: str, tmp_path: Path) -> None:
     """No choice later in the list of defaults may undo it."""
     cfg = compose(tmp_path, f"model={model}", f"variant={variant}").cfg
-    body = OmegaConf.load(CONF / "deviation" / model / f"{variant}.yaml")
-    for group, settings in body.items():
+    files = [CONF / kind / model / f"{variant}.yaml" for kind in ("deviation", "size")]
+    bodies = [OmegaConf.load(file) for file in files if file.is_file()]
+    for group, settings in (pair for body in bodies for pair in body.items()):
         for name, value in settings.items() if OmegaConf.is_dict(settings) else []:
             if not OmegaConf.is_interpolation(settings, name):
                 assert cfg[group][name] == value, f"{group}.{name}"

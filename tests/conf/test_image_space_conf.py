@@ -109,13 +109,14 @@ def test_the_memorisation_test_shows_the_images_that_it_learned(tmp_path: Path) 
 def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path: Path) -> None:
     model = "patch_pf" if sweep == "ladder" else "cnn_patch"
     rungs = (CONF / "sweep" / f"{sweep}.yaml").read_text().split("rung: paper,")[1].strip().split(",")
-    base = {v: compose_job("train", CONF, [f"model={model}", f"rung={v}"], tmp_path).choices for v in ("paper", "working")}
+    said = [f"model={model}", f"sweep={sweep}"]
+    base = {v: compose_job("train", CONF, [*said, f"rung={v}"], tmp_path).choices for v in ("paper", "working")}
     assert base["paper"]["variant"] == "paper"
     before = base["paper"]
     ignored = ("rung", "variant", "deviation", "sweep")
     for rung in rungs:
-        job = compose_job("train", CONF, [f"model={model}", f"rung={rung}"], tmp_path)
-        choices = job.choices
+        choices = compose_job("train", CONF, [*said, f"rung={rung}"], tmp_path).choices
+        assert choices["size"] == f"{model}/working", "else a rung is more than its remedy"
         if rung.startswith("c") or rung.startswith(("box_c", "pose_c")):
             against, before = before, choices
         else:
