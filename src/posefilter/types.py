@@ -51,6 +51,15 @@ class Children(NamedTuple):
     shares: Tensor | None = None  # (B, N, M) how much of each parent a child is, rows sum to 1; None: all of its one parent
 
 
+class Fragments(NamedTuple):
+    """Which point of the object each particle's own measured point may be: a fragment of the surface, and where in it."""
+
+    log_share: Tensor  # (B, N, K) log-probability of each fragment, given that the point is the object's
+    place: Tensor  # (B, N, K, 3) the object's point if it is that fragment, over the radius, from the object's centre
+    centers: Tensor  # (B, K, 3) the fragments' middles, likewise
+    reach: Tensor  # () the fragments' mean reach, over the radius
+
+
 class Reading(NamedTuple):
     """What a method makes of each particle at one step."""
 
@@ -58,6 +67,7 @@ class Reading(NamedTuple):
     motion: Tensor  # (B, N, D) learned displacement in the space's tangent; zeros where the filter only diffuses
     pose: Tensor  # (B, N, 4, 4) camera_from_object that the particle stands for
     memory: Tensor  # (B, N, L)
+    fragments: Fragments | None = None  # of the particles' own points; None where a method tells no more than `pose`
 
 
 class Step(NamedTuple):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from posefilter.geometry.camera import intrinsics
-from posefilter.types import Batch, Belief, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, Belief, Cloud, Fragments, ObjectModel, Reading, Step, Trace
 
 
 def eye_pose(*shape: int, z: float = 1.0) -> torch.Tensor:
@@ -42,6 +42,7 @@ def make_trace() -> Callable[..., Trace]:
         motion: torch.Tensor | None = None,
         pose: torch.Tensor | None = None,
         memory: torch.Tensor | None = None,
+        fragments: Fragments | None = None,
     ) -> Trace:
         T, N = state.shape[:2]
         empty = torch.zeros(1, N, 0, dtype=torch.float64)
@@ -56,6 +57,7 @@ def make_trace() -> Callable[..., Trace]:
                     torch.zeros(1, N, 2, dtype=torch.float64) if motion is None else motion[t : t + 1],
                     eye_pose(1, N) if pose is None else pose[t : t + 1],
                     empty if memory is None else memory[t : t + 1],
+                    fragments,
                 )
             )
         belief = Belief(readings[-1].pose, weights, readings[-1].pose[:, 0], weights[:, 0])

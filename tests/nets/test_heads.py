@@ -4,7 +4,22 @@ import torch
 
 from posefilter.geometry.pose import invert, is_rigid, transform
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
-from posefilter.nets.heads import AbsoluteQuaternion, Bounded, Held, NoPose, OwnPointSixD, Unbounded, fill_depth
+from posefilter.nets.heads import (
+    AbsoluteQuaternion,
+    Bounded,
+    Held,
+    NoPose,
+    OwnPointFragments,
+    OwnPointSixD,
+    Unbounded,
+    fill_depth,
+)
+from posefilter.types import ObjectModel
+
+
+def thing(center: torch.Tensor, radius: float) -> ObjectModel:
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(3)) * radius + center
+    return ObjectModel("thing", points, center, radius, 2 * radius, torch.eye(4)[None], points)
 
 
 def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
@@ -35,21 +50,42 @@ def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> No
     center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
     raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
     code = OwnPointSixD()
-    code.about(center, radius)
-    pose = code(raw, point)
+    code.about(thing(center, radius))
+    pose = code(raw, point).pose
     assert is_rigid(pose)
     back = transform(invert(pose), point[:, :, None])[:, :, 0]
     torch.testing.assert_close(back, center + radius * raw[..., 6:], atol=1e-5, rtol=0)
-    moved = code(raw, point + torch.tensor([0.0, 0.0, 0.3]))  # the same outputs, farther away
+    moved = code(raw, point + torch.tensor([0.0, 0.0, 0.3])).pose  # the same outputs, farther away
     torch.testing.assert_close(moved[..., :3, 3] - pose[..., :3, 3], torch.tensor([0.0, 0.0, 0.3]).expand(2, 6, 3))
+
+
+def test_a_pose_of_fragments_is_that_of_the_likeliest() -> None:
+    g = torch.Generator().manual_seed(2)
+    center, radius, K = torch.tensor([0.01, 0.02, -0.03]), 0.1, 8
+    code = OwnPointFragments(K)
+    code.about(thing(center, radius))
+    raw, point = torch.randn(2, 6, code.width, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
+    pose, said = code(raw, point)
+    assert said is not None
+    assert is_rigid(pose)
+    torch.testing.assert_close(said.log_share.logsumexp(-1), torch.zeros(2, 6), atol=1e-5, rtol=0)
+    back = (transform(invert(pose), point[:, :, None])[:, :, 0] - center) / radius
+    chosen = raw[..., 6 : 6 + K].argmax(-1)
+    for i, j in ((0, 0), (1, 3)):
+        k = int(chosen[i, j])
+        want = code.centers[k] + code.reach * raw[i, j, 6 + K + 3 * k : 6 + K + 3 * k + 3]
+        torch.testing.assert_close(back[i, j], want, atol=1e-5, rtol=0)
+    cut = code.centers.clone()
+    code.about(thing(center + 0.01, 2 * radius))
+    assert torch.equal(code.centers, cut), "fragments are cut once: what was learned is about these"
 
 
 def test_absolute_pose_is_its_seven_outputs() -> None:
     raw = torch.tensor([[[0.0, 0.0, 2.0, 0.0, 0.1, 0.2, 0.9]]])
-    pose = AbsoluteQuaternion()(raw, torch.rand(1, 1, 3))
+    pose = AbsoluteQuaternion()(raw, torch.rand(1, 1, 3)).pose
     torch.testing.assert_close(pose[0, 0, :3, 3], torch.tensor([0.1, 0.2, 0.9]))
     torch.testing.assert_close(pose[0, 0, :3, :3], matrix_from_quat_xyzw(torch.tensor([0.0, 0.0, 1.0, 0.0])))
-    assert NoPose()(raw[..., :0], torch.rand(1, 1, 3)).shape == (1, 1, 4, 4)
+    assert NoPose()(raw[..., :0], torch.rand(1, 1, 3)).pose.shape == (1, 1, 4, 4)
 
 
 def test_depth_is_filled_from_near_by_then_from_the_median() -> None:

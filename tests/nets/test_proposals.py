@@ -5,10 +5,12 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.camera import intrinsics, pixel_grid, rays
+from posefilter.geometry.fragments import nearest_fragment, spread_points
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import angle_between, exp_so3
-from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, coordinate_loss, nearest_fragment, spread_points
-from posefilter.nets.proposals import ObjectCoordinateNet, masked_mean_pool, normals_from_depth
+from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, coordinate_loss
+from posefilter.nets.encoding import masked_mean_pool, normals_from_depth
+from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.nets.votes import draw_poses, measure_cells
 
 H, W = 64, 96

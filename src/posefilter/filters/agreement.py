@@ -1,17 +1,20 @@
 """The pose that most particles' own surface points agree on."""
 
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from torch import Generator, Tensor
 
 from posefilter.contracts import Method, Scene
 from posefilter.geometry.pose import fit_rigid, invert, transform
-from posefilter.types import Belief, Cloud, Reading
+from posefilter.geometry.votes import draw_votes
+from posefilter.types import Belief, Cloud, ObjectModel, Reading
 
 
 class SeesPoints(Protocol):
     """A method whose particles each stand on one measured point."""
+
+    model: ObjectModel
 
     def own_points(self, scene: Scene, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool."""
@@ -21,35 +24,56 @@ class SeesPoints(Protocol):
 class Agreement:
     """Bet on the pose that the particles' own points agree on, weighted by their likelihoods.
 
-    A particle's pose says which object point its own measured point is: one correspondence a particle. Each of the likeliest
-    `hypotheses` particles' poses is scored by how many correspondences it explains, and the best is refitted to all of them
-    (Kabsch, reweighted by how well each fits, with a falling scale). scale_m: how far a correspondence may lie off [m].
+    A particle says which object point its own measured point is: by its pose, or by its likeliest `options` fragments where
+    it tells fragments. Hypotheses are the likeliest particles' own poses, and as many votes: a few particles' points at a
+    time. Each is scored by how many particles it explains, and the best is refitted to all of them (Kabsch, reweighted by
+    how well each fits, with a falling scale). The belief is the votes, weighted by what they explain.
+
+    scale_m: how far a particle's point may lie off [m]; hypotheses: of each kind; rounds: of the refit.
     """
 
-    def __init__(self, scale_m: float = 0.015, hypotheses: int = 64, rounds: int = 8) -> None:
+    def __init__(self, scale_m: float = 0.015, hypotheses: int = 64, rounds: int = 8, options: int = 3) -> None:
         self.scale_m = scale_m
         self.hypotheses = hypotheses
         self.rounds = rounds
+        self.options = options
 
     def __call__(self, cloud: Cloud, reading: Reading, scene: Scene, method: Method, generator: Generator) -> Belief:
         """Return the belief whose `best` is the agreed pose, its score the share that agrees x the best likelihood."""
-        point, known = method.own_points(scene, cloud.state)  # type: ignore[attr-defined]
-        thing = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
-        weight = reading.log_likelihood.exp() * known + 1e-9
+        sees = cast(SeesPoints, method)
+        center, radius = sees.model.center.to(cloud.state), sees.model.radius
+        point, known = sees.own_points(scene, cloud.state)
+        share, place = self._options(reading, point, center, radius)
+        weight = reading.log_likelihood.detach().exp() * known + 1e-9
+        votes = draw_votes(point, weight, share, place, center, radius, self.hypotheses, generator)
         start = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
-        guess = reading.pose.gather(1, start[..., None, None].expand(-1, -1, 4, 4))
-        explained = weight[:, None] * self._fit(guess, thing[:, None], point[:, None], 2 * self.scale_m)
-        best = guess.gather(1, explained.sum(-1).argmax(1)[:, None, None, None].expand(-1, -1, 4, 4))[:, 0]
+        likeliest = reading.pose.detach().gather(1, start[..., None, None].expand(-1, -1, 4, 4))
+        guess = torch.cat([votes, likeliest], dim=1)
+        thing = center + radius * place
+        fits = (share[:, None] * self._fit(guess, thing[:, None], point[:, None], 2 * self.scale_m)).sum(-1)
+        explained = (weight[:, None] * fits).sum(-1)
+        best = guess.gather(1, explained.argmax(1)[:, None, None, None].expand(-1, -1, 4, 4))[:, 0]
         for i in range(self.rounds):
             scale = self.scale_m * 2 ** (2 - 2 * i / max(self.rounds - 1, 1))
-            best = fit_rigid(thing, point, weight * self._fit(best, thing, point, scale))
-        near = self._fit(best, thing, point, self.scale_m) > 0.04  # within two scales
+            fit, option = (share * self._fit(best, thing, point, scale)).max(-1)
+            chosen = thing.gather(2, option[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+            best = fit_rigid(chosen, point, weight * fit)
+        near = (self._fit(best, thing, point, self.scale_m) > 0.04).any(-1)  # within two scales
         agreed = (weight * near).sum(1) / weight.sum(1)
-        log_weights = torch.log_softmax(reading.log_likelihood, dim=1)
-        return Belief(reading.pose, log_weights, best, agreed * reading.log_likelihood.exp().max(1).values)
+        log_weights = torch.log_softmax(explained[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1)
+        return Belief(votes, log_weights, best, agreed * reading.log_likelihood.exp().max(1).values)
+
+    def _options(self, reading: Reading, point: Tensor, center: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+        """Return what each particle's own point may be.  -> shares (B, N, k), places over the radius (B, N, k, 3)."""
+        said = reading.fragments
+        if said is None:
+            thing = transform(invert(reading.pose.detach()), point[:, :, None])
+            return torch.ones_like(thing[..., 0]), (thing - center) / radius
+        log_share, fragment = said.log_share.detach().topk(min(self.options, said.log_share.shape[-1]), dim=-1)
+        return log_share.exp(), said.place.detach().gather(2, fragment[..., None].expand(-1, -1, -1, 3))
 
     @staticmethod
     def _fit(pose: Tensor, thing: Tensor, point: Tensor, scale: float) -> Tensor:
-        """How well poses explain correspondences, in (0, 1].  (*, 4, 4), (*, N, 3), (*, N, 3) [m] -> (*, N)."""
-        square = (transform(pose, thing) - point).square().sum(-1)
-        return 1 / (1 + square / scale**2).square()
+        """How well poses explain what particles say, in (0, 1].  (*, 4, 4), (*, N, k, 3), (*, N, 3) [m] -> (*, N, k)."""
+        there = transform(pose, thing.flatten(-3, -2)).unflatten(-2, thing.shape[-3:-1])
+        return 1 / (1 + (there - point[..., None, :]).square().sum(-1) / scale**2).square()

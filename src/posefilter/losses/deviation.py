@@ -5,11 +5,13 @@ from torch import Tensor
 
 from posefilter.contracts import Label
 from posefilter.errors import UserError
+from posefilter.geometry.camera import back_project
 from posefilter.geometry.deviation import deviation, nearest_deviation, thin
+from posefilter.geometry.fragments import nearest_fragment, pick_fragment
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.pose import invert, transform
 from posefilter.losses.likelihood import log_not
-from posefilter.types import Batch, ObjectModel, Reading, Trace
+from posefilter.types import Batch, Cloud, ObjectModel, Reading, Trace
 
 
 class Add:
@@ -80,17 +82,53 @@ class OwnPoint:
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
         total = batch.rgb.new_zeros(len(batch.rgb))
-        seen = torch.cat([batch.depth, batch.mask.to(batch.depth)], dim=1)
-        focal = batch.intrinsics[:, None, [0, 1], [0, 1]]
-        center = batch.intrinsics[:, None, :2, 2]
         for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
-            place = nearest_pixel(cloud.state)
-            z, on = pick(seen, place).unbind(-1)
-            ray = torch.cat([(cloud.state.detach() - center) / focal, torch.ones_like(z[..., None])], dim=-1)
-            point = (ray * z[..., None])[:, :, None]
-            guess = transform(invert(reading.pose), point)[:, :, 0]
-            true = transform(invert(batch.camera_from_object), point[:, :, 0])
-            counts = (on > 0) & (z > 0) & ((true - model.center.to(true)).norm(dim=-1) < 1.2 * model.radius)
+            point, true, counts = own_points(cloud, batch, model)
+            guess = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
             off = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
-            total = total + (off * counts).sum(1) / counts.sum(1).clamp_min(1)
+            total = total + _mean(off, counts)
         return total / len(trace.readings)
+
+
+class OwnFragment:
+    """Which fragment of the surface a particle's own measured point lies in, and where in it (EPOS, Hodan et al. 2020).
+
+    Cross-entropy of the fragments, and `within` x the L1 error of the place in the true one, in units of the fragments'
+    reach. Counts the same particles as OwnPoint. For pose codes that tell fragments.
+    """
+
+    def __init__(self, within: float = 0.3) -> None:
+        self.within = within
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return (B,)."""
+        total = batch.rgb.new_zeros(len(batch.rgb))
+        for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
+            said = reading.fragments
+            if said is None:
+                raise UserError("pose_lesson=fragments: this pose code tells no fragments; choose pose_code=fragments")
+            _, true, counts = own_points(cloud, batch, model)
+            true = (true - model.center.to(true)) / model.radius
+            fragment = nearest_fragment(true, said.centers)
+            surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
+            error = (pick_fragment(said.place, fragment) - true).abs().sum(-1) / said.reach
+            total = total + _mean(surprise + self.within * error, counts)
+        return total / len(trace.readings)
+
+
+def own_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the point that each particle measures, and which point of the object it is.
+
+    -> (B, N, 3) in the camera [m]; (B, N, 3) in the object's frame [m]; (B, N) bool: the particle's pixel is on the
+    mask, and its depth can be of the object.
+    """
+    seen = torch.cat([batch.depth, batch.mask.to(batch.depth)], dim=1)
+    z, on = pick(seen, nearest_pixel(cloud.state)).unbind(-1)
+    point = back_project(cloud.state.detach(), z, batch.intrinsics)
+    true = transform(invert(batch.camera_from_object), point)
+    return point, true, (on > 0) & (z > 0) & ((true - model.center.to(true)).norm(dim=-1) < 1.2 * model.radius)
+
+
+def _mean(values: Tensor, counts: Tensor) -> Tensor:
+    """Average what counts.  (B, N), (B, N) bool -> (B,), 0 where nothing does."""
+    return (values * counts).sum(1) / counts.sum(1).clamp_min(1)

@@ -109,8 +109,8 @@ class ImageSpace(PoseEstimator):
         said = self.net(patch, extra, memory)
         height, width = scene.image.shape[-2:]
         motion = self.motion(said.motion, said.logit, state, width, height)
-        pose = self.pose_code(said.pose, self.own_points(scene, state)[0])
-        return Reading(F.logsigmoid(said.logit), motion, pose, said.memory)
+        pose, fragments = self.pose_code(said.pose, self.own_points(scene, state)[0])
+        return Reading(F.logsigmoid(said.logit), motion, pose, said.memory, fragments)
 
     def own_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool.
@@ -152,7 +152,7 @@ class ImageSpace(PoseEstimator):
     def adopt(self, model: ObjectModel) -> None:
         """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
         super().adopt(model)
-        self.pose_code.about(model.center, model.radius)
+        self.pose_code.about(model)
         self.scores["signs"] = SignsOfFailure()
 
     def score(self, trace: Trace, batch: Batch) -> None:
@@ -175,7 +175,7 @@ class _Observed:
     def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
         self.method, self.scene = method, scene
         self.space, self.memory_width, self.read = method.space, method.memory_width, method.read
-        self.own_points = method.own_points
+        self.own_points, self.model = method.own_points, method.model
 
     def observe(self, batch: Batch) -> ImageScene:
         """Return what was seen."""

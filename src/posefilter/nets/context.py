@@ -9,10 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from posefilter.geometry.camera import pixel_grid, rays
 from posefilter.geometry.lookup import sample, window
-from posefilter.nets.layers import ResBlock, conv_norm
-from posefilter.nets.proposals import masked_mean_pool, normals_from_depth
+from posefilter.nets.encoding import geometry, grow, masked_mean_pool
+from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
 
 
 class ContextMap(NamedTuple):
@@ -94,25 +93,11 @@ class _Encoder(nn.Module):
         return sample(seen.levels[0], pixels, self.stride, padding="border")
 
 
-def geometry(depth: Tensor, K: Tensor) -> Tensor:
-    """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H, W) -> (B, 7, ...)."""
-    B, _, H, W = depth.shape
-    z, share = masked_mean_pool(depth, 2)
-    grid = pixel_grid(H, W, 2, device=depth.device).reshape(1, -1, 2).expand(B, -1, -1)
-    view = rays(grid, K)[..., :2].transpose(1, 2).unflatten(2, z.shape[-2:])
-    near = (z - 1.0).clamp(-1.0, 1.5) * (share > 0)
-    return torch.cat([normals_from_depth(depth, K), near, share, view], dim=1)
-
-
-def _grow(x: Tensor, like: Tensor) -> Tensor:
-    return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
-
-
 class ConvEncoder(_Encoder):
     """A small U-Net from nothing: strides 4 to 32 and back to 4, about half a million parameters.
 
     widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets. Runs in bfloat16 where
-    autocast does (float32 in, float32 out), which halves its time on CPUs that have it.
+    the machine has it (float32 in, float32 out), which halves its time on processors.
     """
 
     def __init__(self, widths: tuple[int, int, int, int] = (32, 48, 64, 96), width: int = 64) -> None:
@@ -131,15 +116,16 @@ class ConvEncoder(_Encoder):
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map of stride 4."""
         shape = geometry(depth, K)
-        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32):
+        fast = rgb.dtype == torch.float32 and fast_bfloat16(rgb.device)
+        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=fast):
             x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
             x4 = self.down4(self.enter(torch.cat([x, shape[..., : x.shape[-2], : x.shape[-1]]], dim=1)))
             x8 = self.down8(x4)
             x16 = self.down16(x8)
             x32 = self.down32(x16)
-            y16 = self.up16(x16 + _grow(self.to16(x32), x16))
-            y8 = self.up8(x8 + _grow(self.to8(y16), x8))
-            y4 = self.up4(self.skip4(x4) + _grow(self.to4(y8), x4))
+            y16 = self.up16(x16 + grow(self.to16(x32), x16))
+            y8 = self.up8(x8 + grow(self.to8(y16), x8))
+            y4 = self.up4(self.skip4(x4) + grow(self.to4(y8), x4))
         return self._map(y4)
 
 
@@ -161,5 +147,5 @@ class ResNetContext(_Encoder):
         maps = self.trunk(rgb, geometry(depth, K))
         top = self.lateral[-1](maps[-1])
         for lateral, low in zip(reversed(self.lateral[:-1]), reversed(maps[:-1]), strict=True):
-            top = lateral(low) + _grow(top, low)
+            top = lateral(low) + grow(top, low)
         return self._map(self.smooth(top))

@@ -1,13 +1,15 @@
 """What a network's plain outputs mean: a displacement over the image, and a pose."""
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.geometry.fragments import pick_fragment, spread_points
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
+from posefilter.types import Fragments, ObjectModel
 
 
 class Motion(Protocol):
@@ -18,17 +20,24 @@ class Motion(Protocol):
         ...
 
 
+class ToldPose(NamedTuple):
+    """A pose a particle, and where it comes from."""
+
+    pose: Tensor  # (B, N, 4, 4) camera_from_object
+    fragments: Fragments | None = None  # that the particle's own point may lie in; None where the code tells one point
+
+
 class PoseCode(Protocol):
     """Turns plain outputs into a pose."""
 
     width: int  # outputs that make a pose
 
-    def about(self, center: Tensor, radius: float) -> None:
-        """Learn the object's bounding sphere: (3,) [m] in its own frame, [m]."""
+    def about(self, model: ObjectModel) -> None:
+        """Learn what is to be known of the object."""
         ...
 
-    def __call__(self, raw: Tensor, point: Tensor) -> Tensor:
-        """(B, N, width), the particles' own camera points (B, N, 3) [m] -> (B, N, 4, 4) camera_from_object."""
+    def __call__(self, raw: Tensor, point: Tensor) -> ToldPose:
+        """(B, N, width), the particles' own camera points (B, N, 3) [m] -> ToldPose."""
         ...
 
 
@@ -73,7 +82,7 @@ class Held(nn.Module):
 class _AnyObject(nn.Module):
     """A code that does not depend on the object."""
 
-    def about(self, center: Tensor, radius: float) -> None:
+    def about(self, model: ObjectModel) -> None:
         """Need nothing of the object."""
 
 
@@ -82,19 +91,14 @@ class AbsoluteQuaternion(_AnyObject):
 
     width = 7
 
-    def forward(self, raw: Tensor, point: Tensor) -> Tensor:
-        """(B, N, 7), (B, N, 3) -> (B, N, 4, 4)."""
-        return make_pose(matrix_from_quat_xyzw(raw[..., :4]), raw[..., 4:])
+    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
+        """(B, N, 7), (B, N, 3) -> ToldPose."""
+        return ToldPose(make_pose(matrix_from_quat_xyzw(raw[..., :4]), raw[..., 4:]))
 
 
-class OwnPointSixD(nn.Module):
-    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and which object point the particle's own 3-D point is.
+class _OwnPoint(nn.Module):
+    """A code that tells a rotation by two of its columns, and which object point the particle's own 3-D point is."""
 
-    The translation follows: t = p - R x, p being the measured point in the camera and x the told one in the object. So what
-    is regressed is bounded by the object's size, and independent of where in the room it stands.
-    """
-
-    width = 9
     center: Tensor
 
     def __init__(self) -> None:
@@ -102,18 +106,65 @@ class OwnPointSixD(nn.Module):
         self.register_buffer("center", torch.zeros(3), persistent=False)
         self.radius = 1.0
 
-    def about(self, center: Tensor, radius: float) -> None:
-        """Take the object's centre and radius as origin and unit of x."""
-        self.center, self.radius = center.to(self.center), radius
+    def about(self, model: ObjectModel) -> None:
+        """Take the object's centre and radius as origin and unit of the object point."""
+        self.center, self.radius = model.center.to(self.center), model.radius
 
-    def forward(self, raw: Tensor, point: Tensor) -> Tensor:
-        """(B, N, 9), (B, N, 3) [m] -> (B, N, 4, 4)."""
-        start = raw.new_tensor(
-            [1.0, 0.0, 0.0, 0.0, 1.0, 0.0]
-        )  # so that outputs about zero are a rotation, not a singularity
-        R = matrix_from_6d(raw[..., :6] + start)
-        x = self.center + self.radius * raw[..., 6:]
+    def _pose(self, columns: Tensor, thing: Tensor, point: Tensor) -> Tensor:
+        """(B, N, 6), object points (B, N, 3) over the radius, measured ones (B, N, 3) [m] -> (B, N, 4, 4)."""
+        start = columns.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])  # so that zeros are a rotation, not a singularity
+        R = matrix_from_6d(columns + start)
+        x = self.center + self.radius * thing
         return make_pose(R, point - (R @ x[..., None])[..., 0])
+
+
+class OwnPointSixD(_OwnPoint):
+    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and which object point the particle's own 3-D point is.
+
+    The translation follows: t = p - R x, p being the measured point in the camera and x the told one in the object. So what
+    is regressed is bounded by the object's size, and independent of where in the room it stands.
+    """
+
+    width = 9
+
+    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
+        """(B, N, 9), (B, N, 3) [m] -> ToldPose."""
+        return ToldPose(self._pose(raw[..., :6], raw[..., 6:], point))
+
+
+class OwnPointFragments(_OwnPoint):
+    """The same, but the object point is told as a fragment of the surface and a place in it (EPOS, Hodan 2020).
+
+    6 + 4 K outputs. One told point answers doubt by the mean of what is possible, which lies inside the object and is
+    nobody's point; shares of fragments can hold several possibilities. The pose is that of the likeliest.
+    """
+
+    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's centre
+    reach: Tensor  # () their mean reach, over the radius
+
+    def __init__(self, fragments: int = 64) -> None:
+        super().__init__()
+        self.width = 6 + 4 * fragments
+        self.fragments = fragments
+        self.register_buffer("centers", torch.zeros(fragments, 3))
+        self.register_buffer("reach", torch.ones(()))
+
+    def about(self, model: ObjectModel) -> None:
+        """Cut the object into fragments, once: what was learned is about these, whatever points it is judged by later."""
+        super().about(model)
+        if bool(self.centers.any()):
+            return
+        middles, reach = spread_points((model.points - model.center) / model.radius, self.fragments)
+        self.centers.copy_(middles)
+        self.reach.fill_(reach)
+
+    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
+        """(B, N, 6 + 4 K), (B, N, 3) [m] -> ToldPose."""
+        columns, share, offset = raw.split([6, self.fragments, 3 * self.fragments], dim=-1)
+        place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
+        likeliest = pick_fragment(place, share.argmax(-1))
+        said = Fragments(torch.log_softmax(share, dim=-1), place, self.centers.expand(len(raw), -1, -1), self.reach)
+        return ToldPose(self._pose(columns, likeliest, point), said)
 
 
 class NoPose(_AnyObject):
@@ -121,9 +172,9 @@ class NoPose(_AnyObject):
 
     width = 0
 
-    def forward(self, raw: Tensor, point: Tensor) -> Tensor:
-        """(B, N, 0), (B, N, 3) [m] -> (B, N, 4, 4)."""
-        return make_pose(torch.eye(3, dtype=point.dtype, device=point.device), point)
+    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
+        """(B, N, 0), (B, N, 3) [m] -> ToldPose."""
+        return ToldPose(make_pose(torch.eye(3, dtype=point.dtype, device=point.device), point))
 
 
 def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
