@@ -123,4 +123,4 @@ def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path
             against = base["working" if "m" in rung.split("_")[0][:1] or "_m" in rung else "paper"]
         changed = {k for k in choices if choices[k] != against.get(k) and k not in ignored and not k.startswith("hydra")}
         assert rung == "working" or changed, rung
-        assert len(changed) == 1 or rung.endswith("own_point") or rung == "working", (rung, changed)
+        assert len(changed) == 1 or rung.endswith(("own_point", "noise")) or rung == "working", (rung, changed)

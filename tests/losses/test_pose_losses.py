@@ -5,11 +5,10 @@ import math
 import pytest
 import torch
 
-from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.labels.membership import OnObject
-from posefilter.losses.deviation import Add, AddS, Confidence, OwnFragment, OwnPoint
+from posefilter.losses.deviation import Add, AddS, Confidence, OwnPoint
 from posefilter.types import Fragments
 
 ON, OFF = [6.0, 3.0], [15.0, 8.0]
@@ -74,7 +73,7 @@ def test_own_point_measures_where_the_particles_surface_point_lands(batch, model
     assert OwnPoint()(trace, blind, model).item() == 0
 
 
-def test_own_fragment_asks_for_the_true_fragment_and_the_place_in_it(batch, model, make_trace) -> None:
+def test_own_points_told_as_fragments_are_judged_by_the_true_fragment_and_the_place_in_it(batch, model, make_trace) -> None:
     here = torch.tensor([-0.005, -0.005, 0.0], dtype=torch.float64) / 0.15  # pixel (6, 3), over the radius
     centers = torch.stack([here + 0.1, here + 2.0])[None]  # the first is the true one
     share = torch.tensor([[[0.2, 0.8], [0.9, 0.1]]], dtype=torch.float64)
@@ -82,9 +81,7 @@ def test_own_fragment_asks_for_the_true_fragment_and_the_place_in_it(batch, mode
     said = Fragments(share.log(), place, centers, torch.tensor(0.1))
     trace = make_trace(places(ON, OFF), fragments=said)
     want = -math.log(0.2) + 0.3 * 0.4  # |0.03| + |-0.01| radii are 0.4 reaches
-    assert OwnFragment(within=0.3)(trace, batch, model).item() == pytest.approx(want, abs=1e-6)
-    with pytest.raises(UserError, match="pose_code=fragments"):
-        OwnFragment()(make_trace(places(ON)), batch, model)
+    assert OwnPoint(fragments=0.5, within=0.3)(trace, batch, model).item() == pytest.approx(0.5 * want, abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,8 @@ def nearest_fragment(points: Tensor, centers: Tensor) -> Tensor:
 def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
     """Choose `count` points far from each other (farthest point sampling).  (P, 3) -> (count, 3), their mean reach.
 
-    The reach is the mean distance of all points to the nearest chosen one, in the points' unit. A set with fewer points
-    gives some of them more than once.
+    The reach is the mean distance of all points to the nearest chosen one, in the points' unit, and never 0. A set with
+    fewer points gives some of them more than once.
     """
     distance = (points - points.mean(0)).norm(dim=-1)
     chosen, nearest = [], torch.full_like(distance, torch.inf)
@@ -29,4 +29,4 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
         chosen.append(index)
         nearest = torch.minimum(nearest, (points - points[index]).norm(dim=-1))
         distance = nearest
-    return points[chosen], float(nearest.mean())
+    return points[chosen], max(float(nearest.mean()), 1e-3)

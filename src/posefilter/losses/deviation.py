@@ -11,7 +11,7 @@ from posefilter.geometry.fragments import nearest_fragment, pick_fragment
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.pose import invert, transform
 from posefilter.losses.likelihood import log_not
-from posefilter.types import Batch, Cloud, ObjectModel, Reading, Trace
+from posefilter.types import Batch, Cloud, Fragments, ObjectModel, Reading, Trace
 
 
 class Add:
@@ -73,47 +73,36 @@ class Confidence:
 
 
 class OwnPoint:
-    """Where a particle's pose puts its own measured 3-D point on the object, against where it belongs; over the radius.
+    """Where a particle's own measured 3-D point lies on the object, against where it belongs.
 
     A particle on the object sees one point of the surface: its object coordinates are what it can know best, and many
-    particles' coordinates fix a pose. Counts particles whose pixel is on the mask and has depth.
+    particles' coordinates fix a pose. Told outright, by a pose, they are judged by their distance, over the radius; told as
+    fragments (EPOS, Hodan et al. 2020), by `fragments` x (the cross-entropy of the fragments, and `within` x the L1 error of
+    the place in the true one, in units of the fragments' reach). Counts particles whose pixel is on the mask and has depth.
     """
+
+    def __init__(self, fragments: float = 0.25, within: float = 0.3) -> None:
+        self.fragments, self.within = fragments, within
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
         total = batch.rgb.new_zeros(len(batch.rgb))
         for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
             point, true, counts = own_points(cloud, batch, model)
-            guess = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
-            off = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
-            total = total + _mean(off, counts)
+            if reading.fragments is None:
+                guess = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
+                off = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
+            else:
+                off = self._of_fragments(reading.fragments, (true - model.center.to(true)) / model.radius)
+            total = total + (off * counts).sum(1) / counts.sum(1).clamp_min(1)
         return total / len(trace.readings)
 
-
-class OwnFragment:
-    """Which fragment of the surface a particle's own measured point lies in, and where in it (EPOS, Hodan et al. 2020).
-
-    Cross-entropy of the fragments, and `within` x the L1 error of the place in the true one, in units of the fragments'
-    reach. Counts the same particles as OwnPoint. For pose codes that tell fragments.
-    """
-
-    def __init__(self, within: float = 0.3) -> None:
-        self.within = within
-
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return (B,)."""
-        total = batch.rgb.new_zeros(len(batch.rgb))
-        for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
-            said = reading.fragments
-            if said is None:
-                raise UserError("pose_lesson=fragments: this pose code tells no fragments; choose pose_code=fragments")
-            _, true, counts = own_points(cloud, batch, model)
-            true = (true - model.center.to(true)) / model.radius
-            fragment = nearest_fragment(true, said.centers)
-            surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
-            error = (pick_fragment(said.place, fragment) - true).abs().sum(-1) / said.reach
-            total = total + _mean(surprise + self.within * error, counts)
-        return total / len(trace.readings)
+    def _of_fragments(self, said: Fragments, true: Tensor) -> Tensor:
+        """Judge what is said by the true points over the radius, from the centre.  (B, N, 3) -> (B, N)."""
+        fragment = nearest_fragment(true, said.centers)
+        surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
+        error = (pick_fragment(said.place, fragment) - true).abs().sum(-1) / said.reach
+        return self.fragments * (surprise + self.within * error)
 
 
 def own_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
@@ -127,8 +116,3 @@ def own_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor, 
     point = back_project(cloud.state.detach(), z, batch.intrinsics)
     true = transform(invert(batch.camera_from_object), point)
     return point, true, (on > 0) & (z > 0) & ((true - model.center.to(true)).norm(dim=-1) < 1.2 * model.radius)
-
-
-def _mean(values: Tensor, counts: Tensor) -> Tensor:
-    """Average what counts.  (B, N), (B, N) bool -> (B,), 0 where nothing does."""
-    return (values * counts).sum(1) / counts.sum(1).clamp_min(1)
