@@ -47,7 +47,7 @@ def plan() -> list[Line]:
     for table, swept in AT_TEST_TIME.items():
         lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
-    lines += [Line("held_out", f"{FOUR} seed=0")]
+    lines += [Line("held_out", f"{FOUR},pose_pf seed=0")]  # pose_pf beside them
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
     lines += [
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),

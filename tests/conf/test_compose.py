@@ -38,10 +38,10 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, varia
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_what_a_deviation_and_a_size_set_holds(model: str, variant: str, tmp_path: Path) -> None:
+def test_what_a_deviation_and_a_budget_set_holds(model: str, variant: str, tmp_path: Path) -> None:
     """No choice later in the list of defaults may undo it."""
     cfg = compose(tmp_path, f"model={model}", f"variant={variant}").cfg
-    files = [CONF / kind / model / f"{variant}.yaml" for kind in ("deviation", "size")]
+    files = [CONF / kind / model / f"{variant}.yaml" for kind in ("deviation", "budget")]
     bodies = [OmegaConf.load(file) for file in files if file.is_file()]
     for group, settings in (pair for body in bodies for pair in body.items()):
         for name, value in settings.items() if OmegaConf.is_dict(settings) else []:
@@ -168,3 +168,14 @@ class TestBuilding:
         assert made["a"][0](torch.zeros(1, 2)).shape == (1, 3)
         later = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5}, "optimizer")
         assert later([torch.nn.Parameter(torch.zeros(1))]).param_groups[0]["lr"] == 0.5
+
+
+@pytest.mark.parametrize("entry", sorted(path.stem for path in CONF.glob("*.yaml")))
+def test_no_setting_is_called_as_a_group_that_its_command_does_not_compose(entry: str) -> None:
+    """Hydra would take `size=[320,240]` for the choice of a group `size`, and say that there is no such setting."""
+    page = OmegaConf.load(CONF / f"{entry}.yaml")
+    composed = {
+        str(key).split()[-1].lstrip("/") for item in page.get("defaults", []) if OmegaConf.is_dict(item) for key in item
+    }
+    groups = {path.name for path in CONF.iterdir() if path.is_dir()}
+    assert not (set(page) & groups) - composed

@@ -116,7 +116,7 @@ def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path
     ignored = ("rung", "variant", "deviation", "sweep")
     for rung in rungs:
         choices = compose_job("train", CONF, [*said, f"rung={rung}"], tmp_path).choices
-        assert choices["size"] == f"{model}/working", "else a rung is more than its remedy"
+        assert choices["budget"] == f"{model}/working", "else a rung is more than its remedy"
         if rung.startswith("c") or rung.startswith(("box_c", "pose_c")):
             against, before = before, choices
         else:

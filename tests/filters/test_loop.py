@@ -17,6 +17,7 @@ from posefilter.filters.reweigh import Annealed, Sequential, TemperedSMC
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.filters.transport import Ensemble, OptimalTransport
 from posefilter.geometry.spaces import PixelSpace
+from posefilter.metrics.signs import distinct
 from posefilter.types import Cloud, Reading, Step
 
 EYE = torch.eye(4)
@@ -211,3 +212,14 @@ def test_annealed_weights_are_the_last_scores_alone() -> None:
     )
     torch.testing.assert_close(trace.clouds[-1].log_weights, trace.readings[-1].log_likelihood.log_softmax(1))
     torch.testing.assert_close(trace.belief.score, trace.readings[-1].log_likelihood.amax(1))
+
+
+def test_copies_of_a_particle_stay_together_until_noise_parts_them() -> None:
+    """A deterministic motion sends all copies of a particle to one place: what resampling doubles is one opinion."""
+    ends = {}
+    for name, pieces in (("alone", [LearnedMotion()]), ("with noise", [LearnedMotion(), Gaussian(1.0)])):
+        run = build(propose=Chain(pieces), reweigh=Annealed(), schedule=Geometric(6.0, 1.5))
+        trace = run(None, Hill(GOALS, pull=0.3), Generator().manual_seed(0))
+        ends[name] = distinct(trace.clouds[-1].state)
+    assert (ends["alone"] < 0.5).all()
+    assert (ends["with noise"] > 0.9).all()
