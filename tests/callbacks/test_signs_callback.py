@@ -42,10 +42,11 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     callback.on_validation_epoch_start(trainer, method)  # type: ignore[arg-type]
     callback.on_validation_epoch_end(trainer, method)  # type: ignore[arg-type]
     callback.on_test_batch_end(trainer, method, run, batch, 0)  # type: ignore[arg-type]
+    callback.on_test_epoch_end(trainer, method)  # type: ignore[arg-type]
     assert logged["signs/off_frame/last"] > 0.9
     assert logged["signs/on_object/last"] == 0
     files = sorted(path.name for path in tmp_path.iterdir())
-    assert files == ["test_film_0.gif", "test_journeys_0.jpg", "validation_signs.jpg"]
+    assert files == ["test_film_0.gif", "test_journeys_0.jpg", "test_signs.jpg", "validation_signs.jpg"]
     with Image.open(tmp_path / "test_film_0.gif") as film:
         assert film.n_frames == 5  # three clouds, two frames from one to the next
     picture = draw_signs(signs.compute(), "signs")

@@ -27,7 +27,7 @@ NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 
 
 class Signs(Callback):
-    """Log where the particles are, step by step, after each validation; draw and film the journeys of a test's first images.
+    """Log where the particles are, step by step, after each validation; draw it of a test, and its first images' journeys.
 
     The numbers themselves are among the method's metrics (val/signs/...); a validation's journeys are among its figures.
     folder: where figures and films are written (null: nowhere); images: how many are drawn; share: of the validations' time
@@ -63,6 +63,13 @@ class Signs(Callback):
         """Draw and film the first batch's journeys."""
         if batch_idx == 0 and on_pixels(outputs):
             self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw where the particles of the test were: of validations, the last one drawn may be an early one."""
+        scores = cast(torch.nn.ModuleDict, pl_module.scores)
+        if "signs" in scores and trainer.is_global_zero:
+            found = cast(SignsOfFailure, scores["signs"]).compute()
+            self._post(trainer, "figures/signs_test", "test_signs", draw_signs(found, "Signs of failure\nof the test"))
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
         """Draw and film the journeys of a batch's first images."""
