@@ -73,7 +73,7 @@ def draw(panel: Panel, theme: Theme) -> bytes:
             draw_line(axes, line, colour, panel.joined)
     dress(axes, panel, theme)
     if len(panel.lines) > 1:
-        place = {"loc": "outside lower center", "ncols": 2} if below(panel) else {"loc": "best"}
+        place = {"loc": "outside lower center", "ncols": columns(panel)} if below(panel) else {"loc": "best"}
         legend = figure.legend if below(panel) else axes.legend
         legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2, **place)
     return to_small_png(figure)
@@ -84,9 +84,14 @@ def below(panel: Panel) -> bool:
     return len(panel.lines) > 1 and (bool(panel.categories) or len(panel.lines) > 4 or not panel.joined)
 
 
+def columns(panel: Panel) -> int:
+    """Return in how many columns a legend below a chart fits the chart's width."""
+    return 2 if max(len(line.label) for line in panel.lines) <= 26 else 1
+
+
 def height(panel: Panel) -> int:
     """Return a chart's height [px]."""
-    legend = 17 * -(-len(panel.lines) // 2) if below(panel) else 0
+    legend = 17 * -(-len(panel.lines) // columns(panel)) if below(panel) else 0
     return legend + (74 + 25 * max(len(panel.categories), 3) if panel.categories else HEIGHT_PX)
 
 
