@@ -48,6 +48,8 @@ def plan() -> list[Line]:
         lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
     lines += [Line("held_out", f"{FOUR},pose_pf seed=0")]  # pose_pf beside them
+    noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
+    lines += [Line("noise", noise, f"held_out/model={model},seed=0", model) for model in WITH_POSE]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
     lines += [
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from posefilter.run.comparing import differing
 from posefilter.run.job import Job
 from posefilter.run.train import finished
 
@@ -31,6 +32,13 @@ def test_a_job_is_done_if_nothing_that_decides_its_result_differs(tmp_path: Path
     (tmp_path / "metrics.json").write_text(json.dumps({"overrides": TYPED, "iou": 0.5}))
     found = finished(job(tmp_path, overrides))
     assert found == ({"overrides": TYPED, "iou": 0.5} if done else None)
+
+
+def test_a_default_that_has_changed_since_is_told() -> None:
+    then = {"choices": {"model": "downsized", "optimizer": "adamw"}, "settings": {"filter": {"steps": 6}, "threads": 1}}
+    now = {"choices": {"model": "downsized", "optimizer": "muon"}, "settings": {"filter": {"steps": 10}, "threads": 2}}
+    assert differing(then, now) == ["filter.steps", "optimizer"]
+    assert differing(then, then | {"settings": {"filter": {"steps": 6}, "data": {"workers": 3}, "out": "elsewhere"}}) == []
 
 
 def test_a_single_run_is_always_run(tmp_path: Path) -> None:

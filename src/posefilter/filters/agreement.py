@@ -27,16 +27,20 @@ class Agreement:
     A particle says which object point its own measured point is: by its pose, or by its likeliest `options` fragments where
     it tells fragments. Hypotheses are the likeliest particles' own poses, and as many votes: a few particles' points at a
     time. Each is scored by how many particles it explains, and the best is refitted to all of them (Kabsch, reweighted by
-    how well each fits, with a falling scale). The belief is the votes, weighted by what they explain.
+    how well each fits, with a falling scale). The belief is the votes, each weighted by the share that it explains to the
+    power of `counts`: as many particles count as independent.
 
     scale_m: how far a particle's point may lie off [m]; hypotheses: of each kind; rounds: of the refit.
     """
 
-    def __init__(self, scale_m: float = 0.015, hypotheses: int = 64, rounds: int = 8, options: int = 3) -> None:
+    def __init__(
+        self, scale_m: float = 0.015, hypotheses: int = 64, rounds: int = 8, options: int = 3, counts: float = 8.0
+    ) -> None:
         self.scale_m = scale_m
         self.hypotheses = hypotheses
         self.rounds = rounds
         self.options = options
+        self.counts = counts
 
     def __call__(self, cloud: Cloud, reading: Reading, scene: Scene, method: Method, generator: Generator) -> Belief:
         """Return the belief whose `best` is the agreed pose, its score the share that agrees x the best likelihood."""
@@ -60,7 +64,7 @@ class Agreement:
             best = fit_rigid(chosen, point, weight * fit)
         near = (self._fit(best, thing, point, self.scale_m) > 0.04).any(-1)  # within two scales
         agreed = (weight * near).sum(1) / weight.sum(1)
-        log_weights = torch.log_softmax(explained[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1)
+        log_weights = torch.log_softmax(self.counts * explained[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1)
         return Belief(votes, log_weights, best, agreed * reading.log_likelihood.exp().max(1).values)
 
     def _options(self, reading: Reading, point: Tensor, center: Tensor, radius: float) -> tuple[Tensor, Tensor]:

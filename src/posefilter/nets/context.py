@@ -94,21 +94,21 @@ class _Encoder(nn.Module):
 
 
 class ConvEncoder(_Encoder):
-    """A small U-Net from nothing: strides 4 to 32 and back to 4, about half a million parameters.
+    """A small U-Net from nothing: strides 4 to 32 and back to 4, about a million and a half parameters.
 
     widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets. Runs in bfloat16 where
     the machine has it (float32 in, float32 out), which halves its time on processors.
     """
 
-    def __init__(self, widths: tuple[int, int, int, int] = (32, 48, 64, 96), width: int = 64) -> None:
+    def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 128), width: int = 64) -> None:
         super().__init__(width, stride=4)
         a, b, c, d = widths
         self.colour = conv_norm(3, 24, stride=2)
         self.enter = conv_norm(24 + 7, a, stride=2)
         self.down4 = ResBlock(a)
         self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
-        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c))
-        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d))
+        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
+        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
         self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
         self.to8, self.up8 = nn.Conv2d(c, b, 1), ResBlock(b)
         self.to4, self.skip4, self.up4 = nn.Conv2d(b, width, 1), nn.Conv2d(a, width, 1), ResBlock(width)

@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 
 from posefilter.run.job import Job
 
+HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")  # by whose change nothing else comes out
 _PASSING = ("callbacks", "console", "debug", "folder", "logger", "out", "resume", "threads")  # where and how, not what
 
 
@@ -20,6 +21,19 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
     settings = OmegaConf.to_container(job.cfg, resolve=False)
     assert isinstance(settings, dict)
     return chosen | dict(leaves({key: value for key, value in settings.items() if key not in _PASSING}))
+
+
+def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return the choices and settings in which two recipes differ, such as a default that has changed since."""
+    kept = [
+        {
+            key: value
+            for key, value in (*recipe["choices"].items(), *leaves(recipe["settings"]))
+            if key not in HANDS and key.split(".")[0] not in _PASSING
+        }
+        for recipe in (then, now)
+    ]
+    return sorted(key for key in {*kept[0], *kept[1]} if kept[0].get(key) != kept[1].get(key))
 
 
 def leaves(node: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, bool | int | float | str]]:

@@ -17,7 +17,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.models.base import score_of
 from posefilter.run.build import instantiate
-from posefilter.run.comparing import comparable
+from posefilter.run.comparing import HANDS, comparable, differing
 from posefilter.run.console import progress
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
@@ -26,16 +26,15 @@ from posefilter.run.results import record, show, write_json
 from posefilter.run.resume import last_checkpoint
 from posefilter.run.voice import PLAIN, say, typed
 
-_HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")
-
 
 def train(job: Job) -> float:
     """Train and test; write metrics.json into the job's folder.  Returns the score that sweeps maximise."""
     done = finished(job)
     if done is not None:
-        say(
-            job.cfg.console, "skipped", f"{job.folder}: done before; delete its metrics.json to run it again", run=job.folder
-        )
+        changed = changed_since(job)
+        other = f", with other settings than now ({', '.join(changed[:5])})" if changed else ""
+        sentence = f"{job.folder}: done before{other}; delete its metrics.json to run it again"
+        say(job.cfg.console, "skipped", sentence, run=str(job.folder), changed=changed)
         return score_of(done)
     check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
@@ -146,9 +145,15 @@ def finished(job: Job) -> dict[str, Any] | None:
     return metrics if deciding(metrics["overrides"]) == deciding(job.overrides) else None
 
 
+def changed_since(job: Job) -> list[str]:
+    """Return the settings in which a job that is done differs from what its words mean now, as defaults may change."""
+    best = job.folder / "checkpoints" / "best.ckpt"
+    return differing(read_checkpoint(best)["recipe"], recipe(job)) if best.is_file() else []
+
+
 def deciding(overrides: list[str]) -> list[str]:
     """Return what was typed, in one order, less what says where and with how many hands a run is done."""
-    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in _HANDS)
+    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
 
 
 def quiet() -> None:
