@@ -9,6 +9,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 from toy import scenes, square
 
+from posefilter.errors import UserError
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.downsized import Downsized
 from posefilter.models.image_space import ImageSpace
@@ -90,10 +91,22 @@ def test_the_motions_margin_is_as_much_of_the_object_at_either_width(tmp_path: P
     assert "motion" not in build(tmp_path, "model=cnn_patch", "motion_lesson=none").lessons
 
 
-@pytest.mark.parametrize("change", ["pose_code=absolute", "pose_lesson=none", "estimate=densest_pose", "estimate=mean"])
+@pytest.mark.parametrize(
+    "change", ["pose_code=absolute", "pose_code=own_point pose_lesson=none", "estimate=densest_pose", "estimate=mean"]
+)
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf"])
 def test_each_pose_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
-    step(build(tmp_path, f"model={model}", change))
+    step(build(tmp_path, f"model={model}", *change.split()))
+
+
+def test_fragments_are_not_left_untaught(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="pose_lesson=own_point"):
+        build(tmp_path, "model=patch_pf", "pose_lesson=none")
+    method = build(tmp_path, "model=patch_pf")
+    step(method)
+    last = [m for m in method.net.pose if isinstance(m, torch.nn.Linear)][-1]
+    fragments = method.pose_code.fragments
+    assert (last.weight.grad[6 : 6 + fragments].abs().amax(1) > 0).all(), "every share learns"
 
 
 def test_the_memorisation_test_shows_the_images_that_it_learned(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_own_points_told_as_fragments_are_judged_by_the_true_fragment_and_the_pl
     said = Fragments(share.log(), place, centers, torch.tensor(0.1))
     trace = make_trace(places(ON, OFF), fragments=said)
     want = -math.log(0.2) + 0.3 * 0.4  # |0.03| + |-0.01| radii are 0.4 reaches
-    assert OwnPoint(fragments=0.5, within=0.3)(trace, batch, model).item() == pytest.approx(0.5 * want, abs=1e-6)
+    assert OwnPoint(fragment_weight=0.5, within=0.3)(trace, batch, model).item() == pytest.approx(0.5 * want, abs=1e-6)
 
 
 @pytest.mark.parametrize(

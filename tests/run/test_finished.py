@@ -38,6 +38,9 @@ def test_a_default_that_has_changed_since_is_told() -> None:
     then = {"choices": {"model": "downsized", "optimizer": "adamw"}, "settings": {"filter": {"steps": 6}, "threads": 1}}
     now = {"choices": {"model": "downsized", "optimizer": "muon"}, "settings": {"filter": {"steps": 10}, "threads": 2}}
     assert differing(then, now) == ["filter.steps", "optimizer"]
+    pieces = [{"settings": {"propose": {"pieces": [{"factor": f}]}}, "choices": {"model": "downsized"}} for f in (0.4, 1.0)]
+    assert differing(*pieces) == ["propose.pieces.0.factor"]
+    assert differing(then, then | {"choices": {**then["choices"], "a_new_group": "of the same settings"}}) == []
     assert differing(then, then | {"settings": {"filter": {"steps": 6}, "data": {"workers": 3}, "out": "elsewhere"}}) == []
 
 

@@ -48,8 +48,9 @@ class Agreement:
         center, radius = sees.model.center.to(cloud.state), sees.model.radius
         point, known = sees.own_points(scene, cloud.state)
         share, place = self._options(reading, point, center, radius)
-        weight = reading.log_likelihood.detach().exp() * known + 1e-9
+        weight = reading.log_likelihood.detach().exp() * known
         votes = draw_votes(point, weight, share, place, center, radius, self.hypotheses, generator)
+        weight = weight + 1e-9  # where none is known, all are
         start = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
         likeliest = reading.pose.detach().gather(1, start[..., None, None].expand(-1, -1, 4, 4))
         guess = torch.cat([votes, likeliest], dim=1)
@@ -62,7 +63,7 @@ class Agreement:
             fit, option = (share * self._fit(best, thing, point, scale)).max(-1)
             chosen = thing.gather(2, option[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
             best = fit_rigid(chosen, point, weight * fit)
-        near = (self._fit(best, thing, point, self.scale_m) > 0.04).any(-1)  # within two scales
+        near = (share * (self._fit(best, thing, point, self.scale_m) > 0.04)).sum(-1)  # within two scales
         agreed = (weight * near).sum(1) / weight.sum(1)
         log_weights = torch.log_softmax(self.counts * explained[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1)
         return Belief(votes, log_weights, best, agreed * reading.log_likelihood.exp().max(1).values)

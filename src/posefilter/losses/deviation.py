@@ -52,7 +52,7 @@ class Confidence:
     has no pose to tell, so there its c is pushed down by -w log(1 - c), a quarter of the particles' weight in all.
     """
 
-    def __init__(self, label: Label, weight: float = 0.1, points: int = 64) -> None:
+    def __init__(self, label: Label, weight: float = 0.5, points: int = 64) -> None:
         self.label = label
         self.weight = weight
         self.points = points
@@ -77,18 +77,19 @@ class OwnPoint:
 
     A particle on the object sees one point of the surface: its object coordinates are what it can know best, and many
     particles' coordinates fix a pose. Told outright, by a pose, they are judged by their distance, over the radius; told as
-    fragments (EPOS, Hodan et al. 2020), by `fragments` x (the cross-entropy of the fragments, and `within` x the L1 error of
-    the place in the true one, in units of the fragments' reach). Counts particles whose pixel is on the mask and has depth.
+    fragments (EPOS, Hodan et al. 2020), by `fragment_weight` x (the cross-entropy of the fragments, and `within` x the L1
+    error of the place in the true one, in units of the fragments' reach). Counts particles whose pixel is on the mask and
+    has depth.
     """
 
-    def __init__(self, fragments: float = 0.25, within: float = 0.3) -> None:
-        self.fragments, self.within = fragments, within
+    def __init__(self, fragment_weight: float = 0.25, within: float = 0.3) -> None:
+        self.fragment_weight, self.within = fragment_weight, within
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
         total = batch.rgb.new_zeros(len(batch.rgb))
         for cloud, reading in zip(trace.clouds, trace.readings, strict=True):
-            point, true, counts = own_points(cloud, batch, model)
+            point, true, counts = true_points(cloud, batch, model)
             if reading.fragments is None:
                 guess = transform(invert(reading.pose), point[:, :, None])[:, :, 0]
                 off = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
@@ -102,10 +103,10 @@ class OwnPoint:
         fragment = nearest_fragment(true, said.centers)
         surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
         error = (pick_fragment(said.place, fragment) - true).abs().sum(-1) / said.reach
-        return self.fragments * (surprise + self.within * error)
+        return self.fragment_weight * (surprise + self.within * error)
 
 
-def own_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
+def true_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
     """Return the point that each particle measures, and which point of the object it is.
 
     -> (B, N, 3) in the camera [m]; (B, N, 3) in the object's frame [m]; (B, N) bool: the particle's pixel is on the

@@ -8,16 +8,18 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.spaces import PixelSpace
+from posefilter.losses.deviation import OwnPoint
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box import Box
 from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
-from posefilter.nets.heads import fill_depth
+from posefilter.nets.heads import OwnPointFragments, fill_depth
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 
@@ -76,6 +78,10 @@ class ImageSpace(PoseEstimator):
         self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
         self.stages = tuple(stages or ())
         check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
+        if isinstance(pose_code, OwnPointFragments) and not any(isinstance(x.loss, OwnPoint) for x in self.lessons.values()):
+            raise UserError(
+                "pose_code: nothing but pose_lesson=own_point teaches fragments; choose it, or pose_code=own_point"
+            )
         self.relevance_weight, self.truncate = relevance, truncate
         if object_model is not None:  # not in the base, where the pose code is not there yet
             self.adopt(object_model)
@@ -115,13 +121,15 @@ class ImageSpace(PoseEstimator):
     def own_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool.
 
-        Depth is read at the particle's whole pixel: between pixels of two surfaces there is nothing.
+        Depth is read at the particle's whole pixel: between pixels of two surfaces there is nothing. Off the frame it is the
+        nearest pixel's, and not measured.
         """
         H, W = scene.depth.shape[-2:]
         corner = torch.tensor([W - 1, H - 1], device=state.device)
-        inside = torch.minimum(nearest_pixel(state).clamp_min(0), corner)
+        pixel = nearest_pixel(state)
+        inside = torch.minimum(pixel.clamp_min(0), corner)
         z, known = pick(scene.depth, inside).unbind(-1)
-        return back_project(state.detach(), z, scene.intrinsics), known > 0
+        return back_project(state.detach(), z, scene.intrinsics), (known > 0) & (inside == pixel).all(-1)
 
     def place(self, scene: ImageScene, state: Tensor) -> Tensor:
         """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its location in [-1, 1]."""

@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 from posefilter.run.job import Job
 
 HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")  # by whose change nothing else comes out
+_PLACES = ("data.root", "data.cache_dir")
 _PASSING = ("callbacks", "console", "debug", "folder", "logger", "out", "resume", "threads")  # where and how, not what
 
 
@@ -25,15 +26,20 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
 
 def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """Return the choices and settings in which two recipes differ, such as a default that has changed since."""
-    kept = [
-        {
-            key: value
-            for key, value in (*recipe["choices"].items(), *leaves(recipe["settings"]))
-            if key not in HANDS and key.split(".")[0] not in _PASSING
-        }
-        for recipe in (then, now)
-    ]
-    return sorted(key for key in {*kept[0], *kept[1]} if kept[0].get(key) != kept[1].get(key))
+    groups = {group for group in {*then["choices"]} & {*now["choices"]} if then["choices"][group] != now["choices"][group]}
+    before, after = (dict(flat(recipe["settings"])) for recipe in (then, now))
+    settings = {key for key in {*before, *after} if before.get(key) != after.get(key)}
+    return sorted(k for k in groups | settings if k not in (*HANDS, *_PLACES) and k.split(".")[0] not in _PASSING)
+
+
+def flat(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested settings, those in lists too, by its dotted key."""
+    inner = node.items() if isinstance(node, Mapping) else enumerate(node) if isinstance(node, list) else None
+    if inner is None:
+        yield name, node
+        return
+    for key, value in inner:
+        yield from flat(value, f"{name}.{key}" if name else str(key))
 
 
 def leaves(node: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, bool | int | float | str]]:

@@ -147,8 +147,11 @@ def finished(job: Job) -> dict[str, Any] | None:
 
 def changed_since(job: Job) -> list[str]:
     """Return the settings in which a job that is done differs from what its words mean now, as defaults may change."""
-    best = job.folder / "checkpoints" / "best.ckpt"
-    return differing(read_checkpoint(best)["recipe"], recipe(job)) if best.is_file() else []
+    try:
+        then = read_checkpoint(job.folder / "checkpoints" / "best.ckpt")["recipe"]
+    except UserError:  # what is left of a finished job need not be whole: its results are
+        return []
+    return differing(then, recipe(job))
 
 
 def deciding(overrides: list[str]) -> list[str]:
