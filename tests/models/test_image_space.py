@@ -35,7 +35,7 @@ from posefilter.models.pixel_pf import PixelPF
 from posefilter.models.stages import Auxiliary, Stage, factors_at
 from posefilter.nets.context import ConvEncoder, NoContext
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
-from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointSixD, Unbounded
+from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointFragments, OwnPointSixD, Unbounded
 from posefilter.nets.mlp import LatentNet, PatchNet
 from posefilter.types import Trace
 
@@ -238,3 +238,26 @@ def test_own_points_are_where_the_truth_puts_them() -> None:
     depth = batch.depth[:, 0, H // 2, W // 2]
     torch.testing.assert_close(point[:, 0, 2], depth)
     torch.testing.assert_close(point[:, 0, 0], 0.5 / 60 * depth)
+
+
+def test_what_fragments_have_learned_survives_a_checkpoint_and_other_points_to_judge_by() -> None:
+    method = working(PatchPF, 3, pose_code=OwnPointFragments(16))
+    teach(method, 10)
+    again = working(PatchPF, 3, pose_code=OwnPointFragments(16))
+    model = square()
+    again.load_state_dict(method.state_dict())
+    again.eval().adopt(model._replace(points=model.points.flip(0)[::2]))
+    with torch.no_grad():
+        before, after = (m.predict_step(scenes(2), 0).belief for m in (method, again))
+    torch.testing.assert_close(before.best, after.best)
+    torch.testing.assert_close(before.poses, after.poses)
+
+
+def test_an_image_without_depth_gets_a_finite_belief() -> None:
+    method = working(PatchPF, 3, pose_code=OwnPointFragments(16)).eval()
+    batch = scenes(2)
+    batch.depth[1] = 0
+    with torch.no_grad():
+        belief = method.predict_step(batch, 0).belief
+    for part in belief:
+        assert part.isfinite().all()
