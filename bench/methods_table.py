@@ -34,7 +34,8 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
-SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.workers")  # change no result
+# these change no result
+SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.workers")
 RUNGS = Path(__file__).parents[1] / "conf" / "rung"
 ORDER = ("paper", "s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")  # of rungs, by what their names begin with
 
