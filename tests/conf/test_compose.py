@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from posefilter.errors import UserError
 from posefilter.models.pose_pf import PosePF
 from posefilter.run import run_command
 from posefilter.run.build import instantiate
-from posefilter.run.command import compose_job
+from posefilter.run.command import compose_job, explain
 from posefilter.run.job import Job
 from posefilter.run.method import build_method, check_loss, recipe
 
@@ -180,3 +181,12 @@ def test_no_setting_is_called_as_a_group_that_its_command_does_not_compose(entry
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
     handled = {"debug", "augment"}  # debug is read before Hydra; augment is what a data module asks for, and not to be typed
     assert not (set(page) & groups) - composed - handled
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("budget=patch_pf/wrking", "patch_pf/working"), ("context=unett", "unet")])
+def test_a_choice_that_is_not_there_names_the_nearest(typed: str, meant: str, tmp_path: Path) -> None:
+    with pytest.raises(MissingConfigException) as caught:
+        compose_job("train", CONF, ["model=patch_pf", typed], tmp_path)
+    told = explain(caught.value, "train", CONF, [typed])
+    assert told.startswith(f"{typed}: there is no such choice; did you mean '{meant}'; there are ")
+    assert "\n" not in told

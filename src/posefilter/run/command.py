@@ -122,6 +122,10 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, MissingConfigException) and error.options is not None and error.missing_cfg_file:
         group, _, choice = error.missing_cfg_file.rpartition("/")
         options = sorted(error.options)
+        if not options:  # the choices of some groups lie in a folder each
+            inner, group = group, group.partition("/")[0]
+            choice = f"{inner.partition('/')[2]}/{choice}".lstrip("/")
+            options = sorted(str(f.relative_to(conf / group).with_suffix("")) for f in (conf / group).rglob("*.yaml"))
         return (
             f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there are {', '.join(options)}"
         )
