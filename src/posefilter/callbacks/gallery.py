@@ -66,7 +66,7 @@ def one_image(trace: Trace, i: int) -> Trace:
     take = lambda x: x[i : i + 1].detach().cpu() if x.ndim else x.detach().cpu()  # noqa: E731
     return Trace(
         tuple(Cloud(*map(take, cloud)) for cloud in trace.clouds),
-        tuple(Reading(*map(take, r._replace(fragments=None)[:-1])) for r in trace.readings),  # fragments: not for the eye
+        tuple(Reading(*map(take, reading[:-1])) for reading in trace.readings),  # fragments: not for the eye
         tuple(step._replace(sigma=take(step.sigma)) for step in trace.steps),
         Belief(*map(take, trace.belief)),
     )

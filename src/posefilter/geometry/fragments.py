@@ -30,3 +30,28 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
         nearest = torch.minimum(nearest, (points - points[index]).norm(dim=-1))
         distance = nearest
     return points[chosen], max(float(nearest.mean()), 1e-3)
+
+
+def cut_once(centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float) -> None:
+    """Fill buffers (K, 3) and () by cutting a surface into K fragments, over the radius, from the centre; once.
+
+    points: (P, 3) of the surface [m]; center: (3,) and radius [m]. Filled buffers stay: what was learned is about their
+    fragments, whatever points it is judged by later.
+    """
+    if bool(centers.any()):
+        return
+    middles, mean = spread_points((points - center) / radius, len(centers))
+    centers.copy_(middles)
+    reach.fill_(mean)
+
+
+def fragment_errors(
+    log_share: Tensor, place: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the surprise at the true fragments, and the L1 error of the places in them, in units of their reach.
+
+    (B, *, K), (B, *, K, 3), (B, K, 3) and the true points (B, *, 3) over the radius, from the centre -> (B, *), (B, *).
+    """
+    fragment = nearest_fragment(truth, centers)
+    surprise = -log_share.gather(-1, fragment[..., None])[..., 0]
+    return surprise, (pick_fragment(place, fragment) - truth).abs().sum(-1) / reach

@@ -7,7 +7,7 @@ from posefilter.contracts import Label
 from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.deviation import deviation, nearest_deviation, thin
-from posefilter.geometry.fragments import nearest_fragment, pick_fragment
+from posefilter.geometry.fragments import fragment_errors
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.pose import invert, transform
 from posefilter.losses.likelihood import log_not
@@ -100,9 +100,7 @@ class OwnPoint:
 
     def _of_fragments(self, said: Fragments, true: Tensor) -> Tensor:
         """Judge what is said by the true points over the radius, from the centre.  (B, N, 3) -> (B, N)."""
-        fragment = nearest_fragment(true, said.centers)
-        surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
-        error = (pick_fragment(said.place, fragment) - true).abs().sum(-1) / said.reach
+        surprise, error = fragment_errors(said.log_share, said.place, said.centers, said.reach, true)
         return self.fragment_weight * (surprise + self.within * error)
 
 

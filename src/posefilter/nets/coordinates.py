@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from posefilter.geometry.fragments import nearest_fragment, pick_fragment
+from posefilter.geometry.fragments import fragment_errors, nearest_fragment, pick_fragment
 
 STRIDE = 8  # pixels a cell
 
@@ -79,9 +79,7 @@ def coordinate_loss(
     count = inside.sum((1, 2)).clamp_min(1.0)
     mean = lambda x: (x * inside).sum((1, 2)) / count  # noqa: E731
     bce = F.binary_cross_entropy_with_logits(said.logit, on.float(), reduction="none").mean((1, 2))
-    fragment = nearest_fragment(truth, said.centers)
-    surprise = -said.log_share.gather(-1, fragment[..., None])[..., 0]
-    error = (pick_fragment(said.place, fragment) - truth).abs().sum(-1) / reach
+    surprise, error = fragment_errors(said.log_share, said.place, said.centers, reach, truth)
     distance = (said.coordinate - truth).norm(dim=-1).detach() * radius
     return 5 * bce + mean(surprise + 0.3 * error), mean(distance)
 

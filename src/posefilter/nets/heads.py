@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from posefilter.geometry.fragments import pick_fragment, spread_points
+from posefilter.geometry.fragments import cut_once, pick_fragment
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
 from posefilter.types import Fragments, ObjectModel
@@ -152,11 +152,7 @@ class OwnPointFragments(_OwnPoint):
     def about(self, model: ObjectModel) -> None:
         """Cut the object into fragments, once: what was learned is about these, whatever points it is judged by later."""
         super().about(model)
-        if bool(self.centers.any()):
-            return
-        middles, reach = spread_points((model.points - model.center) / model.radius, self.fragments)
-        self.centers.copy_(middles)
-        self.reach.fill_(reach)
+        cut_once(self.centers, self.reach, model.points, model.center, model.radius)
 
     def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
         """(B, N, 6 + 4 K), (B, N, 3) [m] -> ToldPose."""

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from posefilter.geometry.fragments import spread_points
+from posefilter.geometry.fragments import cut_once
 from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.encoding import geometry, grow
 from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
@@ -59,8 +59,4 @@ class ObjectCoordinateNet(nn.Module):
 
         (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m].
         """
-        if bool(self.centers.any()):
-            return
-        middles, reach = spread_points((points - center) / radius, self.fragments)
-        self.centers.copy_(middles)
-        self.reach.fill_(reach)
+        cut_once(self.centers, self.reach, points, center, radius)
