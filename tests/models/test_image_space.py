@@ -111,7 +111,7 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(kind: t
     before = method.results()
     assert before["particles_on_object"] < 0.4
     method._reset()
-    teach(method, 160)
+    teach(method, 240)
     with torch.no_grad():
         method.test_step(scenes(4), 0)
     after = method.results()
