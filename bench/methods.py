@@ -8,6 +8,7 @@ typed beyond the options, such as threads=1, is handed to every command.
 """
 
 import argparse
+import math
 import shlex
 import subprocess
 import sys
@@ -77,13 +78,14 @@ def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
 
 
 def waits(line: Line, root: Path) -> bool:
-    """Tell whether an evaluation has no checkpoint yet, or was done after that was made."""
+    """Tell whether an evaluation has no checkpoint yet, or all its points were evaluated after that was made."""
     if line.of is None:
         return False
-    checkpoint, summary = root / line.of / "checkpoints" / "best.ckpt", root / line.table / line.into / "summary.csv"
     if not (root / line.of / "metrics.json").is_file():
         return True
-    return summary.is_file() and summary.stat().st_mtime > checkpoint.stat().st_mtime
+    made = (root / line.of / "checkpoints" / "best.ckpt").stat().st_mtime
+    done = [path for path in (root / line.table / line.into).glob("*/metrics.json") if path.stat().st_mtime > made]
+    return len(done) >= math.prod(len(word.split("=", 1)[1].split(",")) for word in line.words.split())
 
 
 def main() -> int:

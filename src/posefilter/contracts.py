@@ -79,6 +79,17 @@ class ProposesPoses(Protocol):
 
 
 @runtime_checkable
+class SeesPoints(Protocol):
+    """A method whose particles each stand on one measured point of its object: the estimate `agreement` asks for it."""
+
+    model: ObjectModel
+
+    def own_points(self, scene: Scene, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool."""
+        ...
+
+
+@runtime_checkable
 class HasRelevance(Protocol):
     """A scene that tells where in its images to look: the start `from relevance` asks for it."""
 

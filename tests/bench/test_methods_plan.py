@@ -47,11 +47,12 @@ def test_an_evaluation_waits_for_its_checkpoint_and_is_not_done_twice(tmp_path: 
     checkpoint = run / "checkpoints" / "best.ckpt"
     checkpoint.touch()
     assert not methods.waits(line, tmp_path)
-    summary = tmp_path / line.table / line.into / "summary.csv"
-    summary.parent.mkdir(parents=True)
-    summary.touch()
     os.utime(checkpoint, (1, 1))
-    assert methods.waits(line, tmp_path)
+    points = [tmp_path / line.table / line.into / f"filter.particles={n}" / "metrics.json" for n in (50, 100)]
+    for point, waits in zip(points, (False, True), strict=True):  # cut short after the first, it goes on
+        point.parent.mkdir(parents=True)
+        point.touch()
+        assert methods.waits(line, tmp_path) is waits
     os.utime(checkpoint)
-    os.utime(summary, (1, 1))  # trained anew since
+    os.utime(points[0], (1, 1))  # trained anew since
     assert not methods.waits(line, tmp_path)

@@ -69,7 +69,7 @@ def test_quality_falls_with_the_pose_error_and_is_nothing_off_the_object(batch, 
 
 
 def test_log_not_is_exact_and_its_slope_finite_at_both_ends() -> None:
-    logit = torch.tensor([-40.0, -3.0, 0.0, 5.0, 15.0], dtype=torch.float32, requires_grad=True)
+    logit = torch.tensor([-40.0, -3.0, 0.0, 5.0, 15.0, 28.0, 75.0], dtype=torch.float32, requires_grad=True)
     out = log_not(torch.nn.functional.logsigmoid(logit))
     torch.testing.assert_close(out, torch.nn.functional.logsigmoid(-logit), rtol=1e-5, atol=1e-7)
     out.sum().backward()

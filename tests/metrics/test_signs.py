@@ -5,7 +5,17 @@ import math
 import pytest
 import torch
 
-from posefilter.metrics.signs import auroc, distinct, explained, heading, near_edge, off_frame, pairwise_cosine
+from posefilter.metrics.signs import (
+    SignsOfFailure,
+    auroc,
+    distinct,
+    explained,
+    heading,
+    near_edge,
+    off_frame,
+    pairwise_cosine,
+)
+from posefilter.types import Batch, Belief, Cloud, Reading, Step, Trace
 
 
 def test_pairwise_cosine_equals_the_double_loop() -> None:
@@ -54,3 +64,25 @@ def test_copies_count_once() -> None:
         [[[3.0, 4.0], [3.0, 4.0], [3.04, 4.0], [3.2, 4.0]], [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0], [9.0, 9.0]]]
     )
     assert distinct(state).tolist() == [0.5, 1.0]
+
+
+def test_to_tell_who_left_the_frame_is_no_skill() -> None:
+    """A likelihood that is high wherever there is a picture tells nothing of the object."""
+    mask = torch.zeros(1, 1, 50, 100, dtype=torch.bool)
+    mask[..., 20:30, 40:60] = True
+    state = torch.tensor([[[45.0, 25.0], [55.0, 22.0], [5.0, 5.0], [90.0, 40.0], [-30.0, 9.0], [140.0, 9.0]]])
+    seen = torch.tensor([[-0.1, -0.1, -0.1, -0.1, -9.0, -9.0]])
+    for log_likelihood, wanted in ((seen, 0.5), (torch.where(state[..., 0] > 60, -1.0, seen), 0.75)):
+        signs = SignsOfFailure()
+        signs.update(make_trace(state, log_likelihood), Batch(mask, mask, mask, *[torch.zeros(1)] * 5))
+        assert signs.compute()["auroc"] == pytest.approx(wanted)
+
+
+def make_trace(state: torch.Tensor, log_likelihood: torch.Tensor) -> Trace:
+    B, N = log_likelihood.shape
+    cloud = Cloud(state, torch.zeros(B, N, 0), log_likelihood, torch.arange(N).expand(B, N))
+    pose = torch.eye(4).expand(B, N, 4, 4)
+    reading = Reading(log_likelihood, torch.zeros_like(state), pose, torch.zeros(B, N, 0))
+    return Trace(
+        (cloud,), (reading,), (Step(0, 1, torch.tensor(0.0)),), Belief(pose, log_likelihood, pose[:, 0], pose[:, 0, 0])
+    )

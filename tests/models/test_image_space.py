@@ -13,6 +13,7 @@ from toy import H, W, scenes, square
 
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
+from posefilter.filters.estimate import Best
 from posefilter.filters.guided import Guided
 from posefilter.filters.initialise import FromRelevance, Informed, UniformPixels
 from posefilter.filters.loop import ParticleFilter
@@ -40,8 +41,8 @@ from posefilter.nets.mlp import LatentNet, PatchNet
 from posefilter.types import Trace
 
 
-def run_filter(particles: int, steps: int, initialise=None, resample=None) -> ParticleFilter:
-    pieces = (Constant(0.0), Annealed(), resample or Never(), LearnedMotion(), Agreement(), NoRefine())
+def run_filter(particles: int, steps: int, initialise=None, resample=None, estimate=None) -> ParticleFilter:
+    pieces = (Constant(0.0), Annealed(), resample or Never(), LearnedMotion(), estimate or Best(), NoRefine())
     return ParticleFilter(particles, steps, initialise or UniformPixels(), *pieces)
 
 
@@ -63,7 +64,8 @@ def working(kind: type[ImageSpace], size: int, **changes) -> ImageSpace:
         "motion": Bounded(0.3),
         "bounds": VotedBox() if detects else PoseBox(),
         "lessons": lessons,
-        "filter": run_filter(64, 4, resample=Systematic()),
+        "place_gradient": False,
+        "filter": run_filter(64, 4, resample=Systematic(), estimate=Best() if detects else Agreement()),
         "train_filter": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
         "loss": Chamfer(size) if detects else Confidence(OnObject(size)),
         "optimizer": partial(torch.optim.AdamW, lr=3e-3),

@@ -50,6 +50,15 @@ def test_which_networks_learn(method, learning: set[str]) -> None:
     assert {part for part in ("latent", "pose", "likelihood", "motion") if learns(made, part)} == learning
 
 
+def test_a_stopped_place_keeps_the_likelihoods_loss_out_of_the_motion() -> None:
+    """Through the place, a loss that asks "am I on the object?" teaches to leave for where the answer is surely no."""
+    for stopped, learning in ((False, True), (True, False)):
+        method = taught(paper(PatchPF, 3, loss=Bce(OnObject(3)), glimpse=SmoothGlimpse(3), place_gradient=not stopped))
+        assert learns(method, "motion") is learning
+        assert learns(method, "likelihood")
+        assert learns(method, "latent")
+
+
 def test_the_detectors_likelihood_is_never_taught() -> None:
     method = taught(paper(CnnPatch, 9))
     likelihood, u, v = method.net.tell.weight.grad.abs().sum(1)

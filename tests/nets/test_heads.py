@@ -35,6 +35,16 @@ def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
     assert (out > 100).any()
 
 
+def test_a_particle_pushed_onto_an_edge_can_be_taught_back() -> None:
+    state = torch.tensor([[[5.0, 20.0], [99.0, 49.0]]])
+    raw = torch.tensor([[[-1.0, 0.0], [2.0, 2.0]]], requires_grad=True)  # both are led off the frame, and kept on its edge
+    motion = Bounded(0.3)(raw, torch.zeros(1, 2), state, 100, 50)
+    torch.testing.assert_close(state + motion, torch.tensor([[[0.0, 20.0], [99.0, 49.0]]]))
+    (motion - torch.tensor([[[30.0, 0.0], [-50.0, -20.0]]])).square().sum().backward()
+    assert raw.grad[0, 0, 0] < 0, "descent leads it inwards"
+    assert (raw.grad[0, 1] > 0).all()
+
+
 def test_who_is_there_stays_there() -> None:
     raw, state = torch.ones(1, 3, 2), torch.full((1, 3, 2), 20.0)
     logit = torch.tensor([[-9.0, 0.0, 9.0]]).requires_grad_()

@@ -149,6 +149,12 @@ def test_every_image_space_method_goes_the_whole_way(model: str, tiny_job, tmp_p
     assert 0 <= metrics["particles_on_object"] <= 1
 
 
+def test_a_training_shorter_than_its_interval_is_validated_at_its_end(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train(tiny_job(tmp_path, "model=cnn_patch", "trainer.max_steps=2", "trainer.val_check_interval=100"))
+    assert read(tmp_path)["training"]["steps"] == 2
+    assert (tmp_path / "checkpoints" / "best.ckpt").is_file()
+
+
 def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     found = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):

@@ -1,24 +1,22 @@
 """The pose that most particles' own surface points agree on."""
 
-from typing import Protocol, cast
-
 import torch
 from torch import Generator, Tensor
 
-from posefilter.contracts import Method, Scene
+from posefilter.contracts import Method, Scene, SeesPoints
+from posefilter.errors import UserError
 from posefilter.geometry.pose import fit_rigid, invert, transform
 from posefilter.geometry.votes import draw_votes
-from posefilter.types import Belief, Cloud, ObjectModel, Reading
+from posefilter.types import Belief, Cloud, Reading
 
 
-class SeesPoints(Protocol):
-    """A method whose particles each stand on one measured point."""
-
-    model: ObjectModel
-
-    def own_points(self, scene: Scene, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool."""
-        ...
+def seer(method: Method) -> SeesPoints:
+    """Return the method as one whose particles stand on measured points; raise UserError if they do not."""
+    if not isinstance(method, SeesPoints):
+        raise UserError(
+            f"estimate=agreement: no particle of {type(method).__name__} stands on a measured point; choose estimate=best"
+        )
+    return method
 
 
 class Agreement:
@@ -36,6 +34,10 @@ class Agreement:
     def __init__(
         self, scale_m: float = 0.015, hypotheses: int = 64, rounds: int = 8, options: int = 3, counts: float = 8.0
     ) -> None:
+        if min(hypotheses, options) < 1 or scale_m <= 0:
+            raise UserError(
+                f"estimate: hypotheses={hypotheses} and options={options} must be 1 or more, and scale_m={scale_m} above 0"
+            )
         self.scale_m = scale_m
         self.hypotheses = hypotheses
         self.rounds = rounds
@@ -44,7 +46,7 @@ class Agreement:
 
     def __call__(self, cloud: Cloud, reading: Reading, scene: Scene, method: Method, generator: Generator) -> Belief:
         """Return the belief whose `best` is the agreed pose, its score the share that agrees x the best likelihood."""
-        sees = cast(SeesPoints, method)
+        sees = seer(method)
         center, radius = sees.model.center.to(cloud.state), sees.model.radius
         point, known = sees.own_points(scene, cloud.state)
         share, place = self._options(reading, point, center, radius)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.filters.initialise import draw_from_depth
 from posefilter.filters.propose import half_turns
 from posefilter.geometry.pose import invert, origin_of, pose_about
@@ -65,6 +66,8 @@ class PersistentParticles(nn.Module):
 
     def __init__(self, particles: int = 16, levels: int = 12, sharpest: float = 0.004, step: float = 0.4) -> None:
         super().__init__()
+        if particles < 1 or levels < 2:
+            raise UserError(f"lesson: levels={levels} must be 2 or more, particles={particles} 1 or more, or 0 for none")
         self.particles, self.levels, self.sharpest, self.step = particles, levels, sharpest, step
         self._poses: dict[int, Tensor] = {}
         self._level: dict[int, int] = {}

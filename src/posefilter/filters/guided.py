@@ -29,7 +29,9 @@ class Guided:
     """Draw parents by weight x relevance, and let children start with weights x 1 / relevance, so that the belief stays.
 
     The first stage of an auxiliary particle filter (Pitt and Shephard 1999): more children where it will pay, each
-    counting for less. floor: relevance below it counts as it, since no child can make up for a parent never drawn.
+    counting for less, where weights are handed down (reweigh=tempered, sequential). reweigh=annealed forgets them: then this
+    only searches where relevance is high. floor: relevance below it counts as it, since no child can make up for a parent
+    never drawn.
     """
 
     def __init__(self, resampler: Resample, floor: float = 0.05) -> None:

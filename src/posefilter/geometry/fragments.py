@@ -32,6 +32,14 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
     return points[chosen], max(float(nearest.mean()), 1e-3)
 
 
+def may_be_object(points: Tensor) -> Tensor:
+    """Tell which measured points can be of the object.  (*, 3) over the radius, from the object's centre -> (*) bool.
+
+    A fifth beyond its bounding ball is left to the sensor's error; farther off, a mask's pixel shows what lies behind.
+    """
+    return points.norm(dim=-1) < 1.2
+
+
 def cut_once(centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float) -> None:
     """Fill buffers (K, 3) and () by cutting a surface into K fragments, over the radius, from the centre; once.
 

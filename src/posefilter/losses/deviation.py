@@ -7,7 +7,7 @@ from posefilter.contracts import Label
 from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.deviation import deviation, nearest_deviation, thin
-from posefilter.geometry.fragments import fragment_errors
+from posefilter.geometry.fragments import fragment_errors, may_be_object
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.pose import invert, transform
 from posefilter.losses.likelihood import log_not
@@ -114,4 +114,5 @@ def true_points(cloud: Cloud, batch: Batch, model: ObjectModel) -> tuple[Tensor,
     z, on = pick(seen, nearest_pixel(cloud.state)).unbind(-1)
     point = back_project(cloud.state.detach(), z, batch.intrinsics)
     true = transform(invert(batch.camera_from_object), point)
-    return point, true, (on > 0) & (z > 0) & ((true - model.center.to(true)).norm(dim=-1) < 1.2 * model.radius)
+    near = may_be_object((true - model.center.to(true)) / model.radius)
+    return point, true, (on > 0) & (z > 0) & near

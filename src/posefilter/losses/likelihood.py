@@ -9,8 +9,11 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 def log_not(log_p: Tensor) -> Tensor:
-    """Return log(1 - p) from log p, exact at both ends, with a finite slope at p = 1."""
-    return torch.log(-torch.expm1(log_p.clamp(max=-1e-12)))
+    """Return log(1 - p) from log p = logsigmoid(logit), exact at both ends, its slope in the logit too, up to a logit of 80.
+
+    Beyond, where even log p is all but denormal, it stays finite and has no slope.
+    """
+    return torch.log(-torch.expm1(log_p.clamp(max=-1e-35)))
 
 
 def said(trace: Trace, steps: str) -> Tensor:

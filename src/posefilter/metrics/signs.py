@@ -59,10 +59,15 @@ def auroc(score: Tensor, positive: Tensor) -> Tensor:
     return ((ranks[positive].sum() - n * (n + 1) / 2) / (n * m)).float()
 
 
+def left(state: Tensor, width: int, height: int) -> Tensor:
+    """Tell which particles are off the frame.  (B, N, 2) [px] -> (B, N) bool."""
+    u, v = state.unbind(-1)
+    return (u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)
+
+
 def off_frame(state: Tensor, width: int, height: int) -> Tensor:
     """Return the share of particles that left the frame.  (B, N, 2) [px] -> (B,)."""
-    u, v = state.unbind(-1)
-    return ((u < -0.5) | (u > width - 0.5) | (v < -0.5) | (v > height - 0.5)).float().mean(1)
+    return left(state, width, height).float().mean(1)
 
 
 def near_edge(state: Tensor, width: int, height: int, share: float = 0.05) -> tuple[Tensor, Tensor]:
@@ -89,7 +94,8 @@ class SignsOfFailure(Metric):
 
     off_frame, near_edge, near_corner, on_object, distinct: lists; pairwise_cosine: mean over images and steps; offset_r2,
     heading: displacements against the true offset to the mask's nearest pixel; auroc: of the likelihood, particles on the
-    mask being the positives. The last three are over all steps.
+    mask being the positives, those in the rest of the frame the negatives: who left it sees nothing, and to tell that is no
+    skill. The last three are over all steps.
     """
 
     full_state_update = False
@@ -119,7 +125,7 @@ class SignsOfFailure(Metric):
             self.offsets.append(torch.cat([motion, true], dim=-1).flatten(0, 1).float())
             positive = touches(batch.mask, some).float()
             judged = torch.stack([reading.log_likelihood[:, : self.most].float(), positive], dim=-1)
-            self.judged.append(judged.flatten(0, 1))
+            self.judged.append(judged[~left(some, width, height)])
         self.shares.append(torch.stack(kinds).permute(2, 0, 1))  # (B, T, 5)
 
     def compute(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.scores import overall
 from posefilter.metrics.visibility import ErrorsByVisibility
+from posefilter.models.checks import check_estimate
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
@@ -53,6 +54,7 @@ class PoseEstimator(LightningModule):
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
+        check_estimate(self)
 
     @property
     def space(self) -> Space:

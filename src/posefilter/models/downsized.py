@@ -4,4 +4,4 @@ from posefilter.models.cnn_patch import CnnPatch
 
 
 class Downsized(CnnPatch):
-    """The same on an image reduced to 160 pixels (`width`), so that a patch covers more of the object."""
+    """The same on an image 160 pixels wide (`data.image_width`, set by its budgets): a patch covers more of the object."""

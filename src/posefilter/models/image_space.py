@@ -16,6 +16,7 @@ from posefilter.losses.deviation import OwnPoint
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box import Box
+from posefilter.models.checks import check_training_clouds, check_votes
 from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
@@ -45,8 +46,10 @@ class ImageSpace(PoseEstimator):
 
     net: given the patch's size, how many extra numbers a particle is told and how many make a pose; bounds: how particles
     bound the object in the image; lessons: losses beside the chosen one, by name; stages: factors on all of them as training
-    proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; truncate: cut the
-    gradient every so many steps (null: never), so that a long roll-out stays finite, which changes no value.
+    proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; place_gradient:
+    whether what is read at a place also teaches the motion that led there; truncate: cut the gradient through places that
+    are looked at, and through the memory, every so many steps (null: never), so that a long roll-out stays finite, which
+    changes no value.
     """
 
     place_width: ClassVar[int] = 0  # numbers that tell a particle its own location
@@ -67,6 +70,7 @@ class ImageSpace(PoseEstimator):
         lessons: Mapping[str, Auxiliary | None] | None = None,
         stages: Sequence[Stage] | None = None,
         relevance: float = 1.0,
+        place_gradient: bool = True,
         truncate: int | None = None,
         object_model: ObjectModel | None = None,
         **base: Any,
@@ -78,11 +82,12 @@ class ImageSpace(PoseEstimator):
         self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
         self.stages = tuple(stages or ())
         check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
+        check_votes(self)
         if isinstance(pose_code, OwnPointFragments) and not any(isinstance(x.loss, OwnPoint) for x in self.lessons.values()):
             raise UserError(
                 "pose_code: nothing but pose_lesson=own_point teaches fragments; choose it, or pose_code=own_point"
             )
-        self.relevance_weight, self.truncate = relevance, truncate
+        self.relevance_weight, self.place_gradient, self.truncate = relevance, place_gradient, truncate
         if object_model is not None:  # not in the base, where the pose code is not there yet
             self.adopt(object_model)
 
@@ -110,6 +115,8 @@ class ImageSpace(PoseEstimator):
         state, memory = cloud.state, cloud.memory
         if self.truncate and step.number % self.truncate == 0:
             state, memory = state.detach(), memory.detach()
+        if not self.place_gradient:
+            state = state.detach()
         patch = self.glimpse(scene.image, state)
         extra = torch.cat([self.context.look(scene.context, state), self.place(scene, state)], dim=-1)
         said = self.net(patch, extra, memory)
@@ -141,6 +148,7 @@ class ImageSpace(PoseEstimator):
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an image each, weighted."""
+        check_training_clouds(self)
         scene = self.observe(batch)
         trace: Trace = self.train_filter(batch, _Observed(self, scene), generator)
         losses = {"loss": self.loss(trace, batch, self.model)}

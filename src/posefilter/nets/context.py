@@ -1,17 +1,19 @@
 """Global context: what a particle may know of the image beyond its own glimpse, sampled where the particle stands.
 
-Every context maps an image once to feature maps (a `ContextMap`), and is then looked up at each particle at each step.
+Every context maps images, (B, 3, H, W) in [0, 1], (B, 1, H, W) [m] and (B, 3, 3) [px], once to feature maps (a
+`ContextMap`), and is then looked up at each particle at each step, for `width` features.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.geometry.lookup import sample, window
-from posefilter.nets.encoding import geometry, grow, masked_mean_pool
-from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
+from posefilter.nets.encoding import UNet, geometry, grow, in_bfloat16, masked_mean_pool
+from posefilter.nets.layers import ResBlock
 
 
 class ContextMap(NamedTuple):
@@ -20,20 +22,6 @@ class ContextMap(NamedTuple):
     levels: tuple[Tensor, ...]  # each (B, F, h, w)
     strides: tuple[int, ...]  # pixels a cell of each
     relevance: Tensor | None  # (B, h, w) logit of `this cell shows the object`, at strides[0]; None where not told
-
-
-class Context(Protocol):
-    """An encoder of the whole image."""
-
-    width: int  # features a particle gets
-
-    def __call__(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
-        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> ContextMap."""
-        ...
-
-    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """Return each particle's features.  (B, N, 2) [px] -> (B, N, width)."""
-        ...
 
 
 class NoContext(nn.Module):
@@ -55,11 +43,19 @@ class Pyramid(nn.Module):
 
     def __init__(self, levels: int = 5) -> None:
         super().__init__()
+        if levels < 1:
+            raise UserError(f"context.levels={levels}: must be 1 or more; choose context=none for none")
         self.strides = tuple(2 ** (i + 1) for i in range(levels))
         self.width = levels * 9 * 5
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map a level, of 5 channels: colour, depth, share of known depth."""
+        side = min(rgb.shape[-2:])
+        if self.strides[-1] > side:
+            raise UserError(
+                f"context.levels={len(self.strides)}: a cell of the last would be larger than the image; "
+                f"choose {side.bit_length() - 1} or fewer"
+            )
         levels = []
         for stride in self.strides:
             z, known = masked_mean_pool(depth, stride)
@@ -93,7 +89,7 @@ class _Encoder(nn.Module):
         return sample(seen.levels[0], pixels, self.stride, padding="border")
 
 
-class ConvEncoder(_Encoder):
+class ConvEncoder(_Encoder, UNet):
     """A small U-Net from nothing: strides 4 to 32 and back to 4, about a million and a half parameters.
 
     widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets. Runs in bfloat16 where
@@ -102,29 +98,16 @@ class ConvEncoder(_Encoder):
 
     def __init__(self, widths: tuple[int, int, int, int] = (32, 64, 96, 128), width: int = 64) -> None:
         super().__init__(width, stride=4)
-        a, b, c, d = widths
-        self.colour = conv_norm(3, 24, stride=2)
-        self.enter = conv_norm(24 + 7, a, stride=2)
-        self.down4 = ResBlock(a)
-        self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
-        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
-        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
-        self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
-        self.to8, self.up8 = nn.Conv2d(c, b, 1), ResBlock(b)
+        self.lay_trunk(widths)
+        a, b = widths[:2]
+        self.up8 = ResBlock(b)
         self.to4, self.skip4, self.up4 = nn.Conv2d(b, width, 1), nn.Conv2d(a, width, 1), ResBlock(width)
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map of stride 4."""
         shape = geometry(depth, K)
-        fast = rgb.dtype == torch.float32 and fast_bfloat16(rgb.device)
-        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=fast):
-            x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
-            x4 = self.down4(self.enter(torch.cat([x, shape[..., : x.shape[-2], : x.shape[-1]]], dim=1)))
-            x8 = self.down8(x4)
-            x16 = self.down16(x8)
-            x32 = self.down32(x16)
-            y16 = self.up16(x16 + grow(self.to16(x32), x16))
-            y8 = self.up8(x8 + grow(self.to8(y16), x8))
+        with in_bfloat16(rgb):
+            x4, y8 = self.encode(rgb, shape)
             y4 = self.up4(self.skip4(x4) + grow(self.to4(y8), x4))
         return self._map(y4)
 

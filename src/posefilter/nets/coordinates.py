@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from posefilter.geometry.fragments import fragment_errors, nearest_fragment, pick_fragment
+from posefilter.geometry.fragments import fragment_errors, may_be_object, nearest_fragment, pick_fragment
 
 STRIDE = 8  # pixels a cell
 
@@ -50,6 +50,12 @@ class Cells(NamedTuple):
         return Cells(*(x[:count] for x in self))
 
 
+def whole_cells(image: Tensor) -> Tensor:
+    """Pad images with zeros to whole cells, as many as the network makes.  (B, C, H, W) -> the same, sides of `STRIDE`."""
+    H, W = image.shape[-2:]
+    return F.pad(image, (0, -W % STRIDE, 0, -H % STRIDE))
+
+
 def true_coordinates(
     cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -59,11 +65,10 @@ def true_coordinates(
     the radius, from the centre, (B, h, w, 3); whether the cell's middle pixel shows the object, (B, h, w) bool; and whether
     it also has a depth that can be of the object, so that the point is true.
     """
-    h, w = cells.valid.shape[1:]
-    on = mask[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE][:, :h, :w]
+    on = whole_cells(mask)[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
     truth = ((cells.point - t) @ R - center) / radius
-    return truth, on, on & cells.valid & (truth.norm(dim=-1) < 1.2)
+    return truth, on, on & cells.valid & may_be_object(truth)
 
 
 def coordinate_loss(
@@ -104,7 +109,7 @@ def lay_out_context(said: Coordinates, height: int, width: int) -> Context:
     """Lay out what is said of H x W images. Gradients reach the features alone: the rest has a lesson of its own."""
     rows, columns = -(-height // 2), -(-width // 2)
     grid = torch.cat([said.logit.detach()[..., None], said.features], dim=-1).permute(0, 3, 1, 2)
-    grid = F.interpolate(grid, size=(rows, columns), mode="bilinear", align_corners=False)
+    grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[..., :rows, :columns]
     share, place = said.log_share.detach().exp().flatten(1), said.place.detach().flatten(1, 3)
     return Context(grid.flatten(2).transpose(1, 2), share, place, said.centers, said.logit.shape[1:], columns)  # type: ignore[arg-type]
 

@@ -1,10 +1,11 @@
-"""What every encoder of an image starts from: depth as geometry; and how a coarse map joins a finer one."""
+"""What every encoder of an image starts from: depth as geometry; and the trunk that those learned from nothing share."""
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from posefilter.geometry.camera import back_project, pixel_grid, rays
+from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
 
 
 def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -39,8 +40,10 @@ def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
 def geometry(depth: Tensor, K: Tensor) -> Tensor:
     """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H, W) -> (B, 7, ...).
 
+    Sides are halved upwards, as by a convolution of stride 2: beyond an odd side lies a row of which nothing is known.
     Channels last: joined with colour that is not, it would have every convolution after it reorder its input.
     """
+    depth = F.pad(depth, (0, depth.shape[-1] % 2, 0, depth.shape[-2] % 2))
     B, _, H, W = depth.shape
     z, share = masked_mean_pool(depth, 2)
     grid = pixel_grid(H, W, 2, device=depth.device).reshape(1, -1, 2).expand(B, -1, -1)
@@ -53,3 +56,39 @@ def geometry(depth: Tensor, K: Tensor) -> Tensor:
 def grow(x: Tensor, like: Tensor) -> Tensor:
     """Interpolate a map to the size of another.  (B, C, h, w), (B, *, H, W) -> (B, C, H, W)."""
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def in_bfloat16(rgb: Tensor) -> torch.autocast:
+    """Return the context to encode images in: bfloat16 where the machine has it, unless they come in double precision."""
+    return torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32 and fast_bfloat16(rgb.device))
+
+
+class UNet(nn.Module):
+    """The trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8: colour at full resolution, geometry at half.
+
+    A base class, laid by a method: checkpoints go by its parameters' names, and resumed optimizers by their order too.
+    """
+
+    up8: nn.Module  # of each subclass, laid next: what follows on the way up at stride 8
+
+    def lay_trunk(self, widths: tuple[int, int, int, int]) -> None:
+        """Make the layers all but `up8`.  widths: channels at strides 4, 8, 16 and 32, multiples of 8."""
+        a, b, c, d = widths
+        self.colour = conv_norm(3, 24, stride=2)
+        self.enter = conv_norm(24 + 7, a, stride=2)
+        self.down4 = ResBlock(a)
+        self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
+        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
+        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
+        self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
+        self.to8 = nn.Conv2d(c, b, 1)
+
+    def encode(self, rgb: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, 3, H, W) in [0, 1], its geometry -> maps of stride 4, on the way down, and 8, on the way up."""
+        x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
+        x4 = self.down4(self.enter(torch.cat([x, shape], dim=1)))
+        x8 = self.down8(x4)
+        x16 = self.down16(x8)
+        x32 = self.down32(x16)
+        y16 = self.up16(x16 + grow(self.to16(x32), x16))
+        return x4, self.up8(x8 + grow(self.to8(y16), x8))

@@ -6,6 +6,7 @@ among theirs, and both kinds agree wherever the particle stands on whole pixels.
 
 from torch import Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.geometry.lookup import nearest_pixel, pick, sample, window
 
 
@@ -14,6 +15,8 @@ class IntegerCut(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
+        if size < 1:
+            raise UserError(f"glimpse.size={size}: must be 1 pixel or more")
         self.size = size
 
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
@@ -31,6 +34,10 @@ class SmoothGlimpse(nn.Module):
 
     def __init__(self, size: int, spacing: float = 1.0) -> None:
         super().__init__()
+        if size < 1:
+            raise UserError(f"glimpse.size={size}: must be 1 pixel or more")
+        if spacing <= 0:
+            raise UserError(f"glimpse.spacing={spacing}: must be above 0")
         self.size = size
         self.spacing = spacing
 

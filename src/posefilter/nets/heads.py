@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.errors import UserError
 from posefilter.geometry.fragments import cut_once, pick_fragment
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
@@ -27,20 +28,6 @@ class ToldPose(NamedTuple):
     fragments: Fragments | None = None  # that the particle's own point may lie in; None where the code tells one point
 
 
-class PoseCode(Protocol):
-    """Turns plain outputs into a pose."""
-
-    width: int  # outputs that make a pose
-
-    def about(self, model: ObjectModel) -> None:
-        """Learn what is to be known of the object."""
-        ...
-
-    def __call__(self, raw: Tensor, point: Tensor) -> ToldPose:
-        """(B, N, width), the particles' own camera points (B, N, 3) [m] -> ToldPose."""
-        ...
-
-
 class Unbounded(nn.Module):
     """The outputs are the displacement, in half frame widths; a particle may leave the frame, and go on."""
 
@@ -50,7 +37,10 @@ class Unbounded(nn.Module):
 
 
 class Bounded(nn.Module):
-    """At most `reach` frame widths along each axis (tanh), and never out of the frame."""
+    """At most `reach` frame widths along each axis (tanh), and never out of the frame.
+
+    The gradient passes an edge as if it were not there: else a particle that was pushed onto one could not be taught back.
+    """
 
     def __init__(self, reach: float = 0.25) -> None:
         super().__init__()
@@ -60,7 +50,8 @@ class Bounded(nn.Module):
         """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
         corner = state.new_tensor([width - 1.0, height - 1.0])
         goal = state + torch.tanh(raw) * self.reach * width
-        return torch.minimum(goal.clamp_min(0.0), corner) - state
+        inside = torch.minimum(goal.clamp_min(0.0), corner)
+        return goal + (inside - goal).detach() - state
 
 
 class Held(nn.Module):
@@ -144,6 +135,8 @@ class OwnPointFragments(_OwnPoint):
 
     def __init__(self, fragments: int = 64) -> None:
         super().__init__()
+        if fragments < 1:
+            raise UserError(f"pose_code.fragments={fragments}: must be 1 or more")
         self.width = 6 + 4 * fragments
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))

@@ -1,6 +1,6 @@
 """The networks that read one particle: multi-layer perceptrons over a latent, or a small convolution net over a patch."""
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -17,16 +17,6 @@ class Said(NamedTuple):
     logit: Tensor  # (B, N) of the likelihood
     motion: Tensor  # (B, N, 2)
     pose: Tensor  # (B, N, D), D = 0 where the network tells no pose
-
-
-class ParticleNet(Protocol):
-    """Reads each particle's patch, whatever else is known of its place, and its memory."""
-
-    memory_width: int
-
-    def __call__(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
-        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said."""
-        ...
 
 
 class ParticleNorm(nn.Module):
@@ -78,6 +68,8 @@ class LatentNet(nn.Module):
         normalisation: str = "batch",
     ) -> None:
         super().__init__()
+        if min(memory_width, width, layers) < 1:
+            raise UserError(f"net: memory_width={memory_width}, width={width} and layers={layers} must be 1 or more")
         self.memory_width = memory_width
         self.latent = mlp(4 * size * size + extra + memory_width, memory_width, width, layers, normalisation)
         self.pose = mlp(memory_width, pose_width, width, layers, normalisation)
@@ -96,7 +88,7 @@ class PatchNet(nn.Module):
     """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, shared by all particles, then offset and likelihood.
 
     With `memory_width` 4 the particle also tells, as its memory, how far the box's four sides lie from it. `hidden` > 0
-    puts one more layer before the outputs, for the context that then joins the patch's features.
+    puts two layers of that width before the outputs, for the context that then joins the patch's features.
     """
 
     def __init__(
@@ -112,6 +104,8 @@ class PatchNet(nn.Module):
         super().__init__()
         if pose_width:
             raise UserError("net=patch tells no pose: choose pose_code=none, or net=latent")
+        if width < 1 or min(hidden, memory_width) < 0:
+            raise UserError(f"net: width={width} must be 1 or more; hidden={hidden}, memory_width={memory_width} 0 or more")
         self.memory_width = memory_width
         blocks: list[nn.Module] = []
         for inputs in (4, width, width):

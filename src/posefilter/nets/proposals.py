@@ -5,15 +5,15 @@ from torch import Tensor, nn
 
 from posefilter.geometry.fragments import cut_once
 from posefilter.nets.coordinates import Coordinates
-from posefilter.nets.encoding import geometry, grow
-from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
+from posefilter.nets.encoding import UNet, geometry, in_bfloat16
+from posefilter.nets.layers import ResBlock
 
 
-class ObjectCoordinateNet(nn.Module):
+class ObjectCoordinateNet(UNet):
     """A U-Net with residual blocks: colour at full resolution, geometry (normals, depth, rays) at half of it.
 
     widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told apart by; features: of
-    each cell, for the likelihood's use. Sides must be multiples of 8; other strides are met by interpolation.
+    each cell, for the likelihood's use.
     """
 
     centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's centre
@@ -26,29 +26,18 @@ class ObjectCoordinateNet(nn.Module):
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
-        a, b, c, d = widths
-        self.colour = conv_norm(3, 24, stride=2)
-        self.enter = conv_norm(24 + 7, a, stride=2)
-        self.down4 = ResBlock(a)
-        self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
-        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
-        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
-        self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
-        self.to8, self.up8 = nn.Conv2d(c, b, 1), nn.Sequential(ResBlock(b), ResBlock(b))
+        self.lay_trunk(widths)
+        b = widths[1]
+        self.up8 = nn.Sequential(ResBlock(b), ResBlock(b))
         self.parts = [1, fragments, 3 * fragments, features]
         self.out = nn.Conv2d(b, 1 + 4 * fragments + features, 1)
         nn.init.normal_(self.out.weight, std=0.01)  # at first, every fragment is as likely, and its middle is the place
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
-        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8."""
+        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8, rounded up."""
         shape = geometry(depth, K)
-        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=fast_bfloat16(rgb.device)):
-            x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
-            x8 = self.down8(self.down4(self.enter(torch.cat([x, shape], dim=1))))
-            x16 = self.down16(x8)
-            x32 = self.down32(x16)
-            y16 = self.up16(x16 + grow(self.to16(x32), x16))
-            y = self.out(self.up8(x8 + grow(self.to8(y16), x8))).float()
+        with in_bfloat16(rgb):
+            y = self.out(self.encode(rgb, shape)[1]).float()
         logit, share, offset, features = y.permute(0, 2, 3, 1).split(self.parts, dim=-1)
         place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
         centers = self.centers.expand(len(y), -1, -1)

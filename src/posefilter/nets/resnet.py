@@ -75,9 +75,9 @@ class ResNet(nn.Module):
         return self
 
     def forward(self, rgb: Tensor, geometry: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) in [0, 1], (B, 7, H // 2, W // 2) -> maps of strides 4, 8, 16, 32."""
+        """(B, 3, H, W) in [0, 1], (B, 7, H / 2, W / 2), rounded up -> maps of strides 4, 8, 16, 32."""
         x = self.conv1((rgb - self.mean) / self.std)
-        x = torch.relu(self.bn1(x + self.geometry(geometry)[..., : x.shape[-2], : x.shape[-1]]))
+        x = torch.relu(self.bn1(x + self.geometry(geometry)))
         x = torch.max_pool2d(x, 3, stride=2, padding=1)
         maps = []
         for i in range(1, 5):

@@ -5,7 +5,7 @@ from torch import Generator, Tensor
 
 from posefilter.geometry.camera import back_project, pixel_grid
 from posefilter.geometry.votes import draw_votes
-from posefilter.nets.coordinates import STRIDE, Cells, Coordinates
+from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, whole_cells
 
 
 def measure_cells(depth: Tensor, K: Tensor) -> Cells:
@@ -14,9 +14,10 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
     The median of the four central pixels' known depths would mix surfaces at edges; the largest-depth-first pick of one
     pixel does not, so a cell takes the known central pixel nearest to its centre.
     """
+    depth = whole_cells(depth)
     B, _, H, W = depth.shape
     h, w = H // STRIDE, W // STRIDE
-    blocks = depth[:, 0, : h * STRIDE, : w * STRIDE].unflatten(1, (h, STRIDE)).unflatten(3, (w, STRIDE))
+    blocks = depth[:, 0].unflatten(1, (h, STRIDE)).unflatten(3, (w, STRIDE))
     center = STRIDE // 2
     choices = [(center - 1, center - 1), (center, center), (center - 1, center), (center, center - 1)]
     z = torch.zeros(B, h, w, dtype=depth.dtype, device=depth.device)

@@ -26,6 +26,8 @@ from posefilter.run.results import record, show, write_json
 from posefilter.run.resume import last_checkpoint
 from posefilter.run.voice import PLAIN, say, typed
 
+log = logging.getLogger(__name__)
+
 
 def train(job: Job) -> float:
     """Train and test; write metrics.json into the job's folder.  Returns the score that sweeps maximise."""
@@ -98,6 +100,10 @@ def build_trainer(job: Job) -> Trainer:
     quiet()
     cfg = job.cfg.copy()
     cfg.folder = str(job.folder)
+    steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
+    if isinstance(interval, int) and 0 < steps < interval:  # else it would never be validated, and have no best checkpoint
+        log.info("trainer.val_check_interval=%d is more than max_steps=%d: validated at the end", interval, steps)
+        cfg.trainer.val_check_interval = steps
     callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
     for story in callbacks:
         if isinstance(story, Story):

@@ -1,0 +1,47 @@
+"""Choices that fit one by one, and not together: each check raises a UserError that says what to choose instead."""
+
+from typing import TYPE_CHECKING
+
+from posefilter.errors import UserError
+from posefilter.filters.agreement import Agreement
+from posefilter.losses.motion import Sides
+from posefilter.models.box import VotedBox
+from posefilter.nets.mlp import LatentNet
+
+if TYPE_CHECKING:
+    from posefilter.models.base import PoseEstimator
+    from posefilter.models.image_space import ImageSpace
+
+
+def check_estimate(method: "PoseEstimator") -> None:
+    """Raise UserError unless its particles tell, by their own points, what the estimate asks them for."""
+    kind, filters = type(method), (method.filter, method.train_filter)
+    if any(isinstance(f.estimate, Agreement) for f in filters) and not (kind.tells_pose and hasattr(kind, "own_points")):
+        raise UserError(
+            f"estimate=agreement: no particle of {kind.__name__} tells which point of the object its own pixel shows; "
+            "choose estimate=best"
+        )
+
+
+def check_votes(method: "ImageSpace") -> None:
+    """Raise UserError unless the memory that is read, or taught, as the box's four sides is nothing else."""
+    taught = any(isinstance(lesson.loss, Sides) for lesson in method.lessons.values())
+    if not (taught or isinstance(method.bounds, VotedBox)):
+        return
+    if isinstance(method.net, LatentNet):
+        raise UserError(
+            "bounds=votes: the box's sides would take the place of all that the net remembers from step to step; "
+            "choose bounds=pose or bounds=spread"
+        )
+    if method.memory_width != 4:
+        raise UserError(f"net.memory_width={method.memory_width}: bounds=votes needs 4, one for each of the box's sides")
+
+
+def check_training_clouds(method: "ImageSpace") -> None:
+    """Raise UserError unless all clouds of a training roll-out are of one size: the losses judge them side by side."""
+    rolled, name = method.train_filter, "filter" if method.train_filter is method.filter else "train_filter"
+    if rolled.steps > 1 and rolled.first_particles != rolled.particles:
+        raise UserError(
+            f"{name}.first_particles={rolled.first_particles}: a training needs as many as {name}.particles="
+            f"{rolled.particles}; choose {name}.first_particles=null or train_filter=short (evaluate.py takes any)"
+        )
