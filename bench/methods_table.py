@@ -74,7 +74,8 @@ def told(rest: str) -> str:
     if not rest:
         return ""
     rung = re.search(r"\brung=(\w+)", rest)
-    lines = (RUNGS / f"{rung[1]}.yaml").read_text().splitlines() if rung else []
+    file = RUNGS / f"{rung[1]}.yaml" if rung else None
+    lines = file.read_text().splitlines() if file and file.is_file() else []
     words = lines[1].removeprefix("# ").rstrip(".") if len(lines) > 1 and lines[1].startswith("# ") else ""
     return f"`{rest}`" + (f" {words}" if words else "")
 

@@ -180,3 +180,17 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
     assert [(m.in_features, m.out_features) for m in linear] == [(32 * 81 + 64, 128), (128, 128), (128, 7)]
     plain = net(hidden=0).tell
     assert (plain.in_features, plain.out_features) == (32 * 81 + 64, 3)
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ("model=cnn_patch bounds=pose", ("bounds=pose", "CnnPatch", "bounds=votes")),
+        ("model=patch_pf pose_code=none pose_lesson=none", ("pose_code=none", "PatchPF", "own_point")),
+    ],
+)
+def test_a_pose_that_nobody_tells_is_not_judged(choice: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    with pytest.raises(UserError) as refusal:
+        build(tmp_path, *choice.split())
+    one_line(refusal, *words)
+    build(tmp_path, *choice.split()[:1])

@@ -98,13 +98,9 @@ class PoseEstimator(LightningModule):
 
     # -- training ------------------------------------------------------------------------------------------------------
 
-    def roll_out(self, batch: Batch, generator: Generator) -> Trace:
-        """Return the trace that the loss judges: a run of the training filter."""
-        return self.train_filter(batch, self, generator)
-
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the losses by name, (B,) each; their sum is minimised."""
-        return {"loss": self.loss(self.roll_out(batch, generator), batch, self.model)}
+        """Return the losses by name, (B,) each; their sum is minimised.  Here: the chosen one, of one roll-out."""
+        return {"loss": self.loss(self.train_filter(batch, self, generator), batch, self.model)}
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means."""

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
 from posefilter.losses.motion import Sides
-from posefilter.models.box import VotedBox
+from posefilter.models.box import PoseBox, VotedBox
+from posefilter.nets.heads import NoPose
 from posefilter.nets.mlp import LatentNet
 
 if TYPE_CHECKING:
@@ -21,6 +22,15 @@ def check_estimate(method: "PoseEstimator") -> None:
             f"estimate=agreement: no particle of {kind.__name__} tells which point of the object its own pixel shows; "
             "choose estimate=best"
         )
+
+
+def check_poses(method: "ImageSpace") -> None:
+    """Raise UserError where a pose is asked of particles that tell none, or none told by a method that is judged by it."""
+    name, untold = type(method).__name__, isinstance(method.pose_code, NoPose)
+    if method.tells_pose and untold:
+        raise UserError(f"pose_code=none: {name} is judged by its poses; choose fragments, own_point or absolute")
+    if untold and isinstance(method.bounds, PoseBox):
+        raise UserError(f"bounds=pose: no particle of {name} tells a pose; choose bounds=votes or bounds=spread")
 
 
 def check_votes(method: "ImageSpace") -> None:

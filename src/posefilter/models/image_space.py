@@ -16,7 +16,7 @@ from posefilter.losses.deviation import OwnPoint
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box import Box
-from posefilter.models.checks import check_training_clouds, check_votes
+from posefilter.models.checks import check_poses, check_training_clouds, check_votes
 from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
@@ -82,6 +82,7 @@ class ImageSpace(PoseEstimator):
         self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
         self.stages = tuple(stages or ())
         check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
+        check_poses(self)
         check_votes(self)
         if isinstance(pose_code, OwnPointFragments) and not any(isinstance(x.loss, OwnPoint) for x in self.lessons.values()):
             raise UserError(
