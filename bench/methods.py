@@ -1,6 +1,7 @@
 """Run every run behind docs/methods.md, the most telling first, and bring its tables up to date after each line of the plan.
 
     python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]   # --only may be repeated
+    python bench/methods.py --meshes DIR --frames DIR    # and the real cracker box: YCB's meshes, YCB-Video's frames
 
 Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines, and is printed as it could
 be typed. Started again, it goes on: train.py skips the jobs that are done and resumes the one that was cut short. What is
@@ -36,8 +37,8 @@ class Line(NamedTuple):
     into: str = ""  # a folder of its own below the table's
 
 
-def plan() -> list[Line]:
-    """Return all lines, in order of what they tell."""
+def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
+    """Return all lines, in order of what they tell; those on the real cracker box where its meshes and frames are given."""
     memorise = f"{FOUR} experiment=memorise"
     lines = [
         Line("memorise", f"{memorise} variant=working seed=0"),
@@ -59,6 +60,14 @@ def plan() -> list[Line]:
         Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
         Line("paper_longer", f"{memorise} variant=paper trainer.max_steps=2000 trainer.val_check_interval=500 seed=0"),
     ]
+    if meshes:
+        lines += [Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")]
+    if meshes and frames:
+        real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
+        runs = {
+            model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0" for model in (*DETECTORS, *WITH_POSE)
+        }
+        lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
     return lines
 
 
@@ -92,12 +101,14 @@ def main() -> int:
     """Run the plan; the status is that of the worst line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("more", nargs="*")
-    parser.add_argument("--only", action="append", choices=sorted({line.table for line in plan()}))
+    parser.add_argument("--only", action="append", choices=sorted({line.table for line in plan("DIR", "DIR")}))
+    parser.add_argument("--meshes", help="a folder of YCB's meshes: learn the real cracker box from renders as well")
+    parser.add_argument("--frames", help="a folder of YCB-Video: and test on its photographs")
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
     parser.add_argument("--root", type=Path, default=Path("outputs/methods"))
     options = parser.parse_args()
     worst = 0
-    for line in plan():
+    for line in plan(options.meshes, options.frames):
         if options.only and line.table not in options.only:
             continue
         words = command(line, options.root, options.more)

@@ -35,7 +35,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
 }
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
-SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.workers")
+SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
 RUNGS = Path(__file__).parents[1] / "conf" / "rung"
 ORDER = ("paper", "s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")  # of rungs, by what their names begin with
 

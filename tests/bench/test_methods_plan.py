@@ -22,7 +22,9 @@ def jobs(words: str) -> list[tuple[str, ...]]:
     return list(itertools.product(*([f"{key}={value}" for value in values.split(",")] for key, values in pairs)))
 
 
-@pytest.mark.parametrize("line", [line for line in methods.plan() if line.of is None], ids=lambda line: line.words)
+@pytest.mark.parametrize(
+    "line", [line for line in methods.plan("DIR", "DIR") if line.of is None], ids=lambda line: line.words
+)
 def test_every_line_composes(line, tmp_path: Path) -> None:
     for overrides in (jobs(line.words)[0], jobs(line.words)[-1]):
         job = compose_job("train", HOME / "conf", list(overrides), tmp_path)
@@ -31,7 +33,7 @@ def test_every_line_composes(line, tmp_path: Path) -> None:
 
 def test_every_table_of_the_plan_has_its_place_in_the_docs() -> None:
     page = (HOME / "docs" / "methods.md").read_text()
-    for line in methods.plan():
+    for line in methods.plan("DIR", "DIR"):
         assert f"<!-- table: {line.table} -->" in page
 
 
