@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
-from posefilter.report.sweeps import number
+from posefilter.report.sweeps import declared, key_of, number
 from posefilter.run.voice import PLAIN, ended, typed
 
 COLUMNS = {
@@ -81,36 +81,46 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     axes = [key for key in typed if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
     for row, pairs in zip(rows, said, strict=True):
         row.update({key: number(pairs.get(key, "")) for key in axes})
-    rows.sort(key=lambda row: [(isinstance(row[key], str), row[key]) for key in axes])
+    ranks = {axis: key_of(declared(folder).get(axis, [])) for axis in axes}  # a ladder has an order
+    rows.sort(key=lambda row: [ranks[axis](row[axis]) for axis in axes])
     return rows, axes
 
 
 def draw(rows: list[Row], axes: list[str]) -> Figure:
-    """Draw quality and cost over each swept setting: a dot a job, a line through the means."""
+    """Draw quality and cost over each swept setting, a dot a job: means as a line over numbers, as bars at words."""
     shown = [
         name
         for name in ("add_auc", "iou", "particles_on_object", "seconds_per_image")
         if any(r[name] is not None for r in rows)
     ]
     axes = [key for key in axes if key != "seed"] or axes or ["folder"]
-    figure = Figure(figsize=(4.2 * len(shown), 3.4 * len(axes)), layout="constrained")
+    values = {key: list(dict.fromkeys(row[key] for row in rows)) for key in axes}
+    words = {key for key in axes if any(isinstance(value, str) for value in values[key])}
+    heights = [max(3.4, 1.2 + 0.22 * len(values[key])) if key in words else 3.4 for key in axes]
+    figure = Figure(figsize=(4.2 * len(shown), sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(axes), len(shown), squeeze=False)
+    panels = figure.subplots(len(axes), len(shown), squeeze=False, sharey=False, height_ratios=heights)
     for line, key in zip(panels, axes, strict=True):
-        values = list(dict.fromkeys(row[key] for row in rows))
-        numeric = all(isinstance(value, int | float) for value in values)
-        places = dict(zip(values, values if numeric else range(len(values)), strict=True))
         for panel, name in zip(line, shown, strict=True):
-            dots = [(places[row[key]], row[name]) for row in rows if row[name] is not None]
-            means = {x: [y for at, y in dots if at == x] for x in sorted({x for x, _ in dots})}
-            panel.plot(list(means), [sum(ys) / len(ys) for ys in means.values()], "-", color="tab:blue", label="mean")
-            panel.plot(*zip(*dots, strict=True), "o", color="tab:blue", alpha=0.6, label="run")
-            panel.set(xlabel=key, ylabel=_TITLES.get(name, name.replace("_", " ")))
+            dots = [(row[key], row[name]) for row in rows if row[name] is not None]
+            means = {at: [y for x, y in dots if x == at] for at in values[key] if any(x == at for x, _ in dots)}
+            middles = [sum(ys) / len(ys) for ys in means.values()]
+            title = _TITLES.get(name, name.replace("_", " "))
             panel.grid(alpha=0.3)
-            if numeric and min(values) > 0 and max(values) / min(values) >= 10:
+            if key in words:  # from the top, as they were typed
+                places = {value: place for place, value in enumerate(values[key])}
+                panel.barh([places[at] for at in means], middles, height=0.7, color="tab:blue", alpha=0.25, label="mean")
+                panel.plot([y for _, y in dots], [places[x] for x, _ in dots], "o", color="tab:blue", alpha=0.6, label="run")
+                told = [str(value)[:32] for value in values[key]] if panel is line[0] else ["" for _ in values[key]]
+                panel.set_yticks(list(places.values()), told)
+                panel.set(xlabel=title, ylim=(len(places) - 0.5, -0.5))
+                panel.set_ylabel(key if panel is line[0] else "")
+                continue
+            panel.plot(list(means), middles, "-", color="tab:blue", label="mean")
+            panel.plot(*zip(*dots, strict=True), "o", color="tab:blue", alpha=0.6, label="run")
+            panel.set(xlabel=key, ylabel=title)
+            if min(values[key]) > 0 and max(values[key]) / min(values[key]) >= 10:
                 panel.set_xscale("log")
-            if not numeric:
-                panel.set_xticks(list(places.values()), [str(value)[:24] for value in values], rotation=45, ha="right")
     panels[0, 0].legend()
     return figure
 
