@@ -4,9 +4,10 @@ from typing import TYPE_CHECKING
 
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
+from posefilter.losses.deviation import OwnPoint
 from posefilter.losses.motion import Sides
 from posefilter.models.box import PoseBox, VotedBox
-from posefilter.nets.heads import NoPose
+from posefilter.nets.heads import NoPose, OwnPointFragments
 from posefilter.nets.mlp import LatentNet
 
 if TYPE_CHECKING:
@@ -31,6 +32,13 @@ def check_poses(method: "ImageSpace") -> None:
         raise UserError(f"pose_code=none: {name} is judged by its poses; choose fragments, own_point or absolute")
     if untold and isinstance(method.bounds, PoseBox):
         raise UserError(f"bounds=pose: no particle of {name} tells a pose; choose bounds=votes or bounds=spread")
+
+
+def check_fragments(method: "ImageSpace") -> None:
+    """Raise UserError where fragments are told and nothing teaches them."""
+    taught = any(isinstance(lesson.loss, OwnPoint) for lesson in method.lessons.values())
+    if isinstance(method.pose_code, OwnPointFragments) and not taught:
+        raise UserError("pose_code: nothing but pose_lesson=own_point teaches fragments; choose it, or pose_code=own_point")
 
 
 def check_votes(method: "ImageSpace") -> None:

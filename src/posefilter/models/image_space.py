@@ -8,19 +8,17 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
-from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.losses.deviation import OwnPoint
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box import Box
-from posefilter.models.checks import check_poses, check_training_clouds, check_votes
+from posefilter.models.checks import check_fragments, check_poses, check_training_clouds, check_votes
 from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
-from posefilter.nets.heads import OwnPointFragments, fill_depth
+from posefilter.nets.heads import fill_depth
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 
@@ -84,10 +82,7 @@ class ImageSpace(PoseEstimator):
         check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
         check_poses(self)
         check_votes(self)
-        if isinstance(pose_code, OwnPointFragments) and not any(isinstance(x.loss, OwnPoint) for x in self.lessons.values()):
-            raise UserError(
-                "pose_code: nothing but pose_lesson=own_point teaches fragments; choose it, or pose_code=own_point"
-            )
+        check_fragments(self)
         self.relevance_weight, self.place_gradient, self.truncate = relevance, place_gradient, truncate
         if object_model is not None:  # not in the base, where the pose code is not there yet
             self.adopt(object_model)

@@ -81,7 +81,8 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     axes = [key for key in typed if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
     for row, pairs in zip(rows, said, strict=True):
         row.update({key: number(pairs.get(key, "")) for key in axes})
-    ranks = {axis: key_of(declared(folder).get(axis, [])) for axis in axes}  # a ladder has an order
+    asked = declared(folder)
+    ranks = {axis: key_of(asked.get(axis, [])) for axis in axes}  # a ladder has an order
     rows.sort(key=lambda row: [ranks[axis](row[axis]) for axis in axes])
     return rows, axes
 
@@ -99,11 +100,13 @@ def draw(rows: list[Row], axes: list[str]) -> Figure:
     heights = [max(3.4, 1.2 + 0.22 * len(values[key])) if key in words else 3.4 for key in axes]
     figure = Figure(figsize=(4.2 * len(shown), sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(len(axes), len(shown), squeeze=False, sharey=False, height_ratios=heights)
+    panels = figure.subplots(len(axes), len(shown), squeeze=False, height_ratios=heights)
     for line, key in zip(panels, axes, strict=True):
         for panel, name in zip(line, shown, strict=True):
             dots = [(row[key], row[name]) for row in rows if row[name] is not None]
-            means = {at: [y for x, y in dots if x == at] for at in values[key] if any(x == at for x, _ in dots)}
+            there = {x for x, _ in dots}
+            order = [at for at in values[key] if at in there] if key in words else sorted(there)
+            means = {at: [y for x, y in dots if x == at] for at in order}
             middles = [sum(ys) / len(ys) for ys in means.values()]
             title = _TITLES.get(name, name.replace("_", " "))
             panel.grid(alpha=0.3)
@@ -111,10 +114,10 @@ def draw(rows: list[Row], axes: list[str]) -> Figure:
                 places = {value: place for place, value in enumerate(values[key])}
                 panel.barh([places[at] for at in means], middles, height=0.7, color="tab:blue", alpha=0.25, label="mean")
                 panel.plot([y for _, y in dots], [places[x] for x, _ in dots], "o", color="tab:blue", alpha=0.6, label="run")
-                told = [str(value)[:32] for value in values[key]] if panel is line[0] else ["" for _ in values[key]]
-                panel.set_yticks(list(places.values()), told)
-                panel.set(xlabel=title, ylim=(len(places) - 0.5, -0.5))
-                panel.set_ylabel(key if panel is line[0] else "")
+                panel.set_yticks(list(places.values()), [str(value)[:32] for value in places])
+                first = panel is line[0]  # has the words for its line
+                panel.tick_params(labelleft=first)
+                panel.set(xlabel=title, ylabel=key if first else "", ylim=(len(places) - 0.5, -0.5))
                 continue
             panel.plot(list(means), middles, "-", color="tab:blue", label="mean")
             panel.plot(*zip(*dots, strict=True), "o", color="tab:blue", alpha=0.6, label="run")
