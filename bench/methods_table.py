@@ -5,6 +5,7 @@
 FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table, searched for metrics.json. Runs
 that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
 what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
+`<!-- table: NAME (on object %, AUROC) -->` has these figures only. What is the same in every row is left out.
 """
 
 import argparse
@@ -12,7 +13,7 @@ import json
 import re
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,28 +98,43 @@ def cell(runs: list[dict[str, Any]], read: Callable[[dict[str, Any]], Any]) -> s
     return f"{mean:.{digits}f}" + (f" ± {half:.{digits}f}" if len(values) > 1 else "")
 
 
-def table(runs: list[dict[str, Any]]) -> str:
-    """Return a Markdown table, one row a kind of run."""
+def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -> str:
+    """Return a Markdown table, one row a kind of run.  Raises KeyError for a figure that is none of COLUMNS."""
     rows = defaultdict(list)
     for run in runs:
         rows[key_of(run)].append(run)
-    shown = [name for name, read in COLUMNS.items() if any(cell([run], read) != "–" for run in runs)]
+    shown = {name: COLUMNS[name] for name in figures if any(cell([run], COLUMNS[name]) != "–" for run in runs)}
     typed = [set(rest.split()) for _, _, rest in rows]
     common = set.intersection(*typed) if len(rows) > 1 else set()  # is said once, above the table
-    lines = ["| method | variant | changed | seeds | " + " | ".join(shown) + " |", "|---" * (4 + len(shown)) + "|"]
+    columns: dict[str, list[str]] = defaultdict(list)
     for model, variant, rest in sorted(rows, key=place):
         same = rows[model, variant, rest]
-        own = " ".join(part for part in rest.split() if part not in common)
-        seeds = len({str(run.get("seed", run["choices"].get("seed"))) for run in same})
-        figures = [cell(same, COLUMNS[name]) for name in shown]
-        lines.append(" | ".join([f"| {model}", variant, told(own), str(seeds), *figures]) + " |")
-    return "\n".join(lines)
+        columns["method"].append(model)
+        columns["variant"].append(variant)
+        columns["changed"].append(told(" ".join(part for part in rest.split() if part not in common)))
+        columns["seeds"].append(str(len({str(run.get("seed", run["choices"].get("seed"))) for run in same})))
+        for name, read in shown.items():
+            columns[name].append(cell(same, read))
+    for name in ("variant", "changed"):
+        if len(set(columns[name])) == 1:
+            del columns[name]
+    lines = [list(columns), ["---"] * len(columns), *zip(*columns.values(), strict=True)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def insert(page: str, name: str, content: str) -> str:
-    """Return the page with the table called `name` replaced."""
-    pattern = re.compile(rf"(<!-- table: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-    return pattern.sub(lambda m: m[1] + content + "\n" + m[2], page)
+def insert(page: str, name: str, runs: list[dict[str, Any]]) -> str:
+    """Return the page with the table called `name` made anew, of the figures that its mark asks for."""
+
+    def filled(found: re.Match[str]) -> str:
+        figures = [figure.strip() for figure in found["figures"].split(",")] if found["figures"] else tuple(COLUMNS)
+        return f"{found['mark']}\n{table(runs, figures)}\n<!-- end -->"
+
+    return re.sub(mark(name) + r"\n.*?<!-- end -->", filled, page, flags=re.DOTALL)
+
+
+def mark(name: str) -> str:
+    """Return the pattern of what stands before a table."""
+    return rf"(?P<mark><!-- table: {re.escape(name)}(?: \((?P<figures>[^)]*)\))? -->)"
 
 
 def main() -> int:
@@ -131,9 +147,9 @@ def main() -> int:
     found = {folder.name: read_runs([folder]) for folder in sorted(options.folder.glob("*")) if folder.is_dir()}
     found = {name: runs for name, runs in found.items() if runs}
     for name, runs in found.items():
-        missing = "" if f"<!-- table: {name} -->" in page else f" (no such table in {options.into})"
+        missing = "" if re.search(mark(name), page) else f" (no such table in {options.into})"
         print(f"{name}: {len(runs)} runs{missing}")
-        page = insert(page, name, table(runs))
+        page = insert(page, name, runs)
     options.into.write_text(page)
     return 0 if found else 1
 

@@ -1,9 +1,10 @@
 """Make the pictures of README.md and docs/ from real runs: `make pictures`, never by hand.
 
     python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
+                                 [--ladder outputs/methods/ladder/patch_pf]
 
 Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and its particles'
-way there.  Of docs/tour.md's commands, where they have been run: the pictures that they left.
+way there.  Of docs/tour.md's commands, and of a ladder of remedies, where they have been run: the pictures that they left.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from posefilter.pictures.belief import draw_belief
 from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, whole
 from posefilter.pictures.cloud import draw_strip
 from posefilter.pictures.overlay import Shape, axes_legend, overlay
+from posefilter.pictures.sheet import TITLE, lettered
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.predict import as_batch
@@ -45,6 +47,12 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_check": "check/contact_sheet.png",
     "tour_train": "run/figures/validation_overlays.jpg",
     "tour_predict": "prediction/belief.png",
+}
+RUNGS = {  # the rungs of docs/methods.md's ladder that its picture shows, and what to say of each
+    "paper": "The paper's",
+    "c5_lesson": "Told the way, and yet they flee",
+    "c6_place": "No gradient through the place",
+    "c9_context": "And global context",
 }
 BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
 
@@ -64,11 +72,13 @@ def main() -> int:
     parser.add_argument("--scenes", type=Path, help="rendered frames in the FAT format (default: docs/scenes/<object>)")
     parser.add_argument("--meshes", default="builtin", help="to render scenes from, where there are none yet")
     parser.add_argument("--tour", type=Path, default=Path("outputs/tour"), help="where docs/tour.md's commands wrote")
+    parser.add_argument("--ladder", type=Path, default=Path("outputs/methods/ladder/patch_pf"), help="a sweep over rungs")
     parser.add_argument("--out", type=Path, default=HOME / "docs" / "pictures")
     said = parser.parse_args()
     try:
         of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
         of_tour(said.tour, said.out)
+        of_ladder(said.ladder, said.out)
     except UserError as error:
         print(f"make_pictures: {error}", file=sys.stderr)
         return 2
@@ -141,6 +151,19 @@ def of_tour(tour: Path, out: Path) -> None:
         print(f"left as it is: tour_report.jpg ({reason})")
     else:
         write(out / "tour_report.jpg", np.concatenate([screen(page, dark=False), screen(page, dark=True)], axis=1))
+
+
+def of_ladder(ladder: Path, out: Path) -> None:
+    """Write journeys.jpg: where particles go on one image, at the rungs that explain it."""
+    tiles = []
+    for rung, words in RUNGS.items():
+        found = sorted(ladder.glob(f"*rung={rung},*/figures/test_journeys_0.jpg"))
+        if len(found) != 1:
+            print(f"left as it is: journeys.jpg ({len(found)} runs of rung={rung} in {ladder}, not one)")
+            return
+        picture = np.asarray(Image.open(found[0]).convert("RGB"))
+        tiles.append(np.concatenate([lettered(words, TITLE - 4, bold=True), picture]))
+    write(out / "journeys.jpg", grid(tiles, 2))
 
 
 def screen(page: Path, dark: bool) -> np.ndarray:

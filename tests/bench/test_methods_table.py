@@ -4,6 +4,8 @@ import importlib.util
 import json
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[2] / "bench" / "methods_table.py"
 spec = importlib.util.spec_from_file_location("methods_table", SCRIPT)
 assert spec is not None
@@ -25,14 +27,19 @@ def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
     run(tmp_path / "c", 0.2, *both, "seed=0", "variant=paper")
     runs = methods_table.read_runs([tmp_path])
     lines = methods_table.table(runs).splitlines()
-    assert lines[0] == "| method | variant | changed | seeds | on object % | box IoU | ADD AUC |"
-    assert lines[2] == "| patch_pf | paper |  | 1 | 20.0 | 0.50 | 40.0 |"
-    assert lines[3] == "| patch_pf | working |  | 2 | 85.0 ± 5.0 | 0.50 ± 0.00 | 40.0 ± 0.0 |"
+    assert lines[0] == "| method | variant | seeds | on object % | box IoU | ADD AUC |"
+    assert lines[2] == "| patch_pf | paper | 1 | 20.0 | 0.50 | 40.0 |"
+    assert lines[3] == "| patch_pf | working | 2 | 85.0 ± 5.0 | 0.50 ± 0.00 | 40.0 ± 0.0 |"
 
 
-def test_only_the_named_table_is_replaced() -> None:
-    page = "a\n<!-- table: x -->\nold\n<!-- end -->\nb\n<!-- table: y -->\nkept\n<!-- end -->\n"
-    assert methods_table.insert(page, "x", "new") == page.replace("old", "new")
+def test_only_the_named_table_is_replaced_by_the_figures_asked_for(tmp_path: Path) -> None:
+    run(tmp_path / "a", 0.9, "model=patch_pf")
+    runs = methods_table.read_runs([tmp_path])
+    page = "a\n<!-- table: x (ADD AUC, box IoU) -->\nold\n<!-- end -->\nb\n<!-- table: y -->\nkept\n<!-- end -->\n"
+    asked = "| method | seeds | ADD AUC | box IoU |\n| --- | --- | --- | --- |\n| patch_pf | 1 | 40.0 | 0.50 |"
+    assert methods_table.insert(page, "x", runs) == page.replace("old", asked)
+    with pytest.raises(KeyError, match="IOU"):
+        methods_table.insert(page.replace("box IoU", "IOU"), "x", runs)
 
 
 def test_rows_climb_the_ladder_and_count_as_people_do(tmp_path: Path) -> None:
@@ -52,6 +59,6 @@ def test_each_folder_is_a_table(tmp_path: Path, monkeypatch, capsys) -> None:
     page.write_text("<!-- table: memorise -->\nold\n<!-- end -->\n")
     monkeypatch.setattr("sys.argv", ["methods_table", str(tmp_path / "runs"), "--into", str(page)])
     assert methods_table.main() == 0
-    assert "| patch_pf | working |  | 1 | 90.0 |" in page.read_text()
+    assert "| patch_pf | 1 | 90.0 |" in page.read_text()
     assert "old" not in page.read_text()
     assert "other: 1 runs (no such table" in capsys.readouterr().out
