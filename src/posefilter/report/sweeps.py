@@ -12,13 +12,15 @@ from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
 from posefilter.report.signs import flatten
 
 SILENT = ("out", "resume", "console", "threads")
-CSV_NAMES = {
+COLUMNS = {  # of summary.csv, and the figures of metrics.json that they hold
     "add_auc": "add/auc",
     "add_recall_01d": "add/recall_01d",
     "add_median_mm": "add/median_mm",
     "add_s_auc": "add_s/auc",
+    "iou": "iou",
+    "particles_on_object": "particles_on_object",
+    "seconds_per_image": "seconds_per_image",
 }
-CSV_SAME = ("iou", "particles_on_object", "seconds_per_image")
 Value = int | float | str
 
 
@@ -101,13 +103,12 @@ def jobs_of_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    known = {**CSV_NAMES, **{name: name for name in CSV_SAME}}
-    axes = [name for name in (rows[0] if rows else {}) if name not in known and name != "folder"]
+    axes = [name for name in (rows[0] if rows else {}) if name not in COLUMNS and name != "folder"]
     if not rows:
         raise UserError(f"{path}: has no row")
     jobs = []
     for row in rows:
-        figures = {name: number(row[column]) for column, name in known.items() if row.get(column)}
+        figures = {name: number(row[column]) for column, name in COLUMNS.items() if row.get(column)}
         numbers = {name: float(value) for name, value in figures.items() if not isinstance(value, str)}
         jobs.append(Job({axis: number(row[axis]) for axis in axes}, numbers, row.get("folder") or ""))
     return axes, jobs

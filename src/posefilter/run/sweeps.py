@@ -1,7 +1,6 @@
 """What a sweep found, in one place: summary.csv, summary.md and summary.png, brought up to date as each job ends."""
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
-from posefilter.report.sweeps import declared, key_of, number
+from posefilter.report.sweeps import COLUMNS, read_sweep
 from posefilter.run.voice import PLAIN, ended, typed
 
-COLUMNS = {
-    "add_auc": ("add", "auc"),
-    "add_recall_01d": ("add", "recall_01d"),
-    "add_median_mm": ("add", "median_mm"),
-    "add_s_auc": ("add_s", "auc"),
-    "iou": ("iou",),
-    "particles_on_object": ("particles_on_object",),
-    "seconds_per_image": ("seconds_per_image",),
-}
 _TITLES = {"add_auc": "ADD AUC", "iou": "box IoU", "particles_on_object": "particles on the object (share)"}
 Row = dict[str, Any]
 
@@ -48,9 +38,9 @@ class SweepSummary(Callback):
 
 def summarise(folder: Path) -> list[Row]:
     """Write the three files of a sweep's folder; returns its rows, none where no job has ended yet."""
-    rows, axes = read_rows(folder)
-    if not rows:
+    if not any(folder.glob("*/**/metrics.json")):
         return []
+    rows, axes = read_rows(folder)
     names = [*axes, *(name for name in COLUMNS if any(row[name] is not None for row in rows)), "folder"]
     with (folder / "summary.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
@@ -65,26 +55,12 @@ def summarise(folder: Path) -> list[Row]:
 
 def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     """Return a row a job that has ended, and the settings in which the jobs differ."""
-    rows, said = [], []
-    for path in sorted(folder.rglob("metrics.json")):
-        metrics = json.loads(path.read_text())
-        pairs = dict(o.lstrip("+~").split("=", 1) for o in metrics["overrides"] if "=" in o)
-        row: Row = {"folder": str(path.parent.relative_to(folder))}
-        for name, keys in COLUMNS.items():
-            value: Any = metrics
-            for key in keys:
-                value = value.get(key) if isinstance(value, dict) else None
-            row[name] = value
-        rows.append(row)
-        said.append(pairs)
-    typed = dict.fromkeys(key for pairs in said for key in pairs)
-    axes = [key for key in typed if len({pairs.get(key) for pairs in said}) > 1 and key not in ("out", "resume")]
-    for row, pairs in zip(rows, said, strict=True):
-        row.update({key: number(pairs.get(key, "")) for key in axes})
-    asked = declared(folder)
-    ranks = {axis: key_of(asked.get(axis, [])) for axis in axes}  # a ladder has an order
-    rows.sort(key=lambda row: [ranks[axis](row[axis]) for axis in axes])
-    return rows, axes
+    sweep = read_sweep(folder)
+    rows: list[Row] = []
+    for job in sweep.jobs:
+        figures = {name: job.numbers.get(figure) for name, figure in COLUMNS.items()}
+        rows.append({"folder": job.folder, **figures, **job.place})
+    return rows, sweep.axes
 
 
 def draw(rows: list[Row], axes: list[str]) -> Figure:
