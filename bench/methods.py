@@ -21,6 +21,7 @@ HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
+TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,working"  # rungs of more than one seed
 AT_TEST_TIME = {  # tables of evaluations, and what they sweep
     "resampling": "resample=never,systematic,guided",
     "particles": "filter.particles=50,100,1000",
@@ -53,12 +54,16 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
     lines += [Line("noise", noise, f"held_out/model={model},seed=0", model) for model in WITH_POSE]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
+    for models, sweep, rungs in ((WITH_POSE, "ladder", f"{TELLING},pose_c12_loss"), (DETECTORS, "ladder_detect", TELLING)):
+        seeds = f"experiment=memorise sweep={sweep} rung={rungs} seed=1,2"
+        lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
+        long = f"experiment=memorise sweep={sweep} rung=paper trainer.max_steps=2000 trainer.val_check_interval=500 seed=0"
+        lines += [Line("paper_longer", f"model={','.join(models)} {long}", into=sweep)]
     lines += [
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),
         Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
         Line("held_out", f"{FOUR} seed=1,2"),
         Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
-        Line("paper_longer", f"{memorise} variant=paper trainer.max_steps=2000 trainer.val_check_interval=500 seed=0"),
     ]
     if meshes:
         lines += [Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")]
