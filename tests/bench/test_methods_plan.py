@@ -34,7 +34,7 @@ def test_every_line_composes(line, tmp_path: Path) -> None:
 def test_every_table_of_the_plan_has_its_place_in_the_docs() -> None:
     page = (HOME / "docs" / "methods.md").read_text()
     for line in methods.plan("DIR", "DIR"):
-        assert f"<!-- table: {line.table} -->" in page
+        assert f"<!-- table: {line.table} " in page
 
 
 def test_an_evaluation_waits_for_its_checkpoint_and_is_not_done_twice(tmp_path: Path) -> None:
