@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from posefilter.geometry.lookup import box_of, center_of, nearest_true, shrink, touches, true_pixels
+from posefilter.geometry.lookup import box_of, center_of, least, nearest_true, shrink, touches, true_pixels
 
 
 def blobs(seed: int) -> torch.Tensor:
@@ -23,6 +23,12 @@ def test_nearest_true_is_the_nearest_of_all_mask_pixels(seed: int) -> None:
         distance = (places[b][:, None] - every).norm(dim=-1).min(1).values
         torch.testing.assert_close((found[b] - places[b]).norm(dim=-1), distance)
         assert all(mask[b, 0, int(v), int(u)] for u, v in found[b])
+
+
+def test_of_equal_values_the_first_is_the_least() -> None:
+    values = torch.tensor([[[2.0, 1.0, 1.0], [0.0, 0.0, 0.0]], [[3.0, 2.0, -torch.inf], [torch.inf, 5.0, 5.0]]])
+    assert least(values).tolist() == [[1, 0], [2, 1]]
+    assert torch.equal(least(values), values.argmin(-1))
 
 
 def test_an_empty_mask_pulls_nowhere() -> None:

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from posefilter.geometry.lookup import least
 from posefilter.geometry.pose import rotation_of, transform, translation_of
 
 
@@ -32,6 +33,6 @@ def nearest_deviation(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
     guess = transform(poses, points)
     true = transform(truth, points)
     with torch.no_grad():
-        nearest = torch.cdist(guess.flatten(1, 2), true).argmin(-1)
+        nearest = least(torch.cdist(guess.flatten(1, 2), true))
     partner = true.gather(1, nearest[..., None].expand(-1, -1, 3)).unflatten(1, guess.shape[1:3])
     return ((guess - partner).square().sum(-1) + 1e-12).sqrt().mean(-1)

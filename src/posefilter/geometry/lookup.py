@@ -71,7 +71,17 @@ def true_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
     return places, torch.arange(longest, device=mask.device) < counts[:, None]
 
 
-def nearest_true(mask: Tensor, pixels: Tensor, chunk: int = 1 << 18) -> Tensor:
+def least(values: Tensor) -> Tensor:
+    """Return the first index of each row's least value: `argmin(-1)`.  (*, n) -> (*) int64.
+
+    On the processor numpy's, which compares many at once where PyTorch's takes them one by one.
+    """
+    if values.device.type != "cpu":
+        return values.argmin(-1)
+    return torch.from_numpy(values.detach().numpy().argmin(-1))
+
+
+def nearest_true(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Tensor:
     """Return the mask pixel nearest to each place; the place itself where a mask is empty.
 
     (B, 1, H, W) bool, (B, P, 2) [px] -> (B, P, 2) [px], without gradient. A place on the mask finds its own pixel; every
@@ -86,7 +96,7 @@ def nearest_true(mask: Tensor, pixels: Tensor, chunk: int = 1 << 18) -> Tensor:
     square = torch.where(real, rim.square().sum(-1), torch.inf)[:, None]
     parts = pixels.split(max(1, chunk // rim.shape[:2].numel()), dim=1)
     # |x - r|^2 less |x|^2, which is the same for every r
-    best = torch.cat([torch.baddbmm(square, part, rim.transpose(1, 2), alpha=-2).argmin(-1) for part in parts], dim=1)
+    best = torch.cat([least(torch.baddbmm(square, part, rim.transpose(1, 2), alpha=-2)) for part in parts], dim=1)
     found = rim.gather(1, best[..., None].expand(-1, -1, 2))
     own = nearest_pixel(pixels)
     found = torch.where(pick(mask.float(), own) > 0, own.to(found.dtype), found)
