@@ -47,6 +47,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
         Line("memorise", f"{memorise} variant=paper seed=0"),
     ]
+    lines += [Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0")]
     for table, swept in AT_TEST_TIME.items():
         lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
