@@ -6,9 +6,12 @@ FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a fo
 that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
 what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
 `<!-- table: NAME (on object %, AUROC) -->` has these figures only. What is the same in every row is left out.
+Every run by itself, with all its figures, goes to a CSV file beside the page.
 """
 
 import argparse
+import csv
+import io
 import json
 import re
 import sys
@@ -81,16 +84,18 @@ def told(rest: str) -> str:
     return f"`{rest}`" + (f" {words}" if words else "")
 
 
+def figure(run: dict[str, Any], read: Callable[[dict[str, Any]], Any]) -> float | None:
+    """Return a figure of a run; nothing where it has none, or no number."""
+    try:
+        value = read(run)
+    except (KeyError, IndexError, TypeError):
+        return None
+    return float(value) if isinstance(value, int | float) and value == value else None
+
+
 def cell(runs: list[dict[str, Any]], read: Callable[[dict[str, Any]], Any]) -> str:
     """Return `mean ± half range` of a figure over seeds; a dash where no run has it."""
-    values = []
-    for run in runs:
-        try:
-            value = read(run)
-        except (KeyError, IndexError, TypeError):
-            continue
-        if isinstance(value, int | float) and value == value:
-            values.append(float(value))
+    values = [value for run in runs if (value := figure(run, read)) is not None]
     if not values:
         return "–"
     mean, half = sum(values) / len(values), (max(values) - min(values)) / 2
@@ -122,6 +127,20 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
+    """Return all tables' runs as CSV: a row a run, all figures to six digits, empty where a run has none."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    columns = {**COLUMNS, "seed": lambda m: m["seed"], "training steps": lambda m: m["training"]["steps"]}
+    writer.writerow(["table", "method", "variant", "changed", *columns, "device", "torch"])
+    for name, runs in found.items():
+        for run in sorted(runs, key=lambda run: (place(key_of(run)), figure(run, columns["seed"]) or 0)):
+            figures = [figure(run, read) for read in columns.values()]
+            texts = ["" if value is None else f"{value:.6g}" for value in figures]
+            writer.writerow([name, *key_of(run), *texts, run.get("device"), (run.get("versions") or {}).get("torch")])
+    return out.getvalue()
+
+
 def insert(page: str, name: str, runs: list[dict[str, Any]]) -> str:
     """Return the page with the table called `name` made anew, of the figures that its mark asks for."""
 
@@ -151,6 +170,7 @@ def main() -> int:
         print(f"{name}: {len(runs)} runs{missing}")
         page = insert(page, name, runs)
     options.into.write_text(page)
+    options.into.with_suffix(".csv").write_text(sheet(found))
     return 0 if found else 1
 
 

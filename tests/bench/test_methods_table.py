@@ -1,5 +1,6 @@
 """The table of results, from metrics files written by hand."""
 
+import csv
 import importlib.util
 import json
 from pathlib import Path
@@ -61,4 +62,10 @@ def test_each_folder_is_a_table(tmp_path: Path, monkeypatch, capsys) -> None:
     assert methods_table.main() == 0
     assert "| patch_pf | 1 | 90.0 |" in page.read_text()
     assert "old" not in page.read_text()
+    rows = list(csv.DictReader(page.with_suffix(".csv").open()))
+    assert [(row["table"], row["variant"], row["on object %"]) for row in rows] == [
+        ("memorise", "working", "90"),
+        ("other", "paper", "10"),
+    ]
+    assert rows[0]["AUROC"] == "", "a figure that a run has not"
     assert "other: 1 runs (no such table" in capsys.readouterr().out
