@@ -29,8 +29,11 @@ AT_TEST_TIME = {  # tables of evaluations, and what they sweep
 }
 
 
+SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
+
+
 class Line(NamedTuple):
-    """A sweep: the table (and folder) that it belongs to, its words, and the run whose checkpoint it evaluates, if any."""
+    """A sweep: the table (and folder) that it belongs to, its words, and the run or checkpoint that it evaluates, if any."""
 
     table: str
     words: str
@@ -73,6 +76,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         runs = {
             model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0" for model in (*DETECTORS, *WITH_POSE)
         }
+        runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
     return lines
 
@@ -87,18 +91,23 @@ def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
     out = root / line.table / line.into
     if line.of is None:
         return ["train.py", "-m", *line.words.split(), f"out={out}", "console=plain", *more]
-    checkpoint = root / line.of / "checkpoints" / "best.ckpt"
-    quoted = str(checkpoint).replace("=", r"\=").replace(",", r"\,")  # Hydra's grammar
+    quoted = str(evaluated(line.of, root)).replace("=", r"\=").replace(",", r"\,")  # Hydra's grammar
     return ["evaluate.py", "-m", f"checkpoint={quoted}", *line.words.split(), f"out={out}", "console=plain", *more]
+
+
+def evaluated(of: str, root: Path) -> Path:
+    """Return the checkpoint of a run, or the one that is named."""
+    return Path(of) if of.endswith(".ckpt") else root / of / "checkpoints" / "best.ckpt"
 
 
 def waits(line: Line, root: Path) -> bool:
     """Tell whether an evaluation has no checkpoint yet, or all its points were evaluated after that was made."""
     if line.of is None:
         return False
-    if not (root / line.of / "metrics.json").is_file():
+    checkpoint = evaluated(line.of, root)
+    if line.of != str(checkpoint) and not (root / line.of / "metrics.json").is_file():
         return True
-    made = (root / line.of / "checkpoints" / "best.ckpt").stat().st_mtime
+    made = checkpoint.stat().st_mtime
     done = [path for path in (root / line.table / line.into).glob("*/metrics.json") if path.stat().st_mtime > made]
     return len(done) >= math.prod(len(word.split("=", 1)[1].split(",")) for word in line.words.split())
 
