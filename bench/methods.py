@@ -61,7 +61,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     for models, sweep, rungs in ((WITH_POSE, "ladder", f"{TELLING},pose_c12_loss"), (DETECTORS, "ladder_detect", TELLING)):
         seeds = f"experiment=memorise sweep={sweep} rung={rungs} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
-        long = f"experiment=memorise sweep={sweep} rung=paper trainer.max_steps=2000 trainer.val_check_interval=500 seed=0"
+        long = f"experiment=memorise sweep={sweep} rung=paper trainer.max_steps=2000 trainer.val_check_interval=2000 seed=0"
         lines += [Line("paper_longer", f"model={','.join(models)} {long}", into=sweep)]
     lines += [
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),

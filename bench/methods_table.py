@@ -131,7 +131,8 @@ def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
     """Return all tables' runs as CSV: a row a run, all figures to six digits, empty where a run has none."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    columns = {**COLUMNS, "seed": lambda m: m["seed"], "training steps": lambda m: m["training"]["steps"]}
+    training = {"steps": lambda m: m["training"]["steps"], "tested step": lambda m: m["training"]["tested_step"]}
+    columns = {**COLUMNS, "seed": lambda m: m["seed"], **training}
     writer.writerow(["table", "method", "variant", "changed", *columns, "device", "torch"])
     for name, runs in found.items():
         for run in sorted(runs, key=lambda run: (place(key_of(run)), figure(run, columns["seed"]) or 0)):

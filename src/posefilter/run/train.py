@@ -51,8 +51,8 @@ def train(job: Job) -> float:
     trainer.fit(method, datamodule=data, ckpt_path=start, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    training = cost(trainer.global_step, before, *began)
     best = job.folder / "checkpoints" / "best.ckpt"
+    training = cost(trainer.global_step, before, *began) | {"tested_step": int(read_checkpoint(best)["global_step"])}
     results = test(trainer, data, best)
     metrics = record(results, job, data.describe(), best) | {"training": training}
     write_json(job.folder / "metrics.json", metrics)
