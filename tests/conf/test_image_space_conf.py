@@ -120,6 +120,7 @@ def test_the_memorisation_test_shows_the_images_that_it_learned(tmp_path: Path) 
 
 SEVERAL = {  # rungs that are more than one choice, or a setting of one
     "s9_lesson_and_place": {"motion_lesson", "place_gradient"},
+    "box_s10_steps": set(),
     "m7_informed": set(),
     "m8_short": {"train_filter", "initialise"},
     "pose_c11_own_point": {"pose_code", "pose_lesson"},
@@ -140,11 +141,14 @@ def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path
     ignored = ("rung", "variant", "deviation", "sweep")
     for rung in rungs:
         choices = compose_job("train", CONF, [*said, f"rung={rung}"], tmp_path).choices
-        assert choices["budget"] == f"{model}/working", "else a rung is more than its remedy"
+        # a detector's ladder starts from the paper's size, whose long roll-outs are among what fails
+        less = rung.startswith(("m", "box_m", "pose_m"))
+        whole = sweep == "ladder" or less or rung in ("box_c14_size", "working")
+        assert choices["budget"] == f"{model}/{'working' if whole else 'paper'}", "else a rung is more than its remedy"
         if rung.startswith("c") or rung.startswith(("box_c", "pose_c")):
             against, before = before, choices
         else:
-            against = base["working" if "m" in rung.split("_")[0][:1] or "_m" in rung else "paper"]
+            against = base["working" if less else "paper"]
         changed = {k for k in choices if choices[k] != against.get(k) and k not in ignored and not k.startswith("hydra")}
         assert changed == SEVERAL.get(rung, changed), rung
         assert rung == "working" or rung in SEVERAL or len(changed) == 1, (rung, changed)
