@@ -58,7 +58,10 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
     lines += [Line("noise", noise, f"held_out/model={model},seed=0", model) for model in WITH_POSE]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
-    for models, sweep, rungs in ((WITH_POSE, "ladder", f"{TELLING},pose_c12_loss"), (DETECTORS, "ladder_detect", f"{TELLING},box_s10_steps")):
+    for models, sweep, rungs in (
+        (WITH_POSE, "ladder", f"{TELLING},pose_c12_loss"),
+        (DETECTORS, "ladder_detect", f"{TELLING},box_s10_steps"),
+    ):
         seeds = f"experiment=memorise sweep={sweep} rung={rungs} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
         long = f"experiment=memorise sweep={sweep} rung=paper trainer.max_steps=2000 trainer.val_check_interval=2000 seed=0"

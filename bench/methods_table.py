@@ -41,7 +41,18 @@ NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
 RUNGS = Path(__file__).parents[1] / "conf" / "rung"
-ORDER = ("paper", "s", "box_s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")  # of rungs, by what their names begin with
+ORDER = (
+    "paper",
+    "s",
+    "box_s",
+    "c",
+    "box_c",
+    "pose_c",
+    "working",
+    "m",
+    "box_m",
+    "pose_m",
+)  # of rungs, by what their names begin with
 
 
 def read_runs(folders: Iterable[Path]) -> list[dict[str, Any]]:
