@@ -6,11 +6,10 @@ import pytest
 import torch
 from torch import Generator
 
-from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.beliefs import entropy, mass_within, pixels_of_poses, rank_of_truth, spread
+from posefilter.metrics.beliefs import entropy, mass_within, rank_of_truth, spread
 from posefilter.metrics.collect import BeliefQuality
 from posefilter.types import Belief, ObjectModel
 
@@ -94,9 +93,3 @@ def test_the_collected_block() -> None:
     metric.update(belief, truth.roll(1, 0))
     assert metric.compute()["mass_2cm"] == 0
     assert metric.compute()["coverage_90"] == 0
-
-
-def test_poses_project_by_their_centres() -> None:
-    K = intrinsics(100.0, 100.0, 50.0, 40.0)[None]
-    pose = make_pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.95]))[None, None]
-    torch.testing.assert_close(pixels_of_poses(pose, CENTER, K)[0, 0], torch.tensor([60.0, 40.0]))

@@ -187,6 +187,8 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
     [
         ("model=cnn_patch bounds=pose", ("bounds=pose", "CnnPatch", "bounds=votes")),
         ("model=patch_pf pose_code=none pose_lesson=none", ("pose_code=none", "PatchPF", "own_point")),
+        ("model=cnn_patch likelihood_lesson=quality", ("likelihood_lesson=quality", "CnnPatch", "balanced")),
+        ("model=downsized pose_lesson=own_point", ("pose_lesson=own_point", "Downsized", "pose_lesson=none")),
     ],
 )
 def test_a_pose_that_nobody_tells_is_not_judged(choice: str, words: tuple[str, ...], tmp_path: Path) -> None:

@@ -3,14 +3,16 @@
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 sys.path.insert(0, str(Path(__file__).parent))
 from toy import H, W, scenes, square
 
+from posefilter.contracts import Estimate, Initialise, Loss, Resample
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.estimate import Best
@@ -38,25 +40,32 @@ from posefilter.nets.context import ConvEncoder, NoContext
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
 from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointFragments, OwnPointSixD, Unbounded
 from posefilter.nets.mlp import LatentNet, PatchNet
-from posefilter.types import Trace
+from posefilter.types import Batch, Trace
 
 
-def run_filter(particles: int, steps: int, initialise=None, resample=None, estimate=None) -> ParticleFilter:
+def run_filter(
+    particles: int,
+    steps: int,
+    initialise: Initialise | None = None,
+    resample: Resample | None = None,
+    estimate: Estimate | None = None,
+) -> ParticleFilter:
     pieces = (Constant(0.0), Annealed(), resample or Never(), LearnedMotion(), estimate or Best(), NoRefine())
     return ParticleFilter(particles, steps, initialise or UniformPixels(), *pieces)
 
 
-def working(kind: type[ImageSpace], size: int, **changes) -> ImageSpace:
+def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
     detects = not kind.tells_pose
     label = OnObject(size) if detects else Quality(size)
     lessons = {"likelihood": Auxiliary(BalancedBce(label)), "motion": Auxiliary(Lesson(TowardsObject("nearest", 1)), 2.0)}
     lessons["sides" if detects else "own_point"] = Auxiliary(Sides(OnObject()) if detects else OwnPoint(), 2.0)
+    net: partial[nn.Module]
     if detects:
         net = partial(PatchNet, width=8, hidden=64, memory_width=4, normalisation="layer")
     else:
         net = partial(LatentNet, memory_width=16, width=64, layers=3, normalisation="layer")
 
-    parts = {
+    parts: dict[str, Any] = {
         "net": net,
         "glimpse": SmoothGlimpse(size),
         "context": ConvEncoder((16, 24, 32, 32), 32),
@@ -74,9 +83,9 @@ def working(kind: type[ImageSpace], size: int, **changes) -> ImageSpace:
     return kind(**(parts | changes))
 
 
-def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes) -> ImageSpace:
+def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> ImageSpace:
     detects = not kind.tells_pose
-    parts = {
+    parts: dict[str, Any] = {
         "net": PatchNet if detects else LatentNet,
         "glimpse": IntegerCut(size),
         "context": NoContext(),
@@ -129,7 +138,7 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(kind: t
 @pytest.mark.parametrize(
     ("kind", "size", "loss"), [(PixelPF, 1, Add()), (PatchPF, 3, Bce(OnObject(3))), (CnnPatch, 9, Chamfer(9))]
 )
-def test_the_papers_recipe_runs_and_its_loss_falls(kind: type[ImageSpace], size: int, loss) -> None:
+def test_the_papers_recipe_runs_and_its_loss_falls(kind: type[ImageSpace], size: int, loss: Loss) -> None:
     torch.manual_seed(0)
     method = paper(kind, size, loss=loss)
     batch = scenes(4)
@@ -182,7 +191,7 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
     teach(method, 40)
     batch = scenes(4)
 
-    def share(initialise, resample) -> list[float]:
+    def share(initialise: Initialise, resample: Resample) -> list[float]:
         method._reset()
         method.filter = run_filter(64, 3, initialise, resample)
         with torch.no_grad():
@@ -197,23 +206,52 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
         blind.predict_step(batch, 0)
 
 
-def test_boxes_from_a_cloud() -> None:
-    method, batch = working(CnnPatch, 9).eval(), scenes(2)
+def made(method: ImageSpace, batch: Batch, places: list[list[float]], weights: Tensor, boxes: Tensor) -> Trace:
+    """Return a run that ends with particles at these places (N, 2), of weights (B, N), that tell boxes (N, 4) [px]."""
     with torch.no_grad():
         trace: Trace = method.predict_step(batch, 0)
-    state = torch.stack(torch.meshgrid(torch.arange(10.0, 31.0), torch.arange(5.0, 16.0), indexing="xy"), -1).reshape(
-        1, -1, 2
-    )
-    n = state.shape[1]
-    even = torch.full((1, n), -float(torch.tensor(n).log()))
-    told = torch.tensor([20.0, 10.0, 40.0, 30.0])
-    memory = torch.cat([state - told[:2], told[2:] - state], -1) / W
-    cloud, reading = trace.clouds[-1], trace.readings[-1]
-    made = trace._replace(
-        clouds=(cloud._replace(state=state, log_weights=even),), readings=(reading._replace(memory=memory),)
-    )
-    assert SpreadBox(size=3, beyond=0.0)(made, batch, method.model)[0].tolist() == [8.5, 3.5, 31.5, 16.5]
-    torch.testing.assert_close(VotedBox()(made, batch, method.model)[0], told)
+    state = torch.tensor(places).expand(len(weights), -1, -1)
+    memory = torch.cat([state - boxes[:, :2], boxes[:, 2:] - state], -1) / W
+    cloud = trace.clouds[-1]._replace(state=state, log_weights=weights.log())
+    return trace._replace(clouds=(cloud,), readings=(trace.readings[-1]._replace(memory=memory),))
+
+
+def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
+    method, batch = working(CnnPatch, 9).eval(), scenes(2)
+    # by rows, so that neither axis finds them in its order; the second image has the same places, all of one weight
+    places = [[40.0, 18.0], [2.0, 20.0], [20.0, 12.0], [50.0, 2.0], [4.0, 26.0], [30.0, 16.0], [10.0, 6.0]]
+    uneven = torch.tensor([0.03, 0.02, 0.50, 0.04, 0.02, 0.33, 0.06])
+    weights = torch.stack([uneven, torch.full((7,), 1 / 7)])
+    trace = made(method, batch, places, weights, torch.zeros(7, 4))
+
+    def box(beyond: float) -> list[list[float]]:
+        found: list[list[float]] = SpreadBox(size=3, beyond=beyond)(trace, batch, method.model).tolist()
+        return found
+
+    # to the left x = 2 and 4 weigh 0.04 together, and go; to the right 50 weighs 0.04, and with 40 it would be 0.07
+    # above y = 2 weighs 0.04, and with 6 it would be 0.10; below 26 and 20 weigh 0.04, and with 18 it would be 0.07
+    all_of_them = [2 - 1.5, 2 - 1.5, 50 + 1.5, 26 + 1.5]
+    assert box(0.05) == [[10 - 1.5, 6 - 1.5, 40 + 1.5, 18 + 1.5], all_of_them]  # a seventh is more than 0.05
+    assert box(0.0) == [all_of_them, all_of_them]
+    # x: 10 and what is left of it weigh 0.10, 40 and what is right of it 0.07, with 30 it would be 0.40
+    # y: 6 and 2 weigh 0.10, 18 and what is below 0.07, with 16 it would be 0.40; of equals one of seven goes a side
+    assert box(0.2) == [[20 - 1.5, 12 - 1.5, 30 + 1.5, 16 + 1.5], [4 - 1.5, 6 - 1.5, 40 + 1.5, 20 + 1.5]]
+
+
+def test_a_box_that_is_voted_for_ignores_what_the_lesser_weight_says() -> None:
+    method, batch = working(CnnPatch, 9).eval(), scenes(2)
+    places = [[3.0, 40.0], [25.0, 15.0], [50.0, 5.0], [30.0, 20.0], [60.0, 30.0]]
+    right, wrong = torch.tensor([20.0, 10.0, 40.0, 30.0]), torch.tensor([44.0, 2.0, 60.0, 12.0])
+    boxes = torch.stack([wrong, right, wrong, right, wrong])
+    weights = torch.tensor([[0.10, 0.40, 0.15, 0.20, 0.15], [0.2] * 5])  # of 1: the right ones 0.6; then three in five
+    found = VotedBox()(made(method, batch, places, weights, boxes), batch, method.model)
+    torch.testing.assert_close(found, torch.stack([right, wrong]))  # a median, so no mix of the two
+    # each side is decided by itself: here in order of what they vote, weights sum to 0.1, 0.5, 0.65, 0.85, 1
+    several = torch.tensor([[1.0, 9.0, 31.0, 41.0], [2.0, 8.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0],
+                            [4.0, 6.0, 34.0, 44.0], [5.0, 5.0, 35.0, 45.0]])  # fmt: skip
+    found = VotedBox()(made(method, batch, places, weights, several), batch, method.model)
+    # the tops fall, so that their order is the other way round: 0.15, 0.35, 0.5, 0.9, 1
+    torch.testing.assert_close(found, torch.tensor([[2.0, 7.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0]]))
 
 
 def test_stages_change_the_weights_as_training_proceeds() -> None:

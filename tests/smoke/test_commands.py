@@ -51,6 +51,7 @@ def test_a_run_leaves_what_was_promised(trained: Path) -> None:
     assert {"iou", "particles_on_object", "seconds_per_image", "belief", "data", "git", "versions"} <= set(metrics)
     assert "debug=smoke" in metrics["overrides"]
     assert metrics["training"]["steps"] == 8
+    assert 0 < metrics["training"]["tested_step"] <= 8
     assert metrics["training"]["seconds_per_step"] > 0
     assert metrics["training"]["cpu_seconds_per_step"] > 0
 
@@ -185,3 +186,24 @@ def test_plain_is_for_machines(tiny_scenes: Path, tmp_path: Path, capfd: pytest.
     assert lines[-1]["iou"] == read(tmp_path / "run")["iou"]
     assert all(Path(path).exists() for path in lines[-1]["files"].values())
     assert err == ""
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ("initialise=from_depth", "initialise=from_depth.*PatchPF"),
+        ("initialise=from_relevance context=pyramid", "from_relevance.*PatchPF"),
+        ("resample=guided context=none", "resample=guided"),
+        ("refine=rescore", "refine.*PatchPF"),
+    ],
+)
+def test_pieces_that_do_not_fit_are_told_of_before_any_training(choice: str, words: str, tiny_job, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=words):
+        train(tiny_job(tmp_path, "model=patch_pf", *choice.split()))
+    assert not (tmp_path / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("resample", ["transport", "ensemble"])
+def test_particles_are_resampled_by_optimal_transport(resample: str, tiny_job, tmp_path: Path) -> None:
+    train(tiny_job(tmp_path, "model=patch_pf", f"resample={resample}", "trainer.max_steps=2"))
+    assert 0 <= read(tmp_path)["particles_on_object"] <= 1

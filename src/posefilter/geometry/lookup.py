@@ -112,13 +112,3 @@ def center_of(mask: Tensor) -> Tensor:
     v = (weight.sum(2) * torch.arange(H, device=mask.device)).sum(1)
     frame = torch.tensor([(W - 1) / 2, (H - 1) / 2], device=mask.device)
     return torch.where(total[:, None] > 0, torch.stack([u, v], -1) / total[:, None].clamp_min(1), frame)
-
-
-def box_of(mask: Tensor) -> Tensor:
-    """Return the tight boxes (left, top, right, bottom), edges of pixels; zeros if empty.  (B, 1, H, W) -> (B, 4) [px]."""
-    H, W = mask.shape[-2:]
-    columns, rows = mask[:, 0].any(1), mask[:, 0].any(2)
-    first = lambda x: x.float().argmax(1).float()  # noqa: E731
-    left, right = first(columns) - 0.5, W - first(columns.flip(1)) - 0.5
-    top, bottom = first(rows) - 0.5, H - first(rows.flip(1)) - 0.5
-    return torch.stack([left, top, right, bottom], -1) * mask.flatten(1).any(1)[:, None]

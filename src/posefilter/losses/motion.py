@@ -63,7 +63,8 @@ class Chamfer:
 class Lesson:
     """A direct lesson for the motion: each reading's displacement against the one that its label asks for (Huber).
 
-    Each step is judged by itself, from where it stood: no gradient flows into earlier steps through the place.
+    Each step is judged by itself: its label takes the place where it stood as given, and blames no earlier step for it. What
+    was seen there is another matter: with place_gradient=flows it teaches the motion that led there, by this loss as by any.
     """
 
     def __init__(self, label: Label, width: float = 0.05) -> None:

@@ -3,7 +3,6 @@
 import torch
 from torch import Tensor
 
-from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import touches
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
@@ -51,8 +50,3 @@ def rank_of_truth(poses: Tensor, log_weights: Tensor, truth: Tensor, space: Pose
 def on_object(mask: Tensor, pixels: Tensor) -> Tensor:
     """Return the share of the particles whose pixel is on the mask.  (B, 1, H, W) bool, (B, N, 2) [px] -> (B,)."""
     return touches(mask, pixels).to(pixels.dtype).mean(1)
-
-
-def pixels_of_poses(poses: Tensor, center: Tensor, K: Tensor) -> Tensor:
-    """Return where each pose puts the object's centre in the image.  (B, N, 4, 4), (3,) [m], (B, 3, 3) -> (B, N, 2) [px]."""
-    return project(origin_of(poses, center.to(poses)), K)

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
+from posefilter.labels.membership import Quality
 from posefilter.losses.deviation import OwnPoint
 from posefilter.losses.motion import Sides
 from posefilter.models.box import PoseBox, VotedBox
@@ -32,6 +33,11 @@ def check_poses(method: "ImageSpace") -> None:
         raise UserError(f"pose_code=none: {name} is judged by its poses; choose fragments, own_point or absolute")
     if untold and isinstance(method.bounds, PoseBox):
         raise UserError(f"bounds=pose: no particle of {name} tells a pose; choose bounds=votes or bounds=spread")
+    losses = [lesson.loss for lesson in method.lessons.values()]
+    if untold and any(isinstance(getattr(loss, "label", None), Quality) for loss in losses):
+        raise UserError(f"likelihood_lesson=quality: no particle of {name} tells a pose; choose balanced or focal")
+    if untold and any(isinstance(loss, OwnPoint) for loss in losses):
+        raise UserError(f"pose_lesson=own_point: no particle of {name} tells a pose; choose pose_lesson=none")
 
 
 def check_fragments(method: "ImageSpace") -> None:

@@ -11,11 +11,12 @@ import torch
 from lightning import Callback, LightningDataModule, Trainer
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
+from torch.utils.data import default_collate
 
 from posefilter.callbacks.story import Story
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
-from posefilter.models.base import score_of
+from posefilter.models.base import PoseEstimator, score_of
 from posefilter.run.build import instantiate
 from posefilter.run.comparing import HANDS, comparable, differing
 from posefilter.run.console import progress
@@ -44,6 +45,7 @@ def train(job: Job) -> float:
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
     method.adopt(data.object_model(0))
+    rehearse(method, data)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
     start = start_from(job)
     before = int(read_checkpoint(start)["global_step"]) if start else 0
@@ -60,6 +62,18 @@ def train(job: Job) -> float:
     following = [] if job.swept else [typed("report", run=job.folder), typed("evaluate", checkpoint=best), "make board"]
     show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console, "trained", files, following)
     return score_of(metrics)
+
+
+def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:
+    """Run the filter on one image before it is trained, as a validation will.
+
+    Pieces that do not fit each other raise their UserError now, not after the hour that it takes to the first validation.
+    """
+    was_training = method.training
+    with torch.no_grad():
+        batch = default_collate([data.val_dataset[0]])
+        method.eval().box(method.predict_step(batch, 0), batch)
+    method.train(was_training)
 
 
 def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | None]:
