@@ -8,8 +8,9 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_image_space import paper
-from toy import scenes
+from toy import scenes, square
 
+from posefilter.geometry.pose import invert, transform
 from posefilter.labels.membership import OnObject
 from posefilter.losses.likelihood import Bce
 from posefilter.models.cnn_patch import CnnPatch
@@ -17,6 +18,7 @@ from posefilter.models.image_space import ImageSpace
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
 from posefilter.nets.glimpse import SmoothGlimpse
+from posefilter.nets.heads import OwnPointSixD
 
 
 def taught(method: ImageSpace) -> ImageSpace:
@@ -85,3 +87,17 @@ def test_what_no_loss_reads_is_asked_for_no_gradient() -> None:
     """Not even for one of zeros: where a place reaches no loss, most of the backward pass would be spent on it."""
     method = taught(paper(PixelPF, 1))
     assert all(p.grad is None for part in ("likelihood", "motion") for p in getattr(method.net, part).parameters())
+
+
+def test_where_the_own_point_belongs_says_nothing_of_the_rotation() -> None:
+    """The position is what remains of the measured point: turned anyhow, the pose puts it where it was told to belong."""
+    code = OwnPointSixD()
+    code.about(square())
+    g = torch.Generator().manual_seed(0)
+    raw = torch.randn(2, 5, 9, generator=g, dtype=torch.float64).requires_grad_()
+    point = torch.randn(2, 5, 3, generator=g, dtype=torch.float64) + torch.tensor([0.0, 0.0, 5.0])
+    told = transform(invert(code.double()(raw, point).pose), point[:, :, None])
+    told.square().sum().backward()
+    assert raw.grad is not None
+    assert raw.grad[..., 6:].abs().min() > 1e-6, "what was told is taught"
+    assert raw.grad[..., :6].abs().max() < 1e-12
