@@ -70,6 +70,8 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),
         Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
         Line("held_out", f"{FOUR} seed=1,2"),
+        Line("held_out_less", "model=patch_pf rung=m9_context,pose_m17_fragments,m11_muon,m5_lesson seed=0"),
+        Line("held_out_less", "resample=never", "held_out/model=patch_pf,seed=0", "patch_pf"),
         Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
     ]
     if meshes:
