@@ -48,10 +48,15 @@ def shrink(mask: Tensor, margin_px: int) -> Tensor:
     """Erode masks by a square of `margin_px`; a mask that would vanish stays as it is.  (B, 1, H, W) bool -> the same."""
     if margin_px == 0:
         return mask
-    side = 2 * margin_px + 1
     outside = F.pad((~mask).float(), (margin_px,) * 4, value=1.0)
-    inner = F.max_pool2d(F.max_pool2d(outside, (side, 1), stride=1), (1, side), stride=1) == 0  # an axis at a time: cheaper
+    inner = ~_any_within(_any_within(outside, 2 * margin_px + 1).mT, 2 * margin_px + 1).mT  # an axis at a time
     return torch.where(inner.flatten(1).any(1)[:, None, None, None], inner, mask)
+
+
+def _any_within(values: Tensor, side: int) -> Tensor:
+    """Tell whether any of `side` neighbours along the last axis is above 0, by running sums.  (*, n) -> (*, n - side + 1)."""
+    sums = F.pad(values.float().cumsum(-1), (1, 0))
+    return sums[..., side:] > sums[..., :-side]
 
 
 def true_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
