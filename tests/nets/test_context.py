@@ -102,3 +102,34 @@ def test_resnet_weight_mistakes_end_in_one_line(tmp_path: Path) -> None:
         ResNet("resnet18", weights=str(tmp_path / "34.pth"))
     with pytest.raises(UserError, match="resnet18 or resnet34"):
         ResNet("resnet50")
+
+
+@pytest.mark.parametrize("size", [(240, 320), (241, 321)])
+def test_wide_images_are_averaged_down_for_context_and_looked_up_where_they_are(size: tuple[int, int]) -> None:
+    g = torch.Generator().manual_seed(3)
+    rgb, depth = torch.rand(1, 3, *size, generator=g), 0.5 + torch.rand(1, 1, *size, generator=g)
+    depth[:, :, 40:50, 60:90] = 0  # a hole wider than a cell, and one narrower
+    depth[:, :, 100, 201] = 0
+    wide = intrinsics(300.0, 300.0, 159.5, 119.5)[None]
+    torch.manual_seed(0)
+    encoder = ConvEncoder(most_px=192).eval()
+    small_rgb = torch.nn.functional.avg_pool2d(rgb, 2)
+    known = torch.nn.functional.avg_pool2d((depth > 0).float(), 2)
+    small_depth = torch.nn.functional.avg_pool2d(depth, 2) / known.clamp_min(1e-6)
+    pixels = torch.tensor([[[0.0, 0.0], [100.5, 60.5], [313.0, 7.0]]])
+    with torch.no_grad():
+        seen = encoder(rgb, depth, wide)
+        small = encoder(small_rgb, small_depth, intrinsics(150.0, 150.0, 79.5, 59.5)[None])  # of 160, which is not too wide
+        assert (seen.strides, small.strides) == ((8,), (4,))
+        found = encoder.look(seen, pixels), encoder.look(small, (pixels - 0.5) / 2)
+    torch.testing.assert_close(*found, atol=1e-5, rtol=1e-5)
+
+
+def test_images_that_are_not_too_wide_are_looked_at_as_they_are() -> None:
+    torch.manual_seed(0)
+    bounded, free = ConvEncoder(most_px=160).eval(), ConvEncoder().eval()
+    free.load_state_dict(bounded.state_dict())
+    with torch.no_grad():
+        assert torch.equal(bounded(*scene(), K).levels[0], free(*scene(), K).levels[0])
+    with pytest.raises(UserError, match=r"context.most_px=16"):
+        ConvEncoder(most_px=16)
