@@ -59,7 +59,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
     label = OnObject(size) if detects else Quality(size)
     lessons = {"likelihood": Auxiliary(BalancedBce(label)), "motion": Auxiliary(Lesson(TowardsObject("nearest", 1)), 2.0)}
     lessons["sides" if detects else "own_point"] = Auxiliary(Sides(OnObject()) if detects else OwnPoint(), 2.0)
-    net: partial[nn.Module]
+    net: Any
     if detects:
         net = partial(PatchNet, width=8, hidden=64, memory_width=4, normalisation="layer")
     else:
@@ -218,7 +218,7 @@ def made(method: ImageSpace, batch: Batch, places: list[list[float]], weights: T
 
 def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
     method, batch = working(CnnPatch, 9).eval(), scenes(2)
-    # by rows, so that neither axis finds them in its order; the second image has the same places, all of one weight
+    # in the order of neither axis; the second image has the same places, all of one weight
     places = [[40.0, 18.0], [2.0, 20.0], [20.0, 12.0], [50.0, 2.0], [4.0, 26.0], [30.0, 16.0], [10.0, 6.0]]
     uneven = torch.tensor([0.03, 0.02, 0.50, 0.04, 0.02, 0.33, 0.06])
     weights = torch.stack([uneven, torch.full((7,), 1 / 7)])
@@ -228,13 +228,15 @@ def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
         found: list[list[float]] = SpreadBox(size=3, beyond=beyond)(trace, batch, method.model).tolist()
         return found
 
-    # to the left x = 2 and 4 weigh 0.04 together, and go; to the right 50 weighs 0.04, and with 40 it would be 0.07
-    # above y = 2 weighs 0.04, and with 6 it would be 0.10; below 26 and 20 weigh 0.04, and with 18 it would be 0.07
     all_of_them = [2 - 1.5, 2 - 1.5, 50 + 1.5, 26 + 1.5]
-    assert box(0.05) == [[10 - 1.5, 6 - 1.5, 40 + 1.5, 18 + 1.5], all_of_them]  # a seventh is more than 0.05
     assert box(0.0) == [all_of_them, all_of_them]
-    # x: 10 and what is left of it weigh 0.10, 40 and what is right of it 0.07, with 30 it would be 0.40
-    # y: 6 and 2 weigh 0.10, 18 and what is below 0.07, with 16 it would be 0.40; of equals one of seven goes a side
+    # left: x = 2 and 4 weigh 0.04, with 10 it would be 0.10; right: 50 weighs 0.04, with 40 it would be 0.07
+    # top: y = 2 weighs 0.04, with 6 it would be 0.10; bottom: 26 and 20 weigh 0.04, with 18 it would be 0.07
+    # where all weigh a seventh, none is as light as 0.05
+    assert box(0.05) == [[10 - 1.5, 6 - 1.5, 40 + 1.5, 18 + 1.5], all_of_them]
+    # left: 2, 4 and 10 weigh 0.10, with 20 it would be 0.60; right: 50 and 40 weigh 0.07, with 30 it would be 0.40
+    # top: 2 and 6 weigh 0.10, with 12 it would be 0.60; bottom: 26, 20 and 18 weigh 0.07, with 16 it would be 0.40
+    # where all weigh a seventh, one goes on each side
     assert box(0.2) == [[20 - 1.5, 12 - 1.5, 30 + 1.5, 16 + 1.5], [4 - 1.5, 6 - 1.5, 40 + 1.5, 20 + 1.5]]
 
 
@@ -243,15 +245,14 @@ def test_a_box_that_is_voted_for_ignores_what_the_lesser_weight_says() -> None:
     places = [[3.0, 40.0], [25.0, 15.0], [50.0, 5.0], [30.0, 20.0], [60.0, 30.0]]
     right, wrong = torch.tensor([20.0, 10.0, 40.0, 30.0]), torch.tensor([44.0, 2.0, 60.0, 12.0])
     boxes = torch.stack([wrong, right, wrong, right, wrong])
-    weights = torch.tensor([[0.10, 0.40, 0.15, 0.20, 0.15], [0.2] * 5])  # of 1: the right ones 0.6; then three in five
+    weights = torch.tensor([[0.10, 0.42, 0.13, 0.20, 0.15], [0.2] * 5])  # the two right ones: 0.62, and 0.4
     found = VotedBox()(made(method, batch, places, weights, boxes), batch, method.model)
     torch.testing.assert_close(found, torch.stack([right, wrong]))  # a median, so no mix of the two
-    # each side is decided by itself: here in order of what they vote, weights sum to 0.1, 0.5, 0.65, 0.85, 1
-    several = torch.tensor([[1.0, 9.0, 31.0, 41.0], [2.0, 8.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0],
-                            [4.0, 6.0, 34.0, 44.0], [5.0, 5.0, 35.0, 45.0]])  # fmt: skip
-    found = VotedBox()(made(method, batch, places, weights, several), batch, method.model)
-    # the tops fall, so that their order is the other way round: 0.15, 0.35, 0.5, 0.9, 1
-    torch.testing.assert_close(found, torch.tensor([[2.0, 7.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0]]))
+    # where all differ, each side has its own order: from particle 1 on the weights add up to 0.10, 0.52, ...; the tops
+    # fall, and from particle 5 back they add up to 0.15, 0.35, 0.48, 0.90: both times it is particle 2 that passes a half
+    differ = torch.stack([torch.arange(1.0, 6), torch.arange(9.0, 4, -1), torch.arange(31.0, 36), torch.arange(41.0, 46)], 1)
+    found = VotedBox()(made(method, batch, places, weights, differ), batch, method.model)
+    torch.testing.assert_close(found, torch.tensor([[2.0, 8.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0]]))
 
 
 def test_stages_change_the_weights_as_training_proceeds() -> None:

@@ -54,7 +54,7 @@ def shrink(mask: Tensor, margin_px: int) -> Tensor:
 
 
 def _any_within(values: Tensor, side: int) -> Tensor:
-    """Tell whether any of `side` neighbours along the last axis is above 0, by running sums.  (*, n) -> (*, n - side + 1)."""
+    """Tell whether any of `side` neighbours along the last axis is above 0: running sums.  (*, n) -> (*, n - side + 1)."""
     sums = F.pad(values.float().cumsum(-1), (1, 0))
     return sums[..., side:] > sums[..., :-side]
 
