@@ -22,14 +22,12 @@ FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
 TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,working"  # rungs of more than one seed
+SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 AT_TEST_TIME = {  # tables of evaluations, and what they sweep
     "resampling": "resample=never,systematic,guided",
     "particles": "filter.particles=50,100,1000",
     "iterations": "filter.steps=10,30,100",
 }
-
-
-SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 
 
 class Line(NamedTuple):
@@ -49,8 +47,8 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
         Line("memorise", f"{memorise} variant=paper seed=0"),
+        Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0"),
     ]
-    lines += [Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0")]
     for table, swept in AT_TEST_TIME.items():
         lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]

@@ -41,18 +41,8 @@ NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
 RUNGS = Path(__file__).parents[1] / "conf" / "rung"
-ORDER = (
-    "paper",
-    "s",
-    "box_s",
-    "c",
-    "box_c",
-    "pose_c",
-    "working",
-    "m",
-    "box_m",
-    "pose_m",
-)  # of rungs, by what their names begin with
+# of rungs, by what their names begin with
+ORDER = ("paper", "s", "box_s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")
 
 
 def read_runs(folders: Iterable[Path]) -> list[dict[str, Any]]:
@@ -131,9 +121,10 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
         columns["seeds"].append(str(len({str(run.get("seed", run["choices"].get("seed"))) for run in same})))
         for name, read in shown.items():
             columns[name].append(cell(same, read))
-    for name in ("variant", "changed"):
-        if len(set(columns[name])) == 1:
-            del columns[name]
+    if len(set(columns["variant"])) == 1:
+        del columns["variant"]
+    if not any(columns["changed"]):
+        del columns["changed"]
     lines = [list(columns), ["---"] * len(columns), *zip(*columns.values(), strict=True)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

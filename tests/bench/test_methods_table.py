@@ -33,6 +33,15 @@ def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
     assert lines[3] == "| patch_pf | working | 2 | 85.0 ± 5.0 | 0.50 ± 0.00 | 40.0 ± 0.0 |"
 
 
+def test_what_a_single_row_changed_is_told(tmp_path: Path) -> None:
+    run(tmp_path / "a", 0.9, "model=patch_pf", "variant=working", "resample=never")
+    assert (
+        methods_table.table(methods_table.read_runs([tmp_path]))
+        .splitlines()[2]
+        .startswith("| patch_pf | `resample=never` |")
+    )
+
+
 def test_only_the_named_table_is_replaced_by_the_figures_asked_for(tmp_path: Path) -> None:
     run(tmp_path / "a", 0.9, "model=patch_pf")
     runs = methods_table.read_runs([tmp_path])

@@ -189,7 +189,7 @@ def test_a_training_walks_through_its_stages() -> None:
     watch = Watch()
     trainer = Trainer(max_steps=5, accumulate_grad_batches=2, callbacks=[watch], accelerator="cpu", logger=False,
                       enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
-    data: Any = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)  # type: ignore[arg-type]
+    data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
     trainer.fit(tiny(CnnPatch, stages=stages_of("three_motion")), data)
     first, second = {"loss", "motion"}, {"likelihood", "sides", "relevance"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]

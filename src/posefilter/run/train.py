@@ -4,7 +4,6 @@ import json
 import logging
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -54,8 +53,9 @@ def train(job: Job) -> float:
     if trainer.interrupted:
         raise KeyboardInterrupt
     best = job.folder / "checkpoints" / "best.ckpt"
-    training = cost(trainer.global_step, before, *began) | {"tested_step": int(read_checkpoint(best)["global_step"])}
-    results = test(trainer, data, best)
+    kept = read_checkpoint(best)
+    training = cost(trainer.global_step, before, *began) | {"tested_step": int(kept["global_step"])}
+    results = test(trainer, data, kept)
     metrics = record(results, job, data.describe(), best) | {"training": training}
     write_json(job.folder / "metrics.json", metrics)
     files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
@@ -140,9 +140,9 @@ def make_trainer(node: DictConfig, callbacks: list[Callback], loggers: list[Logg
     return trainer
 
 
-def test(trainer: Trainer, data: LightningDataModule, checkpoint: Path) -> dict[str, Any]:
+def test(trainer: Trainer, data: LightningDataModule, checkpoint: dict[str, Any]) -> dict[str, Any]:
     """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
-    method = method_of(read_checkpoint(checkpoint))
+    method = method_of(checkpoint)
     trainer.test(method, datamodule=data, verbose=False)
     return method.results()
 
