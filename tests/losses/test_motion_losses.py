@@ -6,7 +6,7 @@ import torch
 from posefilter.errors import UserError
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject
-from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides, overlap
+from posefilter.losses.motion import Chamfer, Lesson, Offset, Sides
 
 W = 20
 
@@ -73,11 +73,6 @@ def test_sides_are_zero_for_the_true_box(batch, model, make_trace) -> None:
     wide = f64([[[1.5, 1.5, 6.5, 2.5], [0.0, 0.0, 0.0, 0.0]]]) / W
     want = 4 / W + 1 - 4 * 4 / (8 * 4)
     assert sides(make_trace(state, memory=wide), batch, small).item() == pytest.approx(want)
-
-
-def test_overlap_of_disjoint_boxes_is_zero() -> None:
-    assert overlap(f64([1, 1, 1, 1]), f64([-2, 1, 4, 1])).item() == 0
-    assert overlap(f64([1, 1, 1, 1]), f64([1, 1, 1, 1])).item() == 1
 
 
 @pytest.mark.parametrize("loss", [Offset(), Chamfer(3), Lesson(TowardsObject())], ids=lambda x: type(x).__name__)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from posefilter.contracts import Label
-from posefilter.geometry.boxes import box_of_pose
+from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.geometry.lookup import nearest_true, true_pixels, window
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -99,15 +99,8 @@ class Sides:
         total = batch.rgb.new_zeros(len(batch.rgb))
         for cloud, reading, inside in zip(trace.clouds, trace.readings, on, strict=True):
             place = cloud.state.detach() / batch.rgb.shape[-1]
-            true = torch.cat([place - box[..., :2], box[..., 2:] - place], dim=-1)
-            guess = reading.memory
-            lost = (guess - true).abs().sum(-1) + 1 - overlap(guess, true)
+            true = box - place.repeat(1, 1, 2)
+            told = torch.cat([-reading.memory[..., :2], reading.memory[..., 2:]], dim=-1)
+            lost = (told - true).abs().sum(-1) + 1 - box_iou(told, true)
             total = total + (lost * inside).sum(1) / inside.sum(1).clamp_min(1)
         return total / len(trace.readings)
-
-
-def overlap(a: Tensor, b: Tensor) -> Tensor:
-    """IoU of two boxes about one point, each as its sides' distances from it.  (*, 4) x 2 -> (*)."""
-    area = lambda x: (x[..., 0] + x[..., 2]).clamp_min(0) * (x[..., 1] + x[..., 3]).clamp_min(0)  # noqa: E731
-    common = area(torch.minimum(a, b))
-    return common / (area(a) + area(b) - common).clamp_min(1e-9)
