@@ -20,14 +20,14 @@ from typing import NamedTuple
 HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
+MODELS = (*DETECTORS, *WITH_POSE)
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
-TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,working"  # rungs of more than one seed
+# rungs of more than one seed; the detectors' paper and working are in the table of memorisation, with all seeds
+TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,pose_c12_loss,working"
+TELLING_BOX = "s2_bounded,s4_lesson,box_s10_steps,c2_glimpse,c3_bounded,c6_place"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
-AT_TEST_TIME = {  # tables of evaluations, and what they sweep
-    "resampling": "resample=never,systematic,guided",
-    "particles": "filter.particles=50,100,1000",
-    "iterations": "filter.steps=10,30,100",
-}
+MEMORISED = "memorise/experiment=memorise,model={},seed=0,variant=working"
+HELD_OUT = "held_out/model={},seed=0"
 
 
 class Line(NamedTuple):
@@ -49,16 +49,17 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("memorise", f"{memorise} variant=paper seed=0"),
         Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0"),
     ]
-    for table, swept in AT_TEST_TIME.items():
-        lines += [ablation(table, swept, model) for model in (*DETECTORS, *WITH_POSE)]
+    lines += [ablation("resampling", "resample=never,systematic,guided", MEMORISED, model) for model in MODELS]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
     lines += [Line("held_out", f"{FOUR},pose_pf seed=0")]  # pose_pf beside them
+    lines += [ablation("particles", "filter.particles=10,20,50,100,300,1000", HELD_OUT, model) for model in MODELS]
+    lines += [ablation("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT, model) for model in MODELS]
     noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
-    lines += [Line("noise", noise, f"held_out/model={model},seed=0", model) for model in WITH_POSE]
+    lines += [ablation("noise", noise, HELD_OUT, model) for model in WITH_POSE]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
     for models, sweep, rungs in (
-        (WITH_POSE, "ladder", f"{TELLING},pose_c12_loss"),
-        (DETECTORS, "ladder_detect", f"{TELLING},box_s10_steps"),
+        (WITH_POSE, "ladder", TELLING),
+        (DETECTORS, "ladder_detect", TELLING_BOX),
     ):
         seeds = f"experiment=memorise sweep={sweep} rung={rungs} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
@@ -69,24 +70,22 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
         Line("held_out", f"{FOUR} seed=1,2"),
         Line("held_out_less", "model=patch_pf rung=m9_context,pose_m17_fragments,m11_muon,m5_lesson seed=0"),
-        Line("held_out_less", "resample=never", "held_out/model=patch_pf,seed=0", "patch_pf"),
+        ablation("held_out_less", "resample=never", HELD_OUT, "patch_pf"),
         Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
     ]
     if meshes:
         lines += [Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")]
     if meshes and frames:
         real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
-        runs = {
-            model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0" for model in (*DETECTORS, *WITH_POSE)
-        }
+        runs = {model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0" for model in MODELS}
         runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
     return lines
 
 
-def ablation(table: str, swept: str, model: str) -> Line:
-    """Return a sweep at test time over a choice of the filter, on the working variant's first run."""
-    return Line(table, swept, f"memorise/experiment=memorise,model={model},seed=0,variant=working", model)
+def ablation(table: str, swept: str, run: str, model: str) -> Line:
+    """Return a sweep at test time over choices of the filter, on a method's run."""
+    return Line(table, swept, run.format(model), model)
 
 
 def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:

@@ -6,6 +6,7 @@ FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a fo
 that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
 what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
 `<!-- table: NAME (on object %, AUROC) -->` has these figures only. What is the same in every row is left out.
+`relative time` is an image's, in units of the fastest row's: for tables whose runs were made one after another.
 Every run by itself, with all its figures, goes to a CSV file beside the page.
 """
 
@@ -34,9 +35,9 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "at an edge %": lambda m: 100 * m["signs"]["near_edge"][-1],
     "in a corner %": lambda m: 100 * m["signs"]["near_corner"][-1],
     "AUROC": lambda m: m["signs"]["auroc"],
-    "s / image": lambda m: m["seconds_per_image"],
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
+RELATIVE = "relative time"
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
@@ -105,11 +106,12 @@ def cell(runs: list[dict[str, Any]], read: Callable[[dict[str, Any]], Any]) -> s
 
 
 def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -> str:
-    """Return a Markdown table, one row a kind of run.  Raises KeyError for a figure that is none of COLUMNS."""
+    """Return a Markdown table, one row a kind of run.  Raises KeyError for an unknown figure."""
     rows = defaultdict(list)
     for run in runs:
         rows[key_of(run)].append(run)
-    shown = {name: COLUMNS[name] for name in figures if any(cell([run], COLUMNS[name]) != "–" for run in runs)}
+    known = COLUMNS | ({RELATIVE: relative_time(rows.values())} if RELATIVE in figures else {})
+    shown = {name: known[name] for name in figures if any(cell([run], known[name]) != "–" for run in runs)}
     typed = [set(rest.split()) for _, _, rest in rows]
     common = set.intersection(*typed) if len(rows) > 1 else set()  # is said once, above the table
     columns: dict[str, list[str]] = defaultdict(list)
@@ -129,12 +131,23 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def relative_time(rows: Iterable[list[dict[str, Any]]]) -> Callable[[dict[str, Any]], float]:
+    """Return the figure of a run that is its time for an image, in units of the fastest row's."""
+    least = min(sum(run["seconds_per_image"] for run in row) / len(row) for row in rows)
+    return lambda run: run["seconds_per_image"] / least
+
+
 def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
     """Return all tables' runs as CSV: a row a run, all figures to six digits, empty where a run has none."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    training = {"steps": lambda m: m["training"]["steps"], "tested step": lambda m: m["training"]["tested_step"]}
-    columns = {**COLUMNS, "seed": lambda m: m["seed"], **training}
+    columns = {
+        **COLUMNS,
+        "s / image": lambda m: m["seconds_per_image"],
+        "seed": lambda m: m["seed"],
+        "steps": lambda m: m["training"]["steps"],
+        "tested step": lambda m: m["training"]["tested_step"],
+    }
     writer.writerow(["table", "method", "variant", "changed", *columns, "device", "torch"])
     for name, runs in found.items():
         for run in sorted(runs, key=lambda run: (place(key_of(run)), figure(run, columns["seed"]) or 0)):

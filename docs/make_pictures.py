@@ -1,10 +1,10 @@
 """Make the pictures of README.md and docs/ from real runs: `make pictures`, never by hand.
 
     python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
-                                 [--ladder outputs/methods/ladder/patch_pf]
+                                 [--methods outputs/methods]
 
 Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and its particles'
-way there.  Of docs/tour.md's commands, and of a ladder of remedies, where they have been run: the pictures that they left.
+way there.  Of docs/tour.md's commands, and of docs/methods.md's runs, where they were made: what they left.
 """
 
 import argparse
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +33,8 @@ from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, whole
 from posefilter.pictures.cloud import draw_strip
 from posefilter.pictures.overlay import Shape, axes_legend, overlay
 from posefilter.pictures.sheet import TITLE, lettered
+from posefilter.report.figures import LIGHT, Line, Panel, draw
+from posefilter.report.sweeps import read_sweep
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.predict import as_batch
@@ -54,6 +57,13 @@ RUNGS = {  # the rungs of docs/methods.md's ladder that its picture shows, and w
     "c6_place": "No gradient through the place",
     "c9_context": "And global context",
 }
+METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")  # those with a pose first: each has one colour in all charts
+SIZES = {"filter.particles": "particles", "filter.steps": "iterations"}  # of a filter, swept when it is tested; its table
+FIGURES = {  # of these sweeps: title, unit, and by what to multiply; None: of one over the least
+    "particles_on_object": ("Particles on the object", "%", 100),
+    "add/auc": ("ADD AUC", "", 1),
+    "seconds_per_image": ("Time of an image", "the least is 1", None),
+}
 BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
 
 
@@ -72,13 +82,14 @@ def main() -> int:
     parser.add_argument("--scenes", type=Path, help="rendered frames in the FAT format (default: docs/scenes/<object>)")
     parser.add_argument("--meshes", default="builtin", help="to render scenes from, where there are none yet")
     parser.add_argument("--tour", type=Path, default=Path("outputs/tour"), help="where docs/tour.md's commands wrote")
-    parser.add_argument("--ladder", type=Path, default=Path("outputs/methods/ladder/patch_pf"), help="a sweep over rungs")
+    parser.add_argument("--methods", type=Path, default=Path("outputs/methods"), help="where bench/methods.py wrote")
     parser.add_argument("--out", type=Path, default=HOME / "docs" / "pictures")
     said = parser.parse_args()
     try:
         of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
         of_tour(said.tour, said.out)
-        of_ladder(said.ladder, said.out)
+        of_ladder(said.methods / "ladder" / "patch_pf", said.out)
+        of_filters(said.methods, said.out)
     except UserError as error:
         print(f"make_pictures: {error}", file=sys.stderr)
         return 2
@@ -164,6 +175,27 @@ def of_ladder(ladder: Path, out: Path) -> None:
         picture = np.asarray(Image.open(found[0]).convert("RGB"))
         tiles.append(np.concatenate([lettered(words, TITLE - 4, bold=True), picture]))
     write(out / "journeys.jpg", grid(tiles, 2))
+
+
+def of_filters(methods: Path, out: Path) -> None:
+    """Write filters.jpg: quality and cost over the filter's size, a row a setting, a line a method."""
+    tiles = []
+    for axis, table in SIZES.items():
+        found = {name: read_sweep(methods / table / name).jobs for name in METHODS if (methods / table / name).is_dir()}
+        if not found:
+            print(f"left as it is: filters.jpg (no {methods / table})")
+            return
+        for name, (title, unit, factor) in FIGURES.items():
+            have = {model: [job for job in jobs if name in job.numbers] for model, jobs in found.items()}
+            by = factor or 1 / min(job.numbers[name] for jobs in have.values() for job in jobs)
+            lines = [
+                Line(model, [float(job.place[axis]) for job in jobs], [by * job.numbers[name] for job in jobs])
+                for model, jobs in have.items()
+                if jobs
+            ]
+            chart = draw(Panel(title, table, unit, lines, log_x=True), LIGHT)
+            tiles.append(np.asarray(Image.open(BytesIO(chart)).convert("RGB")))
+    write(out / "filters.jpg", grid(tiles, len(FIGURES)))
 
 
 def screen(page: Path, dark: bool) -> np.ndarray:

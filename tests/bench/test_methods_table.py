@@ -15,9 +15,10 @@ methods_table = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(methods_table)
 
 
-def run(folder: Path, on: float, *overrides: str) -> None:
+def run(folder: Path, on: float, *overrides: str, seconds: float = 0.1) -> None:
     folder.mkdir(parents=True)
     metrics = {"particles_on_object": on, "iou": 0.5, "add": {"auc": 40.0}, "overrides": list(overrides)}
+    metrics |= {"seconds_per_image": seconds}
     (folder / "metrics.json").write_text(json.dumps(metrics))
 
 
@@ -40,6 +41,16 @@ def test_what_a_single_row_changed_is_told(tmp_path: Path) -> None:
         .splitlines()[2]
         .startswith("| patch_pf | `resample=never` |")
     )
+
+
+def test_time_is_told_in_units_of_the_fastest_row(tmp_path: Path) -> None:
+    for seed, seconds in ((0, 0.02), (1, 0.04)):
+        run(tmp_path / f"few{seed}", 0.9, "model=patch_pf", "filter.particles=50", f"seed={seed}", seconds=seconds)
+    run(tmp_path / "many", 0.9, "model=patch_pf", "filter.particles=100", seconds=0.09)
+    runs = methods_table.read_runs([tmp_path])
+    lines = methods_table.table(runs, ["relative time"]).splitlines()
+    assert [line.split("|")[-2].strip() for line in lines[2:]] == ["1.00 ± 0.33", "3.00"]
+    assert "time" not in methods_table.table(runs)
 
 
 def test_only_the_named_table_is_replaced_by_the_figures_asked_for(tmp_path: Path) -> None:

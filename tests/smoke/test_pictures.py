@@ -7,10 +7,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from posefilter.data.generate import generate
 from posefilter.pictures.canvas import TRUTH
+from posefilter.report.figures import LIGHT
 from posefilter.run.train import train
 
 HOME = Path(__file__).parents[2]
@@ -69,6 +70,28 @@ def test_the_tour_is_pictured_as_far_as_it_was_run(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["tour_check.jpg"]
     for name in ("tour_scenes", "tour_train", "tour_predict", "tour_report"):
         assert f"left as it is: {name}.jpg" in said
+
+
+def test_what_a_filter_s_size_buys_is_pictured_where_it_was_measured(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A row a setting, a chart a figure, a colour a method; one without a pose has no line in ADD's."""
+    script.of_filters(tmp_path, tmp_path / "out")
+    assert "left as it is: filters.jpg" in capsys.readouterr().out
+    for axis, table in script.SIZES.items():
+        for model, scores in (("downsized", {}), ("pixel_pf", {"add": {"auc": 80.0}})):
+            for value in (10, 100):
+                run = tmp_path / table / model / f"{axis}={value}"
+                run.mkdir(parents=True)
+                told = {"overrides": [f"{axis}={value}"], "particles_on_object": 0.9, "seconds_per_image": 0.001 * value}
+                (run / "metrics.json").write_text(json.dumps(told | scores))
+    script.of_filters(tmp_path, tmp_path / "out")
+    shown = np.asarray(Image.open(tmp_path / "out" / "filters.jpg").convert("RGB")).astype(int)
+    first, second = (np.abs(shown - np.array(ImageColor.getrgb(colour))).max(2) < 40 for colour in LIGHT.lines[:2])
+    third = shown.shape[1] // 3
+    for row in np.array_split(np.arange(len(shown)), 2):
+        assert all(first[row][:, i * third : (i + 1) * third].sum() > 50 for i in range(3))
+        assert [bool(second[row][:, i * third : (i + 1) * third].sum() > 50) for i in range(3)] == [True, False, True]
 
 
 def test_mistakes_are_one_line(script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:  # type: ignore[no-untyped-def]
