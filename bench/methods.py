@@ -24,7 +24,7 @@ MODELS = (*DETECTORS, *WITH_POSE)
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
 # rungs of more than one seed; the detectors' paper and working are in the table of memorisation, with all seeds
 TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,pose_c12_loss,working"
-TELLING_BOX = "s2_bounded,s4_lesson,box_s10_steps,c2_glimpse,c3_bounded,c6_place"
+TELLING_BOX = "s2_bounded,c1_normalisation,c6_place"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorise/experiment=memorise,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
@@ -47,7 +47,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
         Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
         Line("memorise", f"{memorise} variant=paper seed=0"),
-        Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0"),
+        Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0,1,2"),
     ]
     lines += [ablation("resampling", "resample=never,systematic,guided", MEMORISED, model) for model in MODELS]
     lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]

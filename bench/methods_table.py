@@ -6,7 +6,8 @@ FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a fo
 that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
 what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
 `<!-- table: NAME (on object %, AUROC) -->` has these figures only. What is the same in every row is left out.
-`relative time` is an image's, in units of the fastest row's: for tables whose runs were made one after another.
+`relative time` is an image's, in units of the fastest row's: for tables whose runs were made one after another. `loss jumps`
+is the largest training loss over the median, of those logged in a training's second half.
 Every run by itself, with all its figures, goes to a CSV file beside the page.
 """
 
@@ -18,8 +19,12 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any
+
+from posefilter.report.events import read_events
 
 COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "on object %": lambda m: 100 * m["particles_on_object"],
@@ -38,6 +43,7 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
 RELATIVE = "relative time"
+ASKED = {"loss jumps": lambda m: loss_jumps(Path(m["path"]).parent)}  # only where a mark asks for it, since it takes a while
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
@@ -110,7 +116,7 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
     rows = defaultdict(list)
     for run in runs:
         rows[key_of(run)].append(run)
-    known = COLUMNS | ({RELATIVE: relative_time(rows.values())} if RELATIVE in figures else {})
+    known = COLUMNS | ASKED | ({RELATIVE: relative_time(rows.values())} if RELATIVE in figures else {})
     shown = {name: known[name] for name in figures if any(cell([run], known[name]) != "–" for run in runs)}
     typed = [set(rest.split()) for _, _, rest in rows]
     common = set.intersection(*typed) if len(rows) > 1 else set()  # is said once, above the table
@@ -135,6 +141,18 @@ def relative_time(rows: Iterable[list[dict[str, Any]]]) -> Callable[[dict[str, A
     """Return the figure of a run that is its time for an image, in units of the fastest row's."""
     least = min(sum(run["seconds_per_image"] for run in row) / len(row) for row in rows)
     return lambda run: run["seconds_per_image"] / least
+
+
+@cache
+def loss_jumps(run: Path) -> float | None:
+    """Return the largest training loss over the median, of those logged in the second half; None where none was logged."""
+    curve = read_events(run)[0].get("train/total")
+    late = (
+        [value for step, value in zip(curve.steps, curve.values, strict=True) if 2 * step >= curve.steps[-1]]
+        if curve
+        else []
+    )
+    return max(late) / median(late) if late else None
 
 
 def sheet(found: dict[str, list[dict[str, Any]]]) -> str:

@@ -134,6 +134,8 @@ SEVERAL = {  # rungs that are more than one choice, or a setting of one
 def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path: Path) -> None:
     model = "patch_pf" if sweep == "ladder" else "cnn_patch"
     rungs = (CONF / "sweep" / f"{sweep}.yaml").read_text().split("rung: paper,")[1].strip().split(",")
+    if sweep == "ladder_detect":  # these cannot be trained; the next is still a remedy more than they
+        rungs[rungs.index("c6_place") : rungs.index("c6_place")] = ["c3_bounded", "c4_balanced", "c5_lesson"]
     said = [f"model={model}", f"sweep={sweep}"]
     base = {v: compose_job("train", CONF, [*said, f"rung={v}"], tmp_path).choices for v in ("paper", "working")}
     assert base["paper"]["variant"] == "paper"

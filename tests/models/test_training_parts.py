@@ -271,3 +271,35 @@ def test_places_that_are_judged_are_not_cut() -> None:
     for earlier in range(3):
         (gradient,) = torch.autograd.grad(trace.clouds[3].state.sum(), trace.readings[earlier].motion, retain_graph=True)
         assert torch.equal(gradient, torch.ones_like(gradient))
+
+
+# -- gradients that are not finite -------------------------------------------------------------------------------------
+
+
+def clipped(method: ImageSpace, wild: float) -> Tensor:
+    """Return the networks' gradient after clipping at 1: ones, and one entry that is `wild`."""
+    for parameter in method.net.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    first = next(method.net.parameters()).grad
+    assert first is not None
+    first.view(-1)[0] = wild
+    method.configure_gradient_clipping(torch.optim.Adam(method.parameters()), 1.0)
+    return torch.cat([p.grad.flatten() for p in method.net.parameters() if p.grad is not None])
+
+
+@pytest.mark.parametrize("wild", [math.inf, math.nan, 1e30])  # the last: finite, but its square is not
+def test_a_gradient_that_is_not_finite_teaches_nothing(wild: float, caplog: pytest.LogCaptureFixture) -> None:
+    method = working(CnnPatch, 9)
+    assert clipped(method, 5.0).norm().item() == pytest.approx(1, rel=1e-4)
+    assert not caplog.records
+    for _ in range(3):
+        assert (clipped(method, wild) == 0).all()
+    assert [record.getMessage() for record in caplog.records] == ["step 0 does not teach net: its gradient is not finite"]
+
+
+def test_a_training_that_only_loses_its_gradients_ends() -> None:
+    method = working(CnnPatch, 9)
+    for wild in [math.nan] * 19 + [1.0] + [math.nan] * 19:  # never twenty in a row
+        clipped(method, wild)
+    with pytest.raises(FloatingPointError, match="gradient of net was not finite in 20 steps in a row"):
+        clipped(method, math.nan)

@@ -1,5 +1,6 @@
 """What every method shares as a LightningModule: every Lightning hook lives here, so that a method's own file is short."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
@@ -23,6 +24,8 @@ from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.models.checks import check_estimate
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
+log = logging.getLogger(__name__)
+_PATIENCE = 20  # steps
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 
 
@@ -53,6 +56,7 @@ class PoseEstimator(LightningModule):
         self._object_model: ObjectModel | None = None
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
+        self.lost_in_a_row = 0  # steps whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
         check_estimate(self)
 
@@ -132,12 +136,28 @@ class PoseEstimator(LightningModule):
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip each part's gradient by its own norm: a wild step of one network must not shrink another's."""
-        if gradient_clip_val:
-            for part in self.children():
-                parameters = list(part.parameters())
-                if parameters:
-                    nn.utils.clip_grad_norm_(parameters, gradient_clip_val)
+        """Clip each part's gradient by its own norm: a wild step of one network must not shrink another's.
+
+        A gradient whose norm is not finite is set to zero, with a warning: it says nothing. Raises FloatingPointError after
+        20 such steps in a row, of any part, since no more would be learned.
+        """
+        if not gradient_clip_val:
+            return
+        lost = []
+        for name, part in self.named_children():
+            gradients = [p.grad for p in part.parameters() if p.grad is not None]
+            if gradients and not bool(nn.utils.clip_grad_norm_(part.parameters(), gradient_clip_val).isfinite()):
+                lost.append(name)
+                for gradient in gradients:
+                    gradient.zero_()
+        self.lost_in_a_row = self.lost_in_a_row + 1 if lost else 0
+        if self.lost_in_a_row == 1:
+            log.warning("step %d does not teach %s: its gradient is not finite", self.global_step, ", ".join(lost))
+        if self.lost_in_a_row == _PATIENCE:
+            raise FloatingPointError(
+                f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: a roll-out's can grow "
+                "with each step; choose place_gradient=stopped or train_filter=short (image space), or fewer filter.steps"
+            )
 
     # -- validation and test -------------------------------------------------------------------------------------------
 

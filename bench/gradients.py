@@ -1,0 +1,94 @@
+"""How the gradient of a roll-out grows with its length, before any training: the table `gradients` of docs/methods.md.
+
+    python bench/gradients.py [--into docs/methods.md] [train.py's settings ...]
+
+Each row is a method at a rung of its ladder, at the ladder's size; each figure the norm of its network's gradient on the
+first batch of `experiment=memorise`, in units of one step's.
+"""
+
+import argparse
+import math
+import re
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from methods_table import mark, told
+
+from posefilter.run.command import compose_job
+from posefilter.run.machine import settle
+from posefilter.run.train import build_data, build_method, quiet, recipe
+
+HOME = Path(__file__).parents[1]
+STEPS = (1, 2, 4, 8, 16, 30)
+LADDERS = {
+    "cnn_patch": "ladder_detect",
+    "patch_pf": "ladder",
+}
+RUNGS = ("paper", "s1_glimpse", "s2_bounded", "c1_normalisation", "c2_glimpse", "c3_bounded", "c6_place")
+
+
+def gradient(model: str, sweep: str, rung: str, steps: int, more: Sequence[str]) -> float:
+    """Return the norm of the network's gradient of one batch, rolled out for so many steps."""
+    with tempfile.TemporaryDirectory() as folder:
+        said = [f"model={model}", "experiment=memorise", f"sweep={sweep}", f"rung={rung}", "seed=0", f"filter.steps={steps}"]
+        job = compose_job("train", HOME / "conf", [*said, *more], Path(folder))
+    settle(job.cfg.threads, job.cfg.seed)
+    data = build_data(job.cfg.data, "plain")
+    data.setup("fit")
+    method = build_method(recipe(job))
+    method.adopt(data.object_model(0))
+    batch = next(iter(data.train_dataloader()))
+    torch.stack(
+        [loss.mean() for loss in method.training_losses(batch, method.generator("train", 0)).values()]
+    ).sum().backward()
+    parts = [p.grad.double().norm() for p in method.net.parameters() if p.grad is not None]
+    return float(torch.stack(parts).norm())
+
+
+def table(more: Sequence[str]) -> str:
+    """Return all rows as Markdown; `overflows` where a figure has no finite number of 32 bits."""
+    lines = [
+        f"| method | rung | {' | '.join('1 step' if n == 1 else f'{n} steps' for n in STEPS)} |",
+        "| --- " * (2 + len(STEPS)) + "|",
+    ]
+    for model, sweep in LADDERS.items():
+        for rung in RUNGS:
+            norms = [gradient(model, sweep, rung, steps, more) for steps in STEPS]
+            cells = [written(norm / norms[0]) for norm in norms]
+            lines.append(f"| {model} | {told(f'rung={rung}')} | {' | '.join(cells)} |")
+            print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def written(number: float) -> str:
+    """Return a number in two digits; `overflows` where it has more than 32 bits hold."""
+    if not math.isfinite(number):
+        return "overflows"
+    return (
+        f"{number:.1f}"
+        if number < 10
+        else f"{float(f'{number:.2g}'):,.0f}"
+        if number < 1e5
+        else f"{number:.0e}".replace("+", "")
+    )
+
+
+def main() -> int:
+    """Measure, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("more", nargs="*")
+    parser.add_argument("--into", type=Path, default=HOME / "docs" / "methods.md")
+    options = parser.parse_args()
+    quiet()
+    rows = table(options.more)
+    page = options.into.read_text()
+    pattern = mark("gradients") + r"\n.*?<!-- end -->"
+    options.into.write_text(re.sub(pattern, lambda m: f"{m['mark']}\n{rows}\n<!-- end -->", page, flags=re.DOTALL))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
