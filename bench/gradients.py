@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from methods_table import mark, told
+from methods_table import fill, mark, told
 
 from posefilter.run.command import compose_job
 from posefilter.run.machine import settle
@@ -49,7 +49,7 @@ def gradient(model: str, sweep: str, rung: str, steps: int, more: Sequence[str])
 
 
 def table(more: Sequence[str]) -> str:
-    """Return all rows as Markdown; `overflows` where a figure has no finite number of 32 bits."""
+    """Return all rows as Markdown, each said as soon as it is measured."""
     lines = [
         f"| method | rung | {' | '.join('1 step' if n == 1 else f'{n} steps' for n in STEPS)} |",
         "| --- " * (2 + len(STEPS)) + "|",
@@ -64,16 +64,15 @@ def table(more: Sequence[str]) -> str:
 
 
 def written(number: float) -> str:
-    """Return a number in two digits; `overflows` where it has more than 32 bits hold."""
+    """Return a number in one or two digits; `overflows` where it is more than 32 bits hold."""
     if not math.isfinite(number):
         return "overflows"
-    return (
-        f"{number:.1f}"
-        if number < 10
-        else f"{float(f'{number:.2g}'):,.0f}"
-        if number < 1e5
-        else f"{number:.0e}".replace("+", "")
-    )
+    if number < 10:
+        return f"{number:.1f}"
+    if number < 1e5:
+        return f"{float(f'{number:.2g}'):,.0f}"
+    digit, power = f"{number:.0e}".split("e")
+    return f"{digit}e{int(power)}"
 
 
 def main() -> int:
@@ -82,11 +81,12 @@ def main() -> int:
     parser.add_argument("more", nargs="*")
     parser.add_argument("--into", type=Path, default=HOME / "docs" / "methods.md")
     options = parser.parse_args()
+    page = options.into.read_text()
+    if not re.search(mark("gradients"), page):
+        parser.error(f"{options.into} has no mark <!-- table: gradients -->")
     quiet()
     rows = table(options.more)
-    page = options.into.read_text()
-    pattern = mark("gradients") + r"\n.*?<!-- end -->"
-    options.into.write_text(re.sub(pattern, lambda m: f"{m['mark']}\n{rows}\n<!-- end -->", page, flags=re.DOTALL))
+    options.into.write_text(fill(page, "gradients", lambda _: rows))
     return 0
 
 

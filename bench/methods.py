@@ -57,10 +57,9 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
     lines += [ablation("noise", noise, HELD_OUT, model) for model in WITH_POSE]
     lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
-    short = "model=patch_pf experiment=memorise sweep=ladder rung=c5_lesson,c6_place train_filter=short seed=0,1,2"
-    lines += [
-        Line("ladder", short, into="patch_pf_short")
-    ]  # does the gradient through the place harm where nothing multiplies it?
+    # does the gradient through the place harm where nothing multiplies it, and whose?
+    short = "model=patch_pf experiment=memorise sweep=ladder rung=c5_lesson,c6_place train_filter=short"
+    lines += [Line("place_gradient", f"{short} stages=none,only_motion,only_likelihood seed=0,1,2")]
     for models, sweep, rungs in (
         (WITH_POSE, "ladder", TELLING),
         (DETECTORS, "ladder_detect", TELLING_BOX),

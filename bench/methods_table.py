@@ -28,6 +28,7 @@ from posefilter.report.events import read_events
 
 COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "on object %": lambda m: 100 * m["particles_on_object"],
+    "began on it %": lambda m: 100 * m["signs"]["on_object"][0],
     "box IoU": lambda m: m["iou"],
     "ADD AUC": lambda m: m["add"]["auc"],
     "ADD < 0.1 d %": lambda m: m["add"]["recall_01d"],
@@ -152,7 +153,7 @@ def loss_jumps(run: Path) -> float | None:
         if curve
         else []
     )
-    return max(late) / median(late) if late else None
+    return max(late) / median(late) if late and median(late) > 0 else None
 
 
 def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
@@ -177,10 +178,15 @@ def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
 
 def insert(page: str, name: str, runs: list[dict[str, Any]]) -> str:
     """Return the page with the table called `name` made anew, of the figures that its mark asks for."""
+    return fill(page, name, lambda figures: table(runs, figures or tuple(COLUMNS)))
+
+
+def fill(page: str, name: str, make: Callable[[Sequence[str]], str]) -> str:
+    """Return the page with another table called `name`: made from the figures that its mark asks for, if any."""
 
     def filled(found: re.Match[str]) -> str:
-        figures = [figure.strip() for figure in found["figures"].split(",")] if found["figures"] else tuple(COLUMNS)
-        return f"{found['mark']}\n{table(runs, figures)}\n<!-- end -->"
+        asked = [figure.strip() for figure in found["figures"].split(",")] if found["figures"] else []
+        return f"{found['mark']}\n{make(asked)}\n<!-- end -->"
 
     return re.sub(mark(name) + r"\n.*?<!-- end -->", filled, page, flags=re.DOTALL)
 

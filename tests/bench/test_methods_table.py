@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from torch.utils.tensorboard import SummaryWriter
 
 SCRIPT = Path(__file__).parents[2] / "bench" / "methods_table.py"
 spec = importlib.util.spec_from_file_location("methods_table", SCRIPT)
@@ -89,3 +90,16 @@ def test_each_folder_is_a_table(tmp_path: Path, monkeypatch, capsys) -> None:
     ]
     assert rows[0]["AUROC"] == "", "a figure that a run has not"
     assert "other: 1 runs (no such table" in capsys.readouterr().out
+
+
+def test_loss_jumps_are_of_the_second_half(tmp_path: Path) -> None:
+    assert methods_table.loss_jumps(tmp_path / "none") is None
+    with SummaryWriter(str(tmp_path / "run")) as log:
+        for step, value in ((20, 100.0), (100, 2.0), (120, 1.0), (200, 8.0)):
+            log.add_scalar("train/total", value, step)
+    assert methods_table.loss_jumps(tmp_path / "run") == 4.0
+    run(tmp_path / "run" / "more", 0.9, "model=patch_pf")
+    (tmp_path / "run" / "more" / "metrics.json").rename(tmp_path / "run" / "metrics.json")
+    runs = methods_table.read_runs([tmp_path])
+    assert methods_table.table(runs, ["loss jumps"]).endswith("| patch_pf | 1 | 4.00 |")
+    assert "jumps" not in methods_table.table(runs), "reading it takes a while"

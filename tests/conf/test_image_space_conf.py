@@ -72,6 +72,7 @@ REMEDIES = [
     "motion_lesson=none", "motion_lesson=center", "likelihood_lesson=none", "likelihood_lesson=focal", "stages=three",
     "train_filter=same", "resample=never", "resample=guided", "initialise=from_relevance", "initialise=informed",
     "propose=learned_and_gaussian", "patch=6", "motion=held", "place_gradient=flows", "stages=three_motion",
+    "stages=only_motion", "stages=only_likelihood",
 ]  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """What every method shares as a LightningModule: every Lightning hook lives here, so that a method's own file is short."""
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar
@@ -138,18 +139,16 @@ class PoseEstimator(LightningModule):
     ) -> None:
         """Clip each part's gradient by its own norm: a wild step of one network must not shrink another's.
 
-        A gradient whose norm is not finite is set to zero, with a warning: it says nothing. Raises FloatingPointError after
-        20 such steps in a row, of any part, since no more would be learned.
+        A part whose gradient's norm is not finite is left as it is by this step, with a warning; also where nothing is
+        clipped. Raises FloatingPointError after 20 such steps in a row, of any part, since no more would be learned.
         """
-        if not gradient_clip_val:
-            return
         lost = []
         for name, part in self.named_children():
-            gradients = [p.grad for p in part.parameters() if p.grad is not None]
-            if gradients and not bool(nn.utils.clip_grad_norm_(part.parameters(), gradient_clip_val).isfinite()):
+            parameters = [p for p in part.parameters() if p.grad is not None]
+            if parameters and not bool(nn.utils.clip_grad_norm_(parameters, gradient_clip_val or math.inf).isfinite()):
                 lost.append(name)
-                for gradient in gradients:
-                    gradient.zero_()
+                for parameter in parameters:
+                    parameter.grad = None  # zeros would still move it, by momentum
         self.lost_in_a_row = self.lost_in_a_row + 1 if lost else 0
         if self.lost_in_a_row == 1:
             log.warning("step %d does not teach %s: its gradient is not finite", self.global_step, ", ".join(lost))

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +31,14 @@ def first(*values: Any) -> Any:
 
 
 def plain_name(text: str) -> str:
-    """Return a text fit for a folder's name: no slashes, no Hydra signs, at most 120 characters."""
-    return re.sub(r"[^\w.,=\-]+", "_", re.sub(r"(^|,)[+~]+", r"\1", str(text))).strip("_")[:120] or "run"
+    """Return a text fit for a folder's name: no slashes, no Hydra signs, at most 120 characters.
+
+    A longer one ends in a digest of the text, so that jobs of a sweep that differ only beyond have folders of their own.
+    """
+    name = re.sub(r"[^\w.,=\-]+", "_", re.sub(r"(^|,)[+~]+", r"\1", str(text))).strip("_")
+    if len(name) > 120:
+        name = f"{name[:111]}_{sha256(str(text).encode()).hexdigest()[:8]}"
+    return name or "run"
 
 
 def run_of(path: Any) -> str:
