@@ -114,6 +114,8 @@ MISTAKES = {
     "resume=nowhere": ("resume=nowhere", "not a run's folder"),
     "initialise.x=1": ("initialise.x", "no such setting"),
     "x=[1": ("[1",),
+    "loss=[bce,add]": ("loss=[bce,add]", "takes the name of a choice", "add, add_s"),
+    "stages=[{until: 1.0}]": ("stages=[{until: 1.0}]", "takes the name of a choice", "three_motion"),
 }
 
 

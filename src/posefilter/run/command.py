@@ -44,6 +44,7 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     register_resolvers()
     before = sys.argv
     try:
+        check_choices(arguments, conf)
         arguments = loosen(with_resumed(bracketed(arguments)), name) + logging_for(arguments)
         sys.argv = [sys.argv[0], *arguments]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(_task(name))()
@@ -64,6 +65,16 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
 def bracketed(arguments: list[str]) -> list[str]:
     """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four numbers, not a sweep."""
     return [re.sub(r"^((?:\w+\.)*(?:intrinsics|camera|size))=([^\[\],]+(?:,[^\[\],]+)+)$", r"\1=[\2]", a) for a in arguments]
+
+
+def check_choices(arguments: list[str], conf: Path) -> None:
+    """Raise UserError where a group is given a value instead of the name of one of its files: Hydra stumbles over it."""
+    for argument in arguments:
+        group, _, value = argument.partition("=")
+        if value.startswith(("[", "{")) and re.fullmatch(r"\w+", group) and (conf / group).is_dir():
+            options = sorted(file.stem for file in (conf / group).glob("*.yaml"))
+            there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
+            raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
 
 
 def _task(name: str) -> Callable[[DictConfig], Any]:
