@@ -140,7 +140,8 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
 
 def relative_time(rows: Iterable[list[dict[str, Any]]]) -> Callable[[dict[str, Any]], float]:
     """Return the figure of a run that is its time for an image, in units of the fastest row's."""
-    least = min(sum(run["seconds_per_image"] for run in row) / len(row) for row in rows)
+    times = [[run["seconds_per_image"] for run in row if "seconds_per_image" in run] for row in rows]
+    least = min((sum(row) / len(row) for row in times if row), default=1.0)
     return lambda run: run["seconds_per_image"] / least
 
 

@@ -57,7 +57,7 @@ class PoseEstimator(LightningModule):
         self._object_model: ObjectModel | None = None
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
-        self.lost_in_a_row = 0  # steps whose gradient was not finite
+        self.lost = self.lost_in_a_row = 0  # steps whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
         check_estimate(self)
 
@@ -149,9 +149,13 @@ class PoseEstimator(LightningModule):
                 lost.append(name)
                 for parameter in parameters:
                     parameter.grad = None  # zeros would still move it, by momentum
+        self.lost += bool(lost)
         self.lost_in_a_row = self.lost_in_a_row + 1 if lost else 0
-        if self.lost_in_a_row == 1:
-            log.warning("step %d does not teach %s: its gradient is not finite", self.global_step, ", ".join(lost))
+        if lost and self.lost in (1, 10, 100, 1000, 10_000):
+            at = self.global_step
+            log.warning(
+                "step %d does not teach %s, the %d. so far: its gradient is not finite", at, ", ".join(lost), self.lost
+            )
         if self.lost_in_a_row == _PATIENCE:
             raise FloatingPointError(
                 f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: a roll-out's can grow "
