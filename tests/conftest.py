@@ -4,6 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """Let every test draw the same numbers each time, and whatever ran before it."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")

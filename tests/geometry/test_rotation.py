@@ -24,7 +24,7 @@ from posefilter.geometry.rotation import (
 )
 
 V = torch.cat([torch.randn(60, 3, dtype=torch.float64, generator=Generator().manual_seed(0)), torch.zeros(1, 3).double()])
-HALF_TURNS = math.pi * torch.cat([torch.eye(3), torch.nn.functional.normalize(torch.randn(5, 3), dim=-1)]).double()
+HALF_TURNS = math.pi * torch.nn.functional.normalize(torch.cat([torch.eye(3).double(), V[:5]]), dim=-1)
 
 
 def test_conversions_are_scipys_and_romas() -> None:
