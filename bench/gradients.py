@@ -23,10 +23,7 @@ from posefilter.run.train import build_data, build_method, quiet, recipe
 
 HOME = Path(__file__).parents[1]
 STEPS = (1, 2, 4, 8, 16, 30)
-LADDERS = {
-    "cnn_patch": "ladder_detect",
-    "patch_pf": "ladder",
-}
+LADDERS = {"cnn_patch": "ladder_detect", "patch_pf": "ladder"}
 RUNGS = ("paper", "s1_glimpse", "s2_bounded", "c1_normalisation", "c2_glimpse", "c3_bounded", "c6_place")
 
 
@@ -41,9 +38,7 @@ def gradient(model: str, sweep: str, rung: str, steps: int, more: Sequence[str])
     method = build_method(recipe(job))
     method.adopt(data.object_model(0))
     batch = next(iter(data.train_dataloader()))
-    torch.stack(
-        [loss.mean() for loss in method.training_losses(batch, method.generator("train", 0)).values()]
-    ).sum().backward()
+    method.training_step(batch, 0).backward()
     parts = [p.grad.double().norm() for p in method.net.parameters() if p.grad is not None]
     return float(torch.stack(parts).norm())
 

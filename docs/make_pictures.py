@@ -53,7 +53,7 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
 }
 RUNGS = {  # the rungs of docs/methods.md's ladder that its picture shows, and what to say of each
     "paper": "The paper's",
-    "c5_lesson": "Told the way, and yet they flee",
+    "c5_lesson": "Told the way, and few arrive",
     "c6_place": "No gradient through the place",
     "c9_context": "And global context",
 }

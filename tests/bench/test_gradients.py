@@ -1,9 +1,10 @@
 """The table of gradients: its measure, its numbers as they are written, and its place in the page."""
 
-import importlib.util
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -11,15 +12,10 @@ HOME = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def gradients(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+def gradients(load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Return bench/gradients.py, which imports its neighbour."""
     monkeypatch.syspath_prepend(str(HOME / "bench"))
-    spec = importlib.util.spec_from_file_location("gradients", HOME / "bench" / "gradients.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("bench/gradients.py")
 
 
 def test_numbers_are_written_short(gradients) -> None:

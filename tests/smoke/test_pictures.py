@@ -1,7 +1,7 @@
 """`make pictures`: what it draws of a checkpoint and of the tour, and what it says where something is not there."""
 
-import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -18,14 +18,9 @@ HOME = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
     """Return docs/make_pictures.py."""
-    spec = importlib.util.spec_from_file_location("make_pictures", HOME / "docs" / "make_pictures.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script("docs/make_pictures.py")
 
 
 @pytest.mark.slow

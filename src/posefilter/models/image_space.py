@@ -46,9 +46,8 @@ class ImageSpace(PoseEstimator):
     bound the object in the image; lessons: losses beside the chosen one, by name; stages: factors on all of them as training
     proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; place_gradient:
     whether what is read at a place also teaches the motion that led there; truncate: cut the gradient through places that
-    are looked at, and through the memory, every so many steps (null: never), which changes no
-    value. A place still hands its own gradient on to the next, so that over a long roll-out this damps the growth; only 1,
-    a cut at every step, ends it.
+    are looked at, and through the memory, every so many steps (null: never), which changes no value. A place still hands its
+    own gradient on to the next, so that over a long roll-out this damps the growth; only 1, a cut at every step, ends it.
     """
 
     place_width: ClassVar[int] = 0  # numbers that tell a particle its own location
