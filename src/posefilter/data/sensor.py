@@ -56,7 +56,7 @@ def sense_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     out = np.clip(out, 0, 1.05) ** np.float32(rng.uniform(0.75, 1.35))
     out = _blur(out, 0.3 + rng.uniform(0, 1.1) * width / 640)
     if rng.random() < 0.25:
-        kernel = _motion_kernel(rng, int(rng.integers(3, max(4, 9 * width // 640))))
+        kernel = motion_kernel(rng, int(rng.integers(3, max(4, 9 * width // 640))))
         out = np.asarray(cv2.filter2D(out, -1, kernel), np.float32)
     out = out + _color_noise(rng, height, width)
     if rng.random() < 0.6:
@@ -99,7 +99,7 @@ def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return rgb * cv2.resize(coarse.astype(np.float32), rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)[..., None]
 
 
-def _motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
+def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
     """Return the trace of a moving camera: a line of `length` pixels in a random direction."""
     line = np.zeros((length, length), np.float32)
     line[length // 2] = 1
