@@ -16,14 +16,14 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from posefilter.callbacks.board import Budget
+from posefilter.callbacks.tensorboard import Budget
 from posefilter.run.build import instantiate
 from posefilter.run.command import compose_job
 from posefilter.run.machine import settle
 from posefilter.run.method import build_method, method_of, read_checkpoint, recipe
 
 HOME = Path(__file__).parents[1]
-LOOKING = ("story", "speed", "signs", "health", "figures")
+LOOKING = ("layout", "speed", "signs", "health", "figures")
 
 
 class Clock(Callback):

@@ -26,14 +26,14 @@ from posefilter.data.generate import generate
 from posefilter.data.meshes import MeshStore
 from posefilter.data.readers import open_reader
 from posefilter.errors import UserError
+from posefilter.figures.belief import draw_belief
+from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, draw_row, full_view
+from posefilter.figures.layout import TITLE, draw_text
+from posefilter.figures.overlay import Shape, draw_poses, list_axes
+from posefilter.figures.particles import draw_iterations
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, strip, whole
-from posefilter.pictures.cloud import draw_strip
-from posefilter.pictures.overlay import Shape, axes_legend, overlay
-from posefilter.pictures.sheet import TITLE, lettered
-from posefilter.report.figures import LIGHT, Line, Panel, draw
+from posefilter.report.charts import LIGHT, Line, Panel, draw_chart
 from posefilter.report.sweeps import read_sweep
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
@@ -57,7 +57,7 @@ RUNGS = {  # the rungs of docs/methods.md's ladder that its picture shows, and w
     "c6_place": "No gradient through the place",
     "c9_context": "And global context",
 }
-METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")  # those with a pose first: each has one colour in all charts
+METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")  # those with a pose first: each has one color in all charts
 SIZES = {"filter.particles": "particles", "filter.steps": "iterations"}  # of a filter, swept when it is tested; its table
 FIGURES = {  # of these sweeps: title, unit, and by what to multiply; None: of one over the least
     "particles_on_object": ("Particles on the object", "%", 100),
@@ -113,7 +113,7 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     one = found[min(EXAMPLE, len(found) - 1)]
     sample, K = one.sample, one.sample.intrinsics
     write(out / "belief.jpg", draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object))
-    write(out / "particles.jpg", draw_strip(sample.rgb, K, one.trace, 0, method.space))
+    write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
 
 
 def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:
@@ -138,14 +138,14 @@ def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.n
         height, width = sample.mask.shape
         truth = torch.from_numpy(sample.camera_from_object)[None]
         error = 1000 * float(add(trace.belief.best, truth, method.model.points)[0])
-        view = whole(height, width, 460)
+        view = full_view(height, width, 460)
         pose = trace.belief.best[0].double().numpy()
-        drawn = overlay(sample.rgb, sample.intrinsics, pose, shape, view, truth=sample.camera_from_object)
-        tiles.append(np.concatenate([drawn, strip(460, f"ADD {error:.1f} mm")]))
-    sheet = grid(tiles, 3)
-    legend = [("truth", TRUTH), ("estimate", ESTIMATE), *axes_legend()]
+        drawn = draw_poses(sample.rgb, sample.intrinsics, pose, shape, view, truth=sample.camera_from_object)
+        tiles.append(np.concatenate([drawn, draw_row(460, f"ADD {error:.1f} mm")]))
+    figure = arrange_grid(tiles, 3)
+    legend = [("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()]
     return np.concatenate(
-        [strip(sheet.shape[1], f"{method.model.name}: {len(found)} scenes that no training saw", legend), sheet]
+        [draw_row(figure.shape[1], f"{method.model.name}: {len(found)} scenes that no training saw", legend), figure]
     )
 
 
@@ -165,16 +165,16 @@ def of_tour(tour: Path, out: Path) -> None:
 
 
 def of_ladder(ladder: Path, out: Path) -> None:
-    """Write journeys.jpg: where particles go on one image, at the rungs that explain it."""
+    """Write trajectories.jpg: where particles go on one image, at the rungs that explain it."""
     tiles = []
     for rung, words in RUNGS.items():
-        found = sorted(ladder.glob(f"*rung={rung},*/figures/test_journeys_0.jpg"))
+        found = sorted(ladder.glob(f"*rung={rung},*/figures/test_trajectories_0.jpg"))
         if len(found) != 1:
-            print(f"left as it is: journeys.jpg ({len(found)} runs of rung={rung} in {ladder}, not one)")
+            print(f"left as it is: trajectories.jpg ({len(found)} runs of rung={rung} in {ladder}, not one)")
             return
         picture = np.asarray(Image.open(found[0]).convert("RGB"))
-        tiles.append(np.concatenate([lettered(words, TITLE - 4, bold=True), picture]))
-    write(out / "journeys.jpg", grid(tiles, 2))
+        tiles.append(np.concatenate([draw_text(words, TITLE - 4, bold=True), picture]))
+    write(out / "trajectories.jpg", arrange_grid(tiles, 2))
 
 
 def of_filters(methods: Path, out: Path) -> None:
@@ -193,9 +193,9 @@ def of_filters(methods: Path, out: Path) -> None:
                 for model, jobs in have.items()
                 if jobs
             ]
-            chart = draw(Panel(title, table, unit, lines, log_x=True), LIGHT)
+            chart = draw_chart(Panel(title, table, unit, lines, log_x=True), LIGHT)
             tiles.append(np.asarray(Image.open(BytesIO(chart)).convert("RGB")))
-    write(out / "filters.jpg", grid(tiles, len(FIGURES)))
+    write(out / "filters.jpg", arrange_grid(tiles, len(FIGURES)))
 
 
 def screen(page: Path, dark: bool) -> np.ndarray:

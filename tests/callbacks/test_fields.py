@@ -7,7 +7,18 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.callbacks.fields import few_levels, point_at, point_field, pose_field, shifted, telling_pixels, turned
+from posefilter.callbacks.fields import (
+    choose_levels,
+    choose_pixels,
+    evaluate_point_field,
+    evaluate_pose_field,
+    make_point,
+    shift_pose,
+    turn_pose,
+)
+from posefilter.figures.canvas import TRUTH
+from posefilter.figures.field import color_scores, draw_point_field, draw_pose_field, round_down
+from posefilter.figures.layout import WIDTH
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import invert, make_pose, origin_of, transform
 from posefilter.geometry.rotation import exp_so3
@@ -15,9 +26,6 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.likelihood import Points, PoseLikelihood, lay_out
 from posefilter.nets.paper_likelihood import PaperLikelihood
-from posefilter.pictures.canvas import TRUTH
-from posefilter.pictures.field import draw_point_field, draw_pose_field, round_down, score_colours
-from posefilter.pictures.sheet import WIDTH
 from posefilter.types import Batch, ObjectModel, Step
 
 H, W = 48, 64
@@ -52,7 +60,7 @@ class Oracle:
 
 
 def test_slices_of_an_oracle_have_their_top_at_the_truth_and_its_exact_shape() -> None:
-    field = pose_field(Oracle(TRUE), None, TRUE, model(), (0.04, 0.01), cells=9)
+    field = evaluate_pose_field(Oracle(TRUE), None, TRUE, model(), (0.04, 0.01), cells=9)
     assert field.reaches == pytest.approx((0.24, 0.06))
     for k, sigma in enumerate(field.sigmas):
         line = np.linspace(-field.reaches[k], field.reaches[k], 9)
@@ -67,16 +75,16 @@ def test_slices_of_an_oracle_have_their_top_at_the_truth_and_its_exact_shape() -
 
 def test_an_oracle_that_is_told_a_shifted_pose_has_its_top_there() -> None:
     wrong = TRUE @ make_pose(torch.eye(3), torch.tensor([0.0, 0.03, -0.03]))
-    field = pose_field(Oracle(wrong), None, TRUE, model(), (0.01,), cells=9)  # 15 mm a cell
+    field = evaluate_pose_field(Oracle(wrong), None, TRUE, model(), (0.01,), cells=9)  # 15 mm a cell
     assert np.unravel_index(field.planes[0, 2].argmax(), (9, 9)) == (2, 6)  # rows z, columns y
     assert field.planes[0, 2].max() == pytest.approx(0.5 * 18, rel=1e-2)  # it outscores the truth, and that is told
 
 
-def test_shifts_are_along_the_objects_axes_and_turns_about_its_centre() -> None:
-    poses = shifted(TRUE, 0.1, 3)
+def test_shifts_are_along_the_objects_axes_and_turns_about_its_center() -> None:
+    poses = shift_pose(TRUE, 0.1, 3)
     moved = transform(invert(TRUE), origin_of(poses[1, 2, 0], CENTER)[None])[0] - CENTER  # plane x-z
     assert moved.tolist() == pytest.approx([-0.1, 0.0, 0.1], abs=1e-6)
-    poses = turned(TRUE, CENTER, torch.tensor([0.5]))
+    poses = turn_pose(TRUE, CENTER, torch.tensor([0.5]))
     assert (origin_of(poses, CENTER) - origin_of(TRUE, CENTER)).abs().max() < 1e-6
     turn = TRUE[:3, :3].T @ poses[2, 0, :3, :3]
     assert turn[0, 0] == pytest.approx(math.cos(0.5), abs=1e-6)
@@ -85,8 +93,8 @@ def test_shifts_are_along_the_objects_axes_and_turns_about_its_centre() -> None:
 
 def test_levels_are_the_ends_and_the_middle() -> None:
     steps = [Step(t, 5, torch.tensor(s)) for t, s in enumerate((0.04, 0.03, 0.02, 0.01, 0.005))]
-    assert few_levels(steps) == pytest.approx((0.04, 0.02, 0.005))
-    assert few_levels(steps[:1] * 3) == pytest.approx((0.04,))
+    assert choose_levels(steps) == pytest.approx((0.04, 0.02, 0.005))
+    assert choose_levels(steps[:1] * 3) == pytest.approx((0.04,))
 
 
 class Knows(PoseLikelihood):
@@ -100,7 +108,7 @@ class Knows(PoseLikelihood):
 
 def test_a_pixel_is_read_where_it_is() -> None:
     batch, image = scene(), lay_out(scene().rgb, scene().depth, scene().intrinsics)
-    points = point_at((40, 30), image, TRUE, model())
+    points = make_point((40, 30), image, TRUE, model())
     camera = torch.tensor([(40 - 31.5) / 60 * 0.8, (30 - 23.5) / 60 * 0.8, 0.8])
     assert bool(points.inside.all())
     expected = transform(invert(batch.camera_from_object), camera[None, None])[0, 0] - CENTER
@@ -110,7 +118,7 @@ def test_a_pixel_is_read_where_it_is() -> None:
 @pytest.mark.parametrize("depthwise", [False, True])
 def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_favours(depthwise: bool) -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
-    field = point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise)
+    field = evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise)
     a, b = field.plane
     row, column = np.unravel_index(field.judged[0].argmax(), field.judged[0].shape)
     line = np.linspace(-field.reach, field.reach, field.judged.shape[1])
@@ -124,29 +132,29 @@ def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_fa
 def test_the_papers_likelihood_has_a_field_too() -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
     with torch.no_grad():
-        field = point_field(PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,))
+        field = evaluate_point_field(PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,))
     assert np.isfinite(field.judged).all()
     assert field.judged.std() > 0
 
 
 def test_pixels_are_chosen_well_on_the_object_and_near_it() -> None:
-    (on, is_on), (off, is_off) = telling_pixels(scene(), model())
+    (on, is_on), (off, is_off) = choose_pixels(scene(), model())
     assert (is_on, is_off) == (True, False)
     assert 30 <= on[0] <= 37  # the middle of the mask, columns 24 to 43 and rows 16 to 33
     assert 22 <= on[1] <= 28
     assert not bool(scene().mask[0, 0, off[1], off[0]])
     assert off[1] >= 6  # where depth is known
-    assert telling_pixels(scene()._replace(mask=torch.zeros(1, 1, H, W, dtype=torch.bool)), model()) == []
+    assert choose_pixels(scene()._replace(mask=torch.zeros(1, 1, H, W, dtype=torch.bool)), model()) == []
 
 
 def test_picture_of_poses_is_brightest_at_the_truth_and_black_where_that_is_outscored() -> None:
     values = -np.ones((9, 9))
     values[4, 4], values[1, 7] = 0.0, 0.5
-    cells = score_colours(values, -1.0)
+    cells = color_scores(values, -1.0)
     size = len(cells)
     assert cells[size // 2, size // 2].astype(int).sum() > cells[0, 0].astype(int).sum() + 200
     assert (cells[size // 8, size * 7 // 8] < 20).all()
-    field = pose_field(Oracle(TRUE), None, TRUE, model(), (0.04, 0.01), cells=9)
+    field = evaluate_pose_field(Oracle(TRUE), None, TRUE, model(), (0.04, 0.01), cells=9)
     picture = draw_pose_field(field, "title", np.array([0.02, 0.0, 0.0]))
     assert picture.shape[1] == WIDTH
     assert (picture == TRUTH).all(-1).sum() > 300  # a ring in each of six slices
@@ -154,7 +162,7 @@ def test_picture_of_poses_is_brightest_at_the_truth_and_black_where_that_is_outs
 
 def test_picture_of_points_shows_each_slice() -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
-    fields = [point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), d) for d in (False, True)]
+    fields = [evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), d) for d in (False, True)]
     picture = draw_point_field(fields, np.full((H, W, 3), 128, np.uint8), (model().points - CENTER).numpy(), "title")
     red = (picture[..., 0] > 120) & (picture[..., 1] < 60) & (picture[..., 2] < 80)
     assert red.sum() > 200  # the favoured places
@@ -174,7 +182,7 @@ def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() 
     share = torch.tensor([0.9, 0.1]).log().expand(1, 6, 8, 2)
     said = Coordinates(torch.zeros(1, 6, 8), share, torch.zeros(1, 6, 8, 2, 3), centers, torch.zeros(1, 6, 8, 4))
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics, said)
-    field = point_field(Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True)
+    field = evaluate_point_field(Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True)
     assert 0 in field.plane
     along_x = field.judged[0].mean(0 if field.plane[0] == 0 else 1)  # columns go along the plane's first axis
     assert along_x[:13] == pytest.approx(math.log(0.9), abs=1e-3)

@@ -14,12 +14,15 @@ from scipy.spatial import ConvexHull
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import DataLoader
 
-from posefilter.callbacks.board import Budget
 from posefilter.callbacks.drawings import DRAWINGS
-from posefilter.callbacks.figures import Figures, looking
-from posefilter.callbacks.gallery import draw_tile, errors_of
+from posefilter.callbacks.figures import Figures, evaluate_quietly
+from posefilter.callbacks.gallery import compute_errors, draw_tile
 from posefilter.callbacks.health import FilterHealth
+from posefilter.callbacks.tensorboard import Budget
 from posefilter.errors import UserError
+from posefilter.figures.canvas import TRUTH
+from posefilter.figures.layout import THUMBNAIL, TITLE, WIDTH, tile_width
+from posefilter.figures.overlay import view_poses
 from posefilter.filters.estimate import Mean
 from posefilter.filters.initialise import FromProposals
 from posefilter.filters.loop import ParticleFilter
@@ -32,9 +35,6 @@ from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.pictures.canvas import TRUTH
-from posefilter.pictures.overlay import view_of_poses
-from posefilter.pictures.sheet import THUMBNAIL, TITLE, WIDTH, tile_width
 from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
 
 H, W, IMAGES = 48, 64, 8
@@ -117,7 +117,7 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     folder = run[0]
     board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
     board.Reload()
-    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "film", "filter_health"}
+    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "animation", "filter_health"}
     assert set(board.Tags()["images"]) == {f"figures/{name}" for name in names}
     for tag, file in (("figures/overlays", "validation_overlays"), ("figures/filter_health", "filter_health")):
         written = (folder / "figures" / f"{file}.jpg").read_bytes()
@@ -125,12 +125,12 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     with Image.open(folder / "figures" / "validation_overlays.jpg") as overlays:
         picture = np.asarray(overlays.convert("RGB"))
     assert picture.shape[1] == WIDTH
-    assert (np.abs(picture.astype(int) - 128) < 4).all(-1).mean() > 0.3  # the grey photographs
-    film = board.Images("figures/film")[0]
-    assert film.encoded_image_string == (folder / "figures" / "validation_film.gif").read_bytes()
-    with Image.open(folder / "figures" / "validation_film.gif") as moving:
+    assert (np.abs(picture.astype(int) - 128) < 4).all(-1).mean() > 0.3  # the gray photographs
+    animation = board.Images("figures/animation")[0]
+    assert animation.encoded_image_string == (folder / "figures" / "validation_animation.gif").read_bytes()
+    with Image.open(folder / "figures" / "validation_animation.gif") as moving:
         assert moving.n_frames == 7  # four clouds, two frames from one to the next
-        assert moving.size == (film.width, film.height)
+        assert moving.size == (animation.width, animation.height)
     assert board.Scalars("filter/sigma_m/step_00")[0].value == pytest.approx(0.03)
     assert board.Scalars("filter/sigma_m/step_03")[0].value == pytest.approx(0.005)
 
@@ -229,13 +229,13 @@ def test_estimates_that_are_no_numbers_are_the_worst() -> None:
     method, batch = Told(), torch.utils.data.default_collate(scenes()[:2])
     trace: Trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     trace.belief.best[0] = torch.nan
-    errors = errors_of(trace, batch, method, model().points)
+    errors = compute_errors(trace, batch, method, model().points)
     assert errors[0] == torch.inf
     assert errors[1] < 0.05
 
 
 def test_one_figure_alone_is_switched_off_by_its_name(tmp_path: Path) -> None:
-    assert set(Figures(without=["film", "field"]).drawings) == set(DRAWINGS) - {"film", "field"}
+    assert set(Figures(without=["animation", "field"]).drawings) == set(DRAWINGS) - {"animation", "field"}
     with pytest.raises(UserError, match=r"figures.without=fild: there is no such figure; there are .*field"):
         Figures(without=["fild"])
 
@@ -244,7 +244,7 @@ def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:
     method = Told()
     method.train()
     method.filter.eval()
-    with looking(method):
+    with evaluate_quietly(method):
         assert not method.training
         assert not torch.is_grad_enabled()
     assert method.training
@@ -255,7 +255,7 @@ def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:
 def test_overlays_outline_lies_on_the_mask_of_a_worst_image(run: tuple[Path, Figures, FilterHealth]) -> None:
     worst = run[1]._kept["worst"][0]
     width = tile_width(3)
-    view = view_of_poses([worst.estimate, worst.truth], model().hull, worst.intrinsics, H, W, width)
+    view = view_poses([worst.estimate, worst.truth], model().hull, worst.intrinsics, H, W, width)
     tile = draw_tile(worst, model().hull, True)[-view.height :]
     green = np.argwhere((tile == TRUTH).all(-1))[:, ::-1]
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from posefilter.callbacks.health import evenly, health, scalars
+from posefilter.callbacks.health import choose_evenly, measure_health, name_scalars
+from posefilter.figures.curves import choose_bounds, choose_ticks, convert_unit, draw_health
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.pictures.curves import bounds, draw_health, even_ticks, in_unit
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 
@@ -29,7 +29,7 @@ def trace_of(states: list[torch.Tensor], weights: list[torch.Tensor], sigmas: li
 def test_pixels_by_hand() -> None:
     states = [torch.tensor([[[0.0, 0.0], [4.0, 0.0]], [[0.0, 0.0], [0.0, 6.0]]])] * 2
     even, one = torch.full((2, 2), 0.5), torch.tensor([[1.0, 0.0], [0.75, 0.25]])
-    found = health(trace_of(states, [even, one], [torch.tensor(8.0), torch.tensor([4.0, 2.0])]), PixelSpace())
+    found = measure_health(trace_of(states, [even, one], [torch.tensor(8.0), torch.tensor([4.0, 2.0])]), PixelSpace())
     assert list(found) == ["ess", "spread_px", "sigma_px", "best_log_likelihood"]
     assert found["ess"].tolist() == [[1.0, 0.5], [1.0, pytest.approx(1 / 0.625 / 2)]]
     # weights 3/4 and 1/4 six apart: the variance is 3/16 x 36
@@ -43,14 +43,16 @@ def test_poses_by_hand() -> None:
     center = torch.tensor([0.1, 0.0, 0.0])
     tangent = torch.tensor([[0.03, 0, 0, 0, 0, 0.2], [-0.03, 0, 0, 0, 0, -0.2]])
     state = move_about(torch.eye(4).expand(2, 4, 4), tangent, center)[None]
-    found = health(trace_of([state], [torch.full((1, 2), 0.5)], [torch.tensor(0.04)]), PoseSpace((0.1, 0.0, 0.0), 0.12))
-    assert found["spread_m"].item() == pytest.approx(0.03, rel=1e-4)  # about the object's centre, whatever the turn
+    found = measure_health(
+        trace_of([state], [torch.full((1, 2), 0.5)], [torch.tensor(0.04)]), PoseSpace((0.1, 0.0, 0.0), 0.12)
+    )
+    assert found["spread_m"].item() == pytest.approx(0.03, rel=1e-4)  # about the object's center, whatever the turn
     assert found["spread_rad"].item() == pytest.approx(0.2, rel=1e-4)
     assert found["sigma_m"].item() == pytest.approx(0.04)
 
 
 def test_scalars_are_named_by_step() -> None:
-    found = scalars({"ess": [0.1 * i for i in range(101)], "sigma_m": [1.0, 0.5]}, most=11)
+    found = name_scalars({"ess": [0.1 * i for i in range(101)], "sigma_m": [1.0, 0.5]}, most=11)
     assert [name for name in found if "ess" in name][:3] == [
         "filter/ess/step_00",
         "filter/ess/step_10",
@@ -59,7 +61,7 @@ def test_scalars_are_named_by_step() -> None:
     assert found["filter/ess/step_100"] == pytest.approx(10.0)
     assert found["filter/sigma_m/step_01"] == 0.5
     assert len(found) == 13
-    assert evenly(5, 1) == [4]
+    assert choose_evenly(5, 1) == [4]
 
 
 def test_figure_shows_the_numbers_where_its_axes_say() -> None:
@@ -71,15 +73,15 @@ def test_figure_shows_the_numbers_where_its_axes_say() -> None:
         top = len(picture) - 6 - 48 - high
         assert 1 - (rows[places == places.min()].mean() - top) / (high - 1) == pytest.approx(first, abs=0.03)
         assert 1 - (rows[places == places.max()].mean() - top) / (high - 1) == pytest.approx(last, abs=0.03)
-    assert in_unit("spread_m", [0.1]).tolist() == [100.0]
-    assert in_unit("spread_rad", [math.pi]).tolist() == [180.0]
+    assert convert_unit("spread_m", [0.1]).tolist() == [100.0]
+    assert convert_unit("spread_rad", [math.pi]).tolist() == [180.0]
 
 
 def test_axes_hold_the_numbers_and_have_round_ticks() -> None:
-    assert bounds("ess", np.array([0.2, 0.3])) == (0.0, 1.0)
-    assert bounds("spread_m", np.array([2.0, 10.0])) == pytest.approx((0.0, 10.8))
-    low, high = bounds("best_log_likelihood", np.array([-3.0, 5.0]))
+    assert choose_bounds("ess", np.array([0.2, 0.3])) == (0.0, 1.0)
+    assert choose_bounds("spread_m", np.array([2.0, 10.0])) == pytest.approx((0.0, 10.8))
+    low, high = choose_bounds("best_log_likelihood", np.array([-3.0, 5.0]))
     assert low < -3 < 5 < high
-    assert bounds("sigma_m", np.array([np.nan])) == (0.0, 1.0)
-    assert even_ticks(0.0, 10.8) == (0.0, 5.0, 10.0)
-    assert even_ticks(-3.6, 5.6) == (-2.5, 0.0, 2.5, 5.0)
+    assert choose_bounds("sigma_m", np.array([np.nan])) == (0.0, 1.0)
+    assert choose_ticks(0.0, 10.8) == (0.0, 5.0, 10.0)
+    assert choose_ticks(-3.6, 5.6) == (-2.5, 0.0, 2.5, 5.0)

@@ -10,7 +10,7 @@ from posefilter.callbacks.records import (
     HEADER,
     Outcome,
     PoseRow,
-    outcomes_of,
+    collect_outcomes,
     read_poses_csv,
     to_mesh,
     to_native,
@@ -121,7 +121,7 @@ def test_outcomes_and_beliefs(tmp_path: Path) -> None:
     belief = Belief(clouds, weights.log(), clouds[:, 1], torch.tensor([1.5, -2.0]))
     empty = torch.zeros(2)
     batch = Batch(empty, empty, empty, empty, empty, empty, torch.tensor([1, 0]), empty)
-    outcomes = outcomes_of(Trace((), (), (), belief), batch, 0.25)
+    outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25)
     assert [(o.frame_id, o.score, o.seconds) for o in outcomes] == [(1, 1.5, 0.25), (0, -2.0, 0.25)]
     assert (outcomes[0].estimate == clouds[0, 1].numpy()).all()
     native_from_mesh = poses(1, seed=3)[0]
@@ -130,4 +130,4 @@ def test_outcomes_and_beliefs(tmp_path: Path) -> None:
         assert found["im_id"].tolist() == [9, 7]
         assert np.abs(found["weights"] - weights.numpy()).max() < 1e-6
         assert np.abs(found["poses"] @ native_from_mesh - clouds.numpy()).max() < 1e-5
-    assert outcomes_of(Trace((), (), (), belief), batch, 0.25, beliefs=False)[0].poses.shape == (0, 4, 4)
+    assert collect_outcomes(Trace((), (), (), belief), batch, 0.25, beliefs=False)[0].poses.shape == (0, 4, 4)

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from posefilter.callbacks import speed
-from posefilter.callbacks.board import Budget
 from posefilter.callbacks.speed import Speed
+from posefilter.callbacks.tensorboard import Budget
 
 
 def test_images_waiting_and_validations_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from posefilter.callbacks.figures import Figures
-from posefilter.callbacks.story import Story
+from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.run.best import Best
 from posefilter.run.command import compose_job
 from posefilter.run.comparing import comparable
@@ -33,9 +33,9 @@ def test_none_leaves_the_checkpoints_and_nothing_that_looks(tmp_path: Path) -> N
 
 
 def test_a_single_figure_is_switched_off_by_its_name(tmp_path: Path) -> None:
-    trainer = build_trainer(compose(tmp_path, "callbacks.figures.without=[film]"))
+    trainer = build_trainer(compose(tmp_path, "callbacks.figures.without=[animation]"))
     (figures,) = [c for c in trainer.callbacks if isinstance(c, Figures)]  # type: ignore[attr-defined]
-    assert "film" not in figures.drawings
+    assert "animation" not in figures.drawings
     assert "belief" in figures.drawings
 
 
@@ -48,5 +48,5 @@ def test_a_run_is_told_apart_by_choices_and_settings_but_not_by_where_it_is(tmp_
     assert "model.filter" not in settings  # it repeats the section `filter`
     assert not [key for key in settings if key.split(".")[0] in ("out", "folder", "callbacks", "logger", "console")]
     assert not [value for value in settings.values() if isinstance(value, str) and "${" in value]
-    (story,) = [c for c in build_trainer(job).callbacks if isinstance(c, Story)]  # type: ignore[attr-defined]
-    assert story.settings == settings
+    (layout,) = [c for c in build_trainer(job).callbacks if isinstance(c, TensorBoardLayout)]  # type: ignore[attr-defined]
+    assert layout.settings == settings

@@ -10,7 +10,7 @@ import yaml
 from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
-MARK = (250, 30, 200)  # a colour that nothing else on the page has
+MARK = (250, 30, 200)  # a color that nothing else on the page has
 
 
 def metrics(auc: float, **others: Any) -> dict[str, Any]:

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.report.events import once
+from posefilter.report.diagnostics import collect_numbers, collect_timings, diagnose, format_duration
+from posefilter.report.events import drop_repeats
 from posefilter.report.gather import read_run
-from posefilter.report.pictures import by_number, by_section
-from posefilter.report.settings import Change, changes
-from posefilter.report.signs import duration, findings, numbers, timings
+from posefilter.report.images import group_by_section, sort_by_number
+from posefilter.report.settings import Change, compare_settings
 
 
 def test_scalars_and_pictures_are_read(run: Path) -> None:
@@ -19,25 +19,25 @@ def test_scalars_and_pictures_are_read(run: Path) -> None:
     assert record.curves["val/score"].steps == (49, 99)
     assert record.curves["val/score"].values == (60.0, 40.0)
     assert len(record.curves["train/total"].values) == 10
-    shown = by_section(record.pictures)
+    shown = group_by_section(record.pictures)
     assert [p.name for p in shown["worst"]] == ["worst_2", "worst_10"]
     assert [p.name for p in shown["overlays"]] == ["validation_overlays"]
     assert [p.name for p in shown["belief"]] == ["figures/belief"]
     assert record.missing == []
-    assert sorted(["a10", "a9", "b1"], key=by_number) == ["a9", "a10", "b1"]
+    assert sorted(["a10", "a9", "b1"], key=sort_by_number) == ["a9", "a10", "b1"]
 
 
 def test_a_resumed_run_is_one_curve() -> None:
     """What was logged beyond the checkpoint that a run went on from is void, in whatever order the files are read."""
     first = [(step, 1.0, 10.0 + step) for step in (0, 10, 20, 30)]
     resumed = [(step, 2.0, 100.0 + step) for step in (15, 25)]
-    assert once([*resumed, *first]).steps == (0, 10, 15, 25)
-    assert once([*first, *resumed]).values == (1.0, 1.0, 2.0, 2.0)
+    assert drop_repeats([*resumed, *first]).steps == (0, 10, 15, 25)
+    assert drop_repeats([*first, *resumed]).values == (1.0, 1.0, 2.0, 2.0)
 
 
 def test_signs_of_failure_are_found(run: Path) -> None:
     """Those beyond their limits, and no others."""
-    found = {finding.sign.key: (finding.value, finding.bad) for finding in findings(read_run(run))}
+    found = {finding.sign.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))}
     assert found["signs/pairwise_cosine"] == (0.95, True)
     assert found["signs/off_frame/last"] == (0.625, True)  # the last step's
     assert found["signs/offset_r2"] == (0.5, False)
@@ -50,17 +50,17 @@ def test_signs_of_failure_are_found(run: Path) -> None:
 
 def test_timings(run: Path) -> None:
     """Two steps a second, as the events' times have it."""
-    told = dict(timings(read_run(run)))
+    told = dict(collect_timings(read_run(run)))
     assert told["training steps a second (median)"] == "2.00"
     assert told["training, validations included"] == "45 s"
-    assert [duration(s) for s in (59.6, 61, 3700)] == ["1 min 0 s", "1 min 1 s", "1 h 1 min"]
+    assert [format_duration(s) for s in (59.6, 61, 3700)] == ["1 min 0 s", "1 min 1 s", "1 h 1 min"]
 
 
 def test_without_a_test_the_last_validation_counts(run: Path) -> None:
     """Numbers are then of the last validation, and it is said."""
     (run / "metrics.json").unlink()
     record = read_run(run)
-    assert numbers(record)["add/auc"] == 40.0
+    assert collect_numbers(record)["add/auc"] == 40.0
     assert any("metrics.json" in sentence for sentence in record.missing)
 
 
@@ -97,10 +97,10 @@ def test_settings_that_differ() -> None:
     """By dotted key, lists of sections item by item; where a run was made does not count."""
     default = {"seed": 0, "a": {"b": 1, "gone": 2}, "steps": [{"x": 1}, {"x": 2}], "out": None}
     own = {"seed": 0, "a": {"b": 1.5, "new": "text"}, "steps": [{"x": 1}, {"x": 3}], "out": "there"}
-    assert changes(own, default) == [
+    assert compare_settings(own, default) == [
         Change("a.b", "1", "1.5"),
         Change("a.new", None, "text"),
         Change("steps.1.x", "2", "3"),
         Change("a.gone", "2", None),
     ]
-    assert changes(default, default) == []
+    assert compare_settings(default, default) == []

@@ -13,10 +13,10 @@ from PIL import Image
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import MARK
 
-from posefilter.report.figures import DARK, LIGHT, Line, Panel, draw, smooth
+from posefilter.report.charts import DARK, LIGHT, Line, Panel, draw_chart, smooth
 from posefilter.report.gather import read_run
 from posefilter.report.html import gallery
-from posefilter.report.pictures import Picture
+from posefilter.report.images import StoredImage
 from posefilter.report.run_page import run_page
 from posefilter.report.settings import Change
 from posefilter.report.sweep_page import sweep_page
@@ -92,15 +92,15 @@ def test_a_bare_run_still_has_a_page(tmp_path: Path) -> None:
 
 def test_a_broken_picture_is_named() -> None:
     """It does not end the report."""
-    assert "worst_3" in gallery([Picture("worst_3", "worst 3", b"nothing")])
-    assert 'class="gone"' in gallery([Picture("worst_3", "worst 3", b"nothing")])
+    assert "worst_3" in gallery([StoredImage("worst_3", "worst 3", b"nothing")])
+    assert 'class="gone"' in gallery([StoredImage("worst_3", "worst 3", b"nothing")])
 
 
 def test_charts_have_both_themes() -> None:
     """The same chart on light and dark paper, at twice the size it is shown."""
     panel = Panel("Loss", "step", "mm", [Line("a", [0, 1, 2], [3, 2, 1]), Line("b", [0, 1, 2], [1, 2, 3])])
     for theme in (LIGHT, DARK):
-        image = np.asarray(Image.open(BytesIO(draw(panel, theme))).convert("RGB"))
+        image = np.asarray(Image.open(BytesIO(draw_chart(panel, theme))).convert("RGB"))
         assert image.shape == (500, 760, 3)
         paper = [int(theme.paper[i : i + 2], 16) for i in (1, 3, 5)]
         assert (np.abs(image[3, 3].astype(int) - paper) < 6).all()
@@ -117,9 +117,9 @@ def test_smoothing_keeps_lines_and_skips_gaps() -> None:
     assert np.isfinite(smooth(line)).all()
 
 
-def close_to(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
-    """Return how many pixels are about of a colour."""
-    return int((np.abs(picture.astype(int) - colour).max(2) < 12).sum())
+def close_to(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Return how many pixels are about of a color."""
+    return int((np.abs(picture.astype(int) - color).max(2) < 12).sum())
 
 
 @needs_browser

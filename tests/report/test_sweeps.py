@@ -7,7 +7,7 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.report.sweep_page import mean_and_half_range, over, spread, sweep_page
-from posefilter.report.sweeps import best_group, best_job, groups, read_sweep
+from posefilter.report.sweeps import find_best_group, find_best_job, group_jobs, read_sweep
 
 
 def test_axes_groups_and_best(sweep: Path) -> None:
@@ -15,22 +15,22 @@ def test_axes_groups_and_best(sweep: Path) -> None:
     found = read_sweep(sweep)
     assert found.axes == ["filter.particles", "refine", "seed"]  # `out` differs too, and is none
     assert found.shown == ["filter.particles", "refine"]
-    assert [tuple(group.place.values()) for group in groups(found)] == [
+    assert [tuple(group.place.values()) for group in group_jobs(found)] == [
         (50, "none"),
         (50, "gradient"),
         (1000, "none"),
         (1000, "gradient"),
     ]
-    assert [len(group.jobs) for group in groups(found)] == [3, 3, 2, 3]
+    assert [len(group.jobs) for group in group_jobs(found)] == [3, 3, 2, 3]
     assert found.unfinished == ["filter.particles=1000,refine=none,seed=2"]
-    assert best_job(found).place == {"filter.particles": 1000, "refine": "gradient", "seed": 2}
-    assert best_group(groups(found)) == 3
+    assert find_best_job(found).place == {"filter.particles": 1000, "refine": "gradient", "seed": 2}
+    assert find_best_group(group_jobs(found)) == 3
 
 
 def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     """Over the particles, a line a refinement, with the seeds' range about it."""
     found = read_sweep(sweep)
-    panel = over("filter.particles", found, groups(found), ["add/auc"])[0]
+    panel = over("filter.particles", found, group_jobs(found), ["add/auc"])[0]
     none, gradient = panel.lines
     assert none.label == "refine=none"
     assert list(gradient.x) == [50.0, 1000.0]
@@ -38,7 +38,7 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     assert list(gradient.low) == pytest.approx([68.5, 78.0])
     assert list(gradient.high) == pytest.approx([73.5, 83.0])
     assert panel.log_x
-    assert over("refine", found, groups(found), ["add/auc"])[0].categories == ["none", "gradient"]
+    assert over("refine", found, group_jobs(found), ["add/auc"])[0].categories == ["none", "gradient"]
 
 
 def test_cells() -> None:
@@ -56,7 +56,7 @@ def test_summary_alone_is_enough(tmp_path: Path) -> None:
     found = read_sweep(tmp_path)
     assert found.axes == ["filter.particles"]
     assert [job.place["filter.particles"] for job in found.jobs] == [50, 1000]
-    assert best_job(found).numbers == {"add/auc": 80.5, "seconds_per_image": 2.0}
+    assert find_best_job(found).numbers == {"add/auc": 80.5, "seconds_per_image": 2.0}
     page, files = sweep_page(found, None, None, "x")
     assert "those of summary.csv" in page
     assert "add-auc-filter-particles.png" in files

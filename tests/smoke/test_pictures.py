@@ -10,8 +10,8 @@ import pytest
 from PIL import Image, ImageColor
 
 from posefilter.data.generate import generate
-from posefilter.pictures.canvas import TRUTH
-from posefilter.report.figures import LIGHT
+from posefilter.figures.canvas import TRUTH
+from posefilter.report.charts import LIGHT
 from posefilter.run.train import train
 
 HOME = Path(__file__).parents[2]

@@ -1,6 +1,6 @@
 """The figures of a validation, one function each: an occasion in, a picture out; None where it does not apply.
 
-Pictures are (H, W, 3) uint8; bytes are a film, a GIF.
+Pictures are (H, W, 3) uint8; bytes are a animation, a GIF.
 """
 
 from collections.abc import Callable
@@ -9,21 +9,27 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from posefilter.callbacks.fields import few_levels, point_field, pose_field, proposals_of, telling_pixels
-from posefilter.callbacks.gallery import Shown, draw_gallery
-from posefilter.callbacks.journeys import followed, glimpses_of, lineage
+from posefilter.callbacks.fields import (
+    choose_levels,
+    choose_pixels,
+    evaluate_point_field,
+    evaluate_pose_field,
+    predict_proposals,
+)
+from posefilter.callbacks.gallery import KeptImage, draw_gallery
+from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
 from posefilter.contracts import HasRelevance
+from posefilter.figures.animation import Animation, draw_silhouettes, encode_gif, outline_hulls, project_hulls
+from posefilter.figures.belief import draw_belief
+from posefilter.figures.field import draw_point_field, draw_pose_field
+from posefilter.figures.maps import draw_proposals, draw_relevance
+from posefilter.figures.overlay import Shape, trace_outline
+from posefilter.figures.particles import draw_iterations, normalize_weights
+from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
-from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.cloud import draw_strip, weights_of
-from posefilter.pictures.field import draw_point_field, draw_pose_field
-from posefilter.pictures.film import Film, draw_silhouettes, hulls_on_image, outlines, to_gif
-from posefilter.pictures.journeys import draw_glimpses, draw_journeys
-from posefilter.pictures.maps import draw_proposals, draw_relevance
-from posefilter.pictures.overlay import Shape, outline
 from posefilter.types import Batch, Trace
 
 
@@ -32,8 +38,8 @@ class Occasion(NamedTuple):
 
     method: PoseEstimator
     shape: Shape  # of the object
-    kept: dict[str, list[Shown]]  # images by kind: first, best, worst
-    one: Shown  # the example that most figures are about
+    kept: dict[str, list[KeptImage]]  # images by kind: first, best, worst
+    one: KeptImage  # the example that most figures are about
     trace: Trace  # its run, on the CPU
     batch: Batch  # the same image as the method reads it
     scene: Any  # what the method keeps of it
@@ -72,9 +78,9 @@ def worst(o: Occasion) -> Drawn:
 
 
 def particles(o: Occasion) -> Drawn:
-    """Draw the clouds on the image, coloured by weight."""
+    """Draw the clouds on the image, colored by weight."""
     title = o.title("Particles by iteration")
-    return draw_strip(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
+    return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
 
 
 def belief(o: Occasion) -> Drawn:
@@ -97,7 +103,7 @@ def field(o: Occasion) -> Drawn:
     if not isinstance(o.method, PosePF):
         return None
     model = o.method.model
-    found = pose_field(o.method, o.scene, o.batch.camera_from_object[0], model, few_levels(o.trace.steps))
+    found = evaluate_pose_field(o.method, o.scene, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps))
     center = model.center.cpu().double().numpy()
     shift = (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center + o.one.estimate[:3, 3] - o.one.truth[:3, 3]
     return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
@@ -109,8 +115,10 @@ def points(o: Occasion) -> Drawn:
         return None
     model, truth = o.method.model, o.batch.camera_from_object[0]
     slices = [
-        point_field(o.method.likelihood, o.scene.image, truth, model, pixel, on, few_levels(o.trace.steps), depthwise)
-        for pixel, on in telling_pixels(o.batch, model)
+        evaluate_point_field(
+            o.method.likelihood, o.scene.image, truth, model, pixel, on, choose_levels(o.trace.steps), depthwise
+        )
+        for pixel, on in choose_pixels(o.batch, model)
         for depthwise in ((False, True) if on else (False,))
     ]
     surface = (model.points - model.center).cpu().double().numpy()
@@ -119,7 +127,7 @@ def points(o: Occasion) -> Drawn:
 
 def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
-    said = proposals_of(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
+    said = predict_proposals(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
     if said is None:
         return None
     title = o.title("Proposals")
@@ -130,35 +138,37 @@ def relevance(o: Occasion) -> Drawn:
     """Draw the map of relevance beside where particles started and ended."""
     if o.posed or not isinstance(o.scene, HasRelevance):
         return None
-    clouds = [(c.state[0].double().numpy(), weights_of(c, 0).numpy()) for c in (o.trace.clouds[0], o.trace.clouds[-1])]
+    clouds = [
+        (c.state[0].double().numpy(), normalize_weights(c, 0).numpy()) for c in (o.trace.clouds[0], o.trace.clouds[-1])
+    ]
     seen = o.scene.relevance[0, 0].detach().float().cpu().numpy()
     return draw_relevance(seen, o.one.rgb, o.mask(), clouds[0], clouds[1], o.title("Relevance"))
 
 
-def journeys(o: Occasion) -> Drawn:
+def trajectories(o: Occasion) -> Drawn:
     """Draw the way of particles that are pixels (the paper, figure 4)."""
     if o.posed:
         return None
-    return draw_journeys(o.one.rgb, o.mask(), lineage(o.trace.clouds)[0].numpy(), o.title("Journeys"))
+    return draw_trajectories(o.one.rgb, o.mask(), trace_lineage(o.trace.clouds)[0].numpy(), o.title("Trajectories"))
 
 
 def glimpses(o: Occasion) -> Drawn:
     """Draw what a few particles saw at each step (the paper, figure 2)."""
     if not isinstance(o.method, ImageSpace):
         return None
-    states = followed(o.trace)
-    patches = glimpses_of(o.method, o.scene, states)
+    states = follow_particles(o.trace)
+    patches = extract_glimpses(o.method, o.scene, states)
     return draw_glimpses(o.one.rgb, o.mask(), states.numpy(), patches, o.title("Glimpses"))
 
 
-def film(o: Occasion) -> Drawn:
-    """Film the filter at work."""
-    scene = Filmed(o.one.rgb, o.one.intrinsics, o.one.truth, o.mask())
-    return filmed(o.method, o.trace, scene, o.title("The filter at work"))
+def animation(o: Occasion) -> Drawn:
+    """Animate the filter at work."""
+    scene = AnimatedScene(o.one.rgb, o.one.intrinsics, o.one.truth, o.mask())
+    return animate(o.method, o.trace, scene, o.title("The filter at work"))
 
 
-class Filmed(NamedTuple):
-    """The image that a film is of."""
+class AnimatedScene(NamedTuple):
+    """The image that a animation is of."""
 
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]
@@ -166,12 +176,14 @@ class Filmed(NamedTuple):
     mask: np.ndarray  # (H, W) bool
 
 
-def filmed(method: PoseEstimator, trace: Trace, scene: Filmed, title: str) -> bytes:
-    """Film the filter on one image, whose trace this is.  -> a GIF."""
+def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: str) -> bytes:
+    """Animate the filter on one image, whose trace this is.  -> a GIF."""
     hull, K = method.model.hull.cpu(), scene.intrinsics
     posed = isinstance(method.space, PoseSpace)
-    target = outlines(hulls_on_image(torch.as_tensor(scene.truth)[None], hull, K)) if posed else outline(scene.mask)
-    return to_gif(list(Film(scene.rgb, K, trace, method.space, hull, target, title).frames()))
+    target = (
+        outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K)) if posed else trace_outline(scene.mask)
+    )
+    return encode_gif(list(Animation(scene.rgb, K, trace, method.space, hull, target, title).frames()))
 
 
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
@@ -182,7 +194,7 @@ def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
 DRAWINGS: dict[str, Callable[[Occasion], Drawn]] = {
     drawing.__name__: drawing
     for drawing in (
-        overlays, worst, best, particles, silhouettes, journeys, glimpses,
-        belief, field, points, proposals, relevance, film,
+        overlays, worst, best, particles, silhouettes, trajectories, glimpses,
+        belief, field, points, proposals, relevance, animation,
     )
 }  # fmt: skip

@@ -13,6 +13,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
 from posefilter.contracts import Scene, ScoresPoses
+from posefilter.figures.field import PLANES, PointField, PoseField
+from posefilter.figures.maps import Proposals
+from posefilter.figures.particles import project_axes
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import invert, make_pose, origin_of, pose_about, rotation_of, transform
 from posefilter.geometry.rotation import exp_so3
@@ -21,22 +24,19 @@ from posefilter.nets.coordinates import ask, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, Points, PoseLikelihood, look
 from posefilter.nets.paper_likelihood import PaperLikelihood
-from posefilter.pictures.cloud import project_axes
-from posefilter.pictures.field import PLANES, PointField, PoseField
-from posefilter.pictures.maps import Proposals
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
 
 
-def few_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
+def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
     """Return noise levels that a filter ran through, broad to sharp: the ends and what lies evenly between them."""
     found = sorted({float(step.sigma.reshape(-1)[0]) for step in steps}, reverse=True)
     picked = {round(i) for i in np.linspace(0, len(found) - 1, min(most, len(found))).tolist()}
     return tuple(found[i] for i in sorted(picked))
 
 
-def pose_field(
+def evaluate_pose_field(
     method: ScoresPoses,
     scene: Scene,
     truth: Tensor,
@@ -52,11 +52,11 @@ def pose_field(
     """
     center = model.center.to(truth)
     degrees = torch.tensor(sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()}))
-    about = turned(truth, center, degrees.to(truth) * math.pi / 180)
+    about = turn_pose(truth, center, degrees.to(truth) * math.pi / 180)
     reaches = tuple(min(max(6 * sigma, model.radius / 4), 2 * model.radius) for sigma in sigmas)
     planes, turns = [], []
     for sigma, reach in zip(sigmas, reaches, strict=True):
-        poses = torch.cat([truth[None], shifted(truth, reach, cells).flatten(0, -3), about.flatten(0, -3)])
+        poses = torch.cat([truth[None], shift_pose(truth, reach, cells).flatten(0, -3), about.flatten(0, -3)])
         generator = torch.Generator(device=truth.device).manual_seed(0)
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):  # as the filter reads
             score = method.score_poses(scene, poses[None], sigma, generator, pixels)[0].float().cpu()
@@ -66,7 +66,7 @@ def pose_field(
     return PoseField(tuple(sigmas), reaches, np.stack(planes), degrees.numpy(), np.stack(turns))
 
 
-def shifted(pose: Tensor, reach: float, cells: int) -> Tensor:
+def shift_pose(pose: Tensor, reach: float, cells: int) -> Tensor:
     """Return a pose shifted within the planes of the object's axes.  (4, 4) -> (3, cells, cells, 4, 4)."""
     line = torch.linspace(-reach, reach, cells, dtype=pose.dtype, device=pose.device)
     shift = torch.zeros(3, cells, cells, 3, dtype=pose.dtype, device=pose.device)
@@ -75,14 +75,14 @@ def shifted(pose: Tensor, reach: float, cells: int) -> Tensor:
     return pose @ make_pose(torch.eye(3, dtype=pose.dtype, device=pose.device), shift)
 
 
-def turned(pose: Tensor, center: Tensor, angles: Tensor) -> Tensor:
-    """Return a pose turned about the object's axes through its centre.  (4, 4), (3,) [m], (A,) [rad] -> (3, A, 4, 4)."""
+def turn_pose(pose: Tensor, center: Tensor, angles: Tensor) -> Tensor:
+    """Return a pose turned about the object's axes through its center.  (4, 4), (3,) [m], (A,) [rad] -> (3, A, 4, 4)."""
     axes = torch.eye(3, dtype=pose.dtype, device=pose.device)
     rotation = rotation_of(pose) @ exp_so3(axes[:, None] * angles[None, :, None])
     return pose_about(rotation, rotation_of(pose) @ center + pose[:3, 3], center)
 
 
-def point_field(
+def evaluate_point_field(
     likelihood: nn.Module,
     image: Pixels,
     truth: Tensor,
@@ -93,12 +93,12 @@ def point_field(
     depthwise: bool = False,
     cells: int = 31,
 ) -> PointField:
-    """Judge one pixel of one image at places in the object's frame, its colour and ray as they are.
+    """Judge one pixel of one image at places in the object's frame, its color and ray as they are.
 
     The slice goes through where the pixel lies under the truth (4, 4), across the viewing ray, or (`depthwise`) along it:
     it is spanned by the two object axes that lie best so.
     """
-    points = point_at(pixel, image, truth, model)
+    points = make_point(pixel, image, truth, model)
     place = points.position[0, 0, 0]
     order = points.ray[0, 0, 0].abs().argsort().tolist()  # the axis most along the ray comes last
     plane = (min(order[1:]), max(order[1:])) if depthwise else (min(order[:2]), max(order[:2]))
@@ -117,7 +117,7 @@ def point_field(
     return PointField(pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), judged, found[:, 0])
 
 
-def point_at(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: ObjectModel) -> Points:
+def make_point(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: ObjectModel) -> Points:
     """Return one pixel (u, v) of one image as a point that the truth (4, 4) looks at.  -> Points (1, 1, 1)."""
     center = model.center.to(truth)
     middle = origin_of(truth, center)
@@ -134,7 +134,7 @@ def judge(likelihood: nn.Module, points: Points, sigma: float, model: ObjectMode
     return likelihood.judge(points, likelihood.level(points.position.new_tensor([sigma])), model.radius)
 
 
-def telling_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
+def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
     """Choose pixels of known depth in one image: one well on the object, and one off it but near; (u, v), and which it is.
 
     batch: of one image. Empty where the object is not seen.
@@ -154,7 +154,7 @@ def telling_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, in
     return [((i % W, i // W), number == 0) for number, i in enumerate(best)]
 
 
-def proposals_of(method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24) -> Proposals | None:
+def predict_proposals(method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24) -> Proposals | None:
     """Return what the proposal network makes of one image; None where the method has none, or no depth is known."""
     if scene.said is None or scene.cells is None or not bool(scene.cells.valid.any()):
         return None

@@ -10,9 +10,9 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from posefilter.callbacks.board import Budget, post
 from posefilter.callbacks.drawings import DRAWINGS, Occasion
-from posefilter.callbacks.gallery import Shown, errors_of, one_image, shape_of, shown
+from posefilter.callbacks.gallery import KeptImage, compute_errors, find_shape, keep_image, select_image
+from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.errors import UserError
 from posefilter.geometry.deviation import thin
 from posefilter.models.base import PoseEstimator
@@ -48,8 +48,8 @@ class Figures(Callback):
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in without}
         self.budget = Budget(share)
         self._validations = 0
-        self._kept: dict[str, list[Shown]] = {}
-        self._example: tuple[Shown, Trace, Batch] | None = None
+        self._kept: dict[str, list[KeptImage]] = {}
+        self._example: tuple[KeptImage, Trace, Batch] | None = None
         self._put_off = False
         self._points: Tensor | None = None
 
@@ -67,12 +67,12 @@ class Figures(Callback):
         method = _method(pl_module)
         if self._points is None:
             self._points = thin(method.model.points, 256).to(batch.rgb.device)
-        errors = errors_of(outputs, batch, method, self._points).tolist()
+        errors = compute_errors(outputs, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
-            self._offer(error, partial(shown, outputs, batch, method, i, error))
+            self._offer(error, partial(keep_image, outputs, batch, method, i, error))
         if self._example is None:
-            one = (self._kept["first"] or [shown(outputs, batch, method, 0, errors[0])])[0]
-            self._example = one, one_image(outputs, 0), Batch(*(x[:1].clone() for x in batch))
+            one = (self._kept["first"] or [keep_image(outputs, batch, method, 0, errors[0])])[0]
+            self._example = one, select_image(outputs, 0), Batch(*(x[:1].clone() for x in batch))
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""
@@ -97,20 +97,20 @@ class Figures(Callback):
         if self._example is None or not trainer.is_global_zero:
             return
         one, trace, batch = self._example
-        with self.budget.spend(), looking(method):
+        with self.budget.spend(), evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
-            shape, scene = shape_of(trainer, method), method.observe(batch)
+            shape, scene = find_shape(trainer, method), method.observe(batch)
             when = f"after {trainer.global_step} steps of training"
             occasion = Occasion(method, shape, self._kept, one, trace, batch, scene, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)
                 if drawn is not None:
-                    post(trainer, f"figures/{name}", drawn, self.folder and self.folder / f"validation_{name}")
+                    post_image(trainer, f"figures/{name}", drawn, self.folder and self.folder / f"validation_{name}")
 
-    def _offer(self, error: float, make: Callable[[], Shown]) -> None:
+    def _offer(self, error: float, make: Callable[[], KeptImage]) -> None:
         """Keep an image where it is among the first, the best or the worst so far; it is only copied if so."""
         kept, counts = self._kept, self.counts
-        made: Shown | None = None
+        made: KeptImage | None = None
         if len(kept["first"]) < counts["first"]:
             made = make()
             kept["first"].append(made)
@@ -124,7 +124,7 @@ class Figures(Callback):
 
 
 @contextmanager
-def looking(method: PoseEstimator) -> Iterator[None]:
+def evaluate_quietly(method: PoseEstimator) -> Iterator[None]:
     """Have a method look at images as in a validation, and leave it as it was."""
     before = [(module, module.training) for module in method.modules()]
     method.eval()

@@ -1,4 +1,4 @@
-"""What is kept of a validation's images, and sheets of them: the first, the best and the worst."""
+"""What is kept of a validation's images, and figures of them: the first, the best and the worst."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,20 +9,20 @@ from lightning import Trainer
 from torch import Tensor
 
 from posefilter.data.meshes import MeshStore
+from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, full_view, to_image
+from posefilter.figures.layout import DETAIL, add_caption, compose_figure, draw_legend, tile_width
+from posefilter.figures.overlay import Shape, draw_poses, list_axes, view_poses
+from posefilter.figures.particles import draw_particles, draw_weight_scale
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.pictures.canvas import ESTIMATE, TRUTH, grid, to_picture, whole
-from posefilter.pictures.cloud import draw_cloud, weight_scale
-from posefilter.pictures.overlay import Shape, axes_legend, overlay, view_of_poses
-from posefilter.pictures.sheet import DETAIL, headed, legend, sheet, tile_width
 from posefilter.types import Batch, Belief, Cloud, Reading, Trace
 
 _COLUMNS = 3
 _TILE = tile_width(_COLUMNS)
 
 
-class Shown(NamedTuple):
+class KeptImage(NamedTuple):
     """What is kept of an image that may be drawn."""
 
     frame_id: int
@@ -35,7 +35,7 @@ class Shown(NamedTuple):
     weights: np.ndarray  # (N,)
 
 
-def errors_of(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor) -> Tensor:
+def compute_errors(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor) -> Tensor:
     """Return how wrong each image is, infinite where no number says: ADD [m], or the share of particles that miss.  (B,)."""
     if method.tells_pose:
         error = add(trace.belief.best.detach(), batch.camera_from_object, points)
@@ -44,15 +44,15 @@ def errors_of(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor)
     return torch.nan_to_num(error.double(), nan=torch.inf)
 
 
-def shown(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float) -> Shown:
+def keep_image(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float) -> KeptImage:
     """Copy what a drawing needs of one image."""
     numpy = lambda x: x[i].detach().cpu().double().numpy()  # noqa: E731
     cloud = trace.clouds[-1]
     pixels = method.particle_pixels(cloud, batch)
-    return Shown(
+    return KeptImage(
         int(batch.frame_id[i]),
         error,
-        to_picture(batch.rgb[i]),
+        to_image(batch.rgb[i]),
         numpy(batch.intrinsics),
         numpy(trace.belief.best),
         numpy(batch.camera_from_object),
@@ -61,7 +61,7 @@ def shown(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: floa
     )
 
 
-def one_image(trace: Trace, i: int) -> Trace:
+def select_image(trace: Trace, i: int) -> Trace:
     """Return the trace of one image alone, on the CPU, without gradients."""
     take = lambda x: x[i : i + 1].detach().cpu() if x.ndim else x.detach().cpu()  # noqa: E731
     return Trace(
@@ -72,7 +72,7 @@ def one_image(trace: Trace, i: int) -> Trace:
     )
 
 
-def shape_of(trainer: Trainer, method: PoseEstimator) -> Shape:
+def find_shape(trainer: Trainer, method: PoseEstimator) -> Shape:
     """Return what outlines are drawn from: the mesh where the data has it, else the hull that the method carries."""
     store = getattr(getattr(trainer, "datamodule", None), "meshes", None)
     if isinstance(store, MeshStore) and method.model.name in store.names():
@@ -80,22 +80,22 @@ def shape_of(trainer: Trainer, method: PoseEstimator) -> Shape:
     return method.model.hull
 
 
-def draw_gallery(kept: Sequence[Shown], shape: Shape, tells_pose: bool, title: str) -> np.ndarray:
+def draw_gallery(kept: Sequence[KeptImage], shape: Shape, tells_pose: bool, title: str) -> np.ndarray:
     """Draw images side by side, in rows, under a title and above what the lines mean."""
-    tiles = grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
+    tiles = arrange_grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
     if not tells_pose:
-        return sheet(title, tiles, weight_scale())
-    return sheet(title, tiles, legend([("truth", TRUTH), ("estimate", ESTIMATE), *axes_legend()]))
+        return compose_figure(title, tiles, draw_weight_scale())
+    return compose_figure(title, tiles, draw_legend([("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()]))
 
 
-def draw_tile(one: Shown, shape: Shape, tells_pose: bool) -> np.ndarray:
+def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
     """Draw one image: a close-up of estimate and truth, or the particles where no pose is told."""
     height, width = one.rgb.shape[:2]
     if tells_pose:
-        view = view_of_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
-        picture = overlay(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
+        view = view_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
+        picture = draw_poses(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
         caption = f"ADD {1000 * one.error:.3g} mm"
     else:
-        picture = draw_cloud(one.rgb, one.pixels, one.weights, whole(height, width, _TILE))
+        picture = draw_particles(one.rgb, one.pixels, one.weights, full_view(height, width, _TILE))
         caption = f"{1 - one.error:.0%} on the object"
-    return headed(headed(picture, f"image {one.frame_id}", DETAIL), caption)
+    return add_caption(add_caption(picture, f"image {one.frame_id}", DETAIL), caption)

@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from posefilter.callbacks.board import Budget, post
+from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.contracts import Space
+from posefilter.figures.curves import draw_health
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
-from posefilter.pictures.curves import draw_health
 from posefilter.types import Trace
 
 
@@ -40,7 +40,7 @@ class FilterHealth(Callback):
         if trainer.sanity_checking or not isinstance(outputs, Trace):
             return
         space: Any = pl_module.space
-        for name, values in health(outputs, space).items():
+        for name, values in measure_health(outputs, space).items():
             total = values.sum(0).cpu()
             self._sums[name] = self._sums[name] + total if name in self._sums else total
         self._images += len(outputs.belief.best)
@@ -52,18 +52,18 @@ class FilterHealth(Callback):
         if not curves or not trainer.is_global_zero:
             return
         for logger in trainer.loggers:
-            logger.log_metrics(scalars(curves, self.most), trainer.global_step)
+            logger.log_metrics(name_scalars(curves, self.most), trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
                 picture = draw_health(curves, self._images, f"Filter health\nafter {trainer.global_step} steps of training")
-                post(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health")
+                post_image(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health")
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""
         return {name: (total / self._images).tolist() for name, total in self._sums.items()}
 
 
-def health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
+def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
     """Return each image's numbers by name, (B, T) each.
 
     ess: 1 / sum w^2 over the number of particles, in (0, 1]; spread_*: weighted root mean square distance from the mean;
@@ -86,16 +86,16 @@ def health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
     return {name: torch.stack([row[name] for row in steps], dim=1).double() for name in steps[0]}
 
 
-def scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
+def name_scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
     """Return curves as scalars with names that sort, `filter/ess/step_03`: `most` of each, evenly chosen."""
     out: dict[str, float] = {}
     for name, values in curves.items():
-        for step in evenly(len(values), most):
+        for step in choose_evenly(len(values), most):
             out[f"filter/{name}/step_{step:02d}"] = values[step]
     return out
 
 
-def evenly(count: int, most: int) -> list[int]:
+def choose_evenly(count: int, most: int) -> list[int]:
     """Return at most `most` indices below `count`, evenly spread, the first and the last among them."""
     if count <= most:
         return list(range(count))

@@ -59,10 +59,10 @@ class Records(Callback):
     ) -> None:
         """Take in one batch."""
         times = getattr(pl_module, "seconds_per_image", [])
-        self.outcomes += outcomes_of(outputs, batch, times[-1] if times else math.nan, self.beliefs)
+        self.outcomes += collect_outcomes(outputs, batch, times[-1] if times else math.nan, self.beliefs)
 
 
-def outcomes_of(trace: Trace, batch: Batch, seconds: float, beliefs: bool = True) -> list[Outcome]:
+def collect_outcomes(trace: Trace, batch: Batch, seconds: float, beliefs: bool = True) -> list[Outcome]:
     """Return a run's belief image by image.  Without `beliefs` no particles are kept."""
     belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from posefilter.callbacks.board import Budget
+from posefilter.callbacks.tensorboard import Budget
 
 
 class Speed(Callback):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALARS, EventAccumulator
 
-from posefilter.report.pictures import Picture, words
+from posefilter.report.images import StoredImage, split_words
 
 PLACES = {"figures", "validation"}  # words of a picture's name that tell where it is, not what it shows
 
@@ -20,12 +20,12 @@ class Curve(NamedTuple):
     times: tuple[float, ...]  # [s] since the epoch, when it was logged
 
 
-def read_events(folder: Path) -> tuple[dict[str, Curve], list[Picture]]:
+def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
     """Return the scalars by tag and the latest picture of each tag; both empty where nothing was logged.
 
     A file that is still being written is read as far as it goes; steps that a resumed run took again count once.
     """
-    if not any(event_files(folder)):
+    if not any(find_event_files(folder)):
         return {}, []
     logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of every step that was taken again
     log = EventAccumulator(str(folder), size_guidance={SCALARS: 0, IMAGES: 1})
@@ -33,15 +33,15 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[Picture]]:
     tags = log.Tags()
     curves = {}
     for tag in tags["scalars"]:
-        curves[tag] = once([(e.step, e.value, e.wall_time) for e in log.Scalars(tag)])
+        curves[tag] = drop_repeats([(e.step, e.value, e.wall_time) for e in log.Scalars(tag)])
     pictures = []
     for tag in tags["images"]:
         latest = log.Images(tag)[-1]
-        pictures.append(Picture(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
+        pictures.append(StoredImage(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
     return curves, pictures
 
 
-def once(events: list[tuple[int, float, float]]) -> Curve:
+def drop_repeats(events: list[tuple[int, float, float]]) -> Curve:
     """Return a curve of (step, value, time) in which steps only grow: what was logged last of a step is what counts.
 
     A run that goes on from a checkpoint goes back to its step; what it had logged beyond that is void.
@@ -55,12 +55,12 @@ def once(events: list[tuple[int, float, float]]) -> Curve:
     return Curve(steps, values, times)
 
 
-def event_files(folder: Path) -> Iterator[Path]:
+def find_event_files(folder: Path) -> Iterator[Path]:
     """Return the event files of a run."""
     return folder.glob("events.out.tfevents.*")
 
 
-def not_yet_in(pictures: list[Picture], files: list[Picture]) -> list[Picture]:
+def select_unsaved(pictures: list[StoredImage], files: list[StoredImage]) -> list[StoredImage]:
     """Return the logged pictures that no file shows: `figures/belief` is what `validation_belief.jpg` is."""
-    known = {words(picture.name) - PLACES for picture in files}
-    return [picture for picture in pictures if words(picture.name) - PLACES not in known]
+    known = {split_words(picture.name) - PLACES for picture in files}
+    return [picture for picture in pictures if split_words(picture.name) - PLACES not in known]

@@ -8,8 +8,8 @@ from typing import Any
 import yaml
 
 from posefilter.errors import UserError
-from posefilter.report.events import Curve, event_files, not_yet_in, read_events
-from posefilter.report.pictures import Picture, read_pictures
+from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
+from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
@@ -27,7 +27,7 @@ class Run:
     overrides: list[str]  # as typed
     data: dict[str, Any]  # data.json
     curves: dict[str, Curve]
-    pictures: list[Picture]
+    pictures: list[StoredImage]
     missing: list[str] = field(default_factory=list)  # a sentence each
 
     def named(self, key: str) -> str:
@@ -44,7 +44,7 @@ def read_run(folder: Path) -> Run:
     choices = {str(k): str(v) for k, v in (runtime.get("choices") or {}).items() if v is not None}
     said = (hydra.get("hydra") or {}).get("overrides") or {}
     curves, logged = read_events(folder)
-    files = read_pictures(folder / "figures")
+    files = read_images(folder / "figures")
     return Run(
         folder=folder,
         metrics=metrics,
@@ -54,8 +54,8 @@ def read_run(folder: Path) -> Run:
         overrides=[str(o) for o in said.get("task") or metrics.get("overrides") or []],
         data=read_json(folder / "data.json"),
         curves=curves,
-        pictures=[*files, *not_yet_in(logged, files)],
-        missing=missing(folder, bool(files or logged)),
+        pictures=[*files, *select_unsaved(logged, files)],
+        missing=list_missing(folder, bool(files or logged)),
     )
 
 
@@ -63,7 +63,7 @@ def check_run(folder: Path) -> None:
     """Raise UserError unless a folder is a run's."""
     if not folder.is_dir():
         raise UserError(f"run={folder}: no such folder")
-    if any((folder / mark).is_file() for mark in MARKS) or any(event_files(folder)):
+    if any((folder / mark).is_file() for mark in MARKS) or any(find_event_files(folder)):
         return
     if is_sweep(folder):
         raise UserError(f"run={folder}: is a sweep's folder; give it as sweep={folder}")
@@ -75,11 +75,11 @@ def is_sweep(folder: Path) -> bool:
     return any((folder / mark).is_file() for mark in SWEEP_MARKS)
 
 
-def missing(folder: Path, pictures: bool) -> list[str]:
+def list_missing(folder: Path, pictures: bool) -> list[str]:
     """Return what a run's folder lacks, and what that means."""
     lacks = (
         ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
-        ("No TensorBoard events, so no curves and no timings of the training.", not any(event_files(folder))),
+        ("No TensorBoard events, so no curves and no timings of the training.", not any(find_event_files(folder))),
         ("No pictures in figures/ or in the events, so no gallery.", not pictures),
         ("No .hydra folder: what was configured is not known.", not (folder / ".hydra" / "config.yaml").is_file()),
         ("No data.json: how its data were split is not known.", not (folder / "data.json").is_file()),

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from html import escape
 from importlib import resources
 
-from posefilter.report.figures import DARK, LIGHT, WIDTH_PX, Panel, draw, height
-from posefilter.report.pictures import SHEET_PX, Picture, data_uri
+from posefilter.report.charts import DARK, LIGHT, WIDTH_PX, Panel, draw_chart, measure_height
+from posefilter.report.images import SHEET_PX, StoredImage, encode_image
 
 Parts = list[tuple[str, str]]  # title and content of each section
 
@@ -38,7 +38,7 @@ def page(title: str, head: str, sections: Parts, foot: str) -> str:
 
 
 def style() -> str:
-    """Return the page's style sheet."""
+    """Return the page's style figure."""
     return resources.files("posefilter.report").joinpath("page.css").read_text()
 
 
@@ -84,11 +84,12 @@ def charts(panels: Sequence[Panel]) -> tuple[str, dict[str, bytes]]:
     """Return charts side by side, each for light and dark, and the light ones as PNGs by file name."""
     out, files = [], {}
     for panel in panels:
-        light, dark = draw(panel, LIGHT), draw(panel, DARK)
+        light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
         files[f"{slug(panel.title)}-{slug(panel.xlabel)}.png"] = light
         out.append(
             f'<picture class="chart"><source media="(prefers-color-scheme: dark)" srcset="{uri(dark)}">'
-            f'<img src="{uri(light)}" width="{WIDTH_PX}" height="{height(panel)}" alt="{escape(describe(panel))}"></picture>'
+            f'<img src="{uri(light)}" width="{WIDTH_PX}" height="{measure_height(panel)}" '
+            f'alt="{escape(describe(panel))}"></picture>'
         )
     return (f'<div class="charts">{"".join(out)}</div>' if out else ""), files
 
@@ -104,17 +105,17 @@ def uri(png: bytes) -> str:
     return "data:image/png;base64," + b64encode(png).decode()
 
 
-def gallery(pictures: Sequence[Picture], wide: bool = False) -> str:
+def gallery(pictures: Sequence[StoredImage], wide: bool = False) -> str:
     """Return pictures with their captions; one that cannot be read says so in its place."""
     out = []
     for picture in pictures:
         try:
-            source, width, height = data_uri(picture.data)
+            source, width, height = encode_image(picture.data)
         except ValueError as error:
             out.append(f'<figure><p class="gone">{escape(picture.name)}: {escape(str(error))}</p></figure>')
             continue
         caption = escape(picture.caption)
-        kind = ' class="sheet"' if width >= SHEET_PX else ""
+        kind = ' class="figure"' if width >= SHEET_PX else ""
         shown = f'<img src="{source}" width="{width}" height="{height}" alt="{caption}">'
         out.append(f'<figure{kind}><div class="scroll">{shown}</div><figcaption>{caption}</figcaption></figure>')
     kind = "gallery wide" if wide else "gallery"

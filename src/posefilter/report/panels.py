@@ -3,8 +3,8 @@
 import re
 from collections.abc import Mapping, Sequence
 
+from posefilter.report.charts import Line, Panel
 from posefilter.report.events import Curve
-from posefilter.report.figures import Line, Panel
 
 PERCENT, SHARE = (-3.0, 103.0), (-0.03, 1.03)
 # title, unit, limits, factor, {tag: label}; drawn where one of the tags was logged
@@ -31,7 +31,7 @@ BELIEF = (
         {"val/belief/truth_outscored": "by any pose", "val/belief/truth_outscored_by_wrong": "by a wrong one"},
     ),
     ("Effective particles", "", None, 1.0, {"val/belief/effective_particles": "1 / Σw²"}),
-    ("Spread of the centres", "mm", None, 1000.0, {"val/belief/spread_m": "weighted rms"}),
+    ("Spread of the centers", "mm", None, 1000.0, {"val/belief/spread_m": "weighted rms"}),
     ("Spread of the rotations", "degrees", None, 57.29578, {"val/belief/spread_rad": "weighted rms"}),
 )
 SIGNS = (
@@ -58,7 +58,7 @@ SIGNS = (
 )
 HEALTH = {  # quantity: title, unit, factor, limits
     "ess": ("Effective particles", "share of all", 1.0, SHARE),
-    "spread_m": ("Spread of the centres", "mm", 1000.0, None),
+    "spread_m": ("Spread of the centers", "mm", 1000.0, None),
     "spread_rad": ("Spread of the rotations", "degrees", 57.29578, None),
     "spread_px": ("Spread", "px", 1.0, None),
     "sigma_m": ("Noise level", "mm", 1000.0, None),
@@ -68,17 +68,19 @@ HEALTH = {  # quantity: title, unit, factor, limits
 Choice = tuple[str, str, tuple[float, float] | None, float, dict[str, str]]
 
 
-def chosen(curves: Mapping[str, Curve], choices: Sequence[Choice]) -> list[Panel]:
+def choose_panels(curves: Mapping[str, Curve], choices: Sequence[Choice]) -> list[Panel]:
     """Return the charts over the training's steps for which there is something logged."""
     out = []
     for title, unit, limits, factor, tags in choices:
-        lines = [Line(label, curves[tag].steps, scaled(curves[tag], factor)) for tag, label in tags.items() if tag in curves]
+        lines = [
+            Line(label, curves[tag].steps, scale_curve(curves[tag], factor)) for tag, label in tags.items() if tag in curves
+        ]
         if lines:
             out.append(Panel(title, "training step", unit, lines, limits))
     return out
 
 
-def training(curves: Mapping[str, Curve]) -> list[Panel]:
+def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     """Return the charts of the training: losses together, what has a unit and the learning rate alone."""
     rate = [tag for tag in curves if tag.startswith("lr-") or tag == "train/learning_rate"]
     own = {tag[6:]: curve for tag, curve in curves.items() if tag.startswith("train/") and tag not in rate}
@@ -98,7 +100,7 @@ def training(curves: Mapping[str, Curve]) -> list[Panel]:
     return out
 
 
-def health(curves: Mapping[str, Curve]) -> list[Panel]:
+def make_health_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     """Return the charts of the filter's iterations at the last validation, from `filter/<quantity>/step_<iteration>`."""
     found: dict[str, dict[int, float]] = {}
     for tag, curve in curves.items():
@@ -113,6 +115,6 @@ def health(curves: Mapping[str, Curve]) -> list[Panel]:
     return out
 
 
-def scaled(curve: Curve, factor: float) -> list[float]:
+def scale_curve(curve: Curve, factor: float) -> list[float]:
     """Return a curve's values in another unit."""
     return [factor * value for value in curve.values]

@@ -6,10 +6,10 @@ from html import escape
 from typing import Any
 
 from posefilter.report import html, panels
+from posefilter.report.diagnostics import collect_numbers, collect_timings, diagnose, read_last_validation
 from posefilter.report.gather import Run
-from posefilter.report.pictures import by_section
+from posefilter.report.images import group_by_section
 from posefilter.report.settings import Change
-from posefilter.report.signs import findings, last_validation, numbers, timings
 
 HEADLINE = (  # key, unit, label, format
     ("add/auc", "", "ADD AUC", "{:.1f}"),
@@ -38,7 +38,7 @@ ROWS = (
 BELIEF = (
     ("effective_particles", "effective particles", "{:.1f}", "1 / Σw²: how many particles carry the weight"),
     ("entropy", "entropy", "{:.2f} nat", "of the weights: 0 where one particle has all"),
-    ("spread_m", "spread of the centres", "{:.3f} m", "weighted root mean square about the mean"),
+    ("spread_m", "spread of the centers", "{:.3f} m", "weighted root mean square about the mean"),
     ("spread_rad", "spread of the rotations", "{:.2f} rad", "the same, of the angle"),
     ("mass_01d", "weight within 0.1 diameters of the truth", "{:.1%}", "1 where the belief is sure and right"),
     ("mass_2cm", "weight within 2 cm of the truth", "{:.1%}", ""),
@@ -63,17 +63,17 @@ def run_page(run: Run, changed: Sequence[Change] | None, command: str) -> tuple[
         files.update(pngs)
         return content
 
-    shown = by_section([p for p in run.pictures if p.name not in ("filter_health", "filter/health")])
+    shown = group_by_section([p for p in run.pictures if p.name not in ("filter_health", "filter/health")])
     sections = [
-        ("Signs of failure", signs(run) + charts(panels.chosen(run.curves, panels.SIGNS))),
+        ("Signs of failure", signs(run) + charts(panels.choose_panels(run.curves, panels.SIGNS))),
         ("Worst and best", worst_and_best(shown)),
         ("Results", results(run)),
-        ("Curves", charts([*panels.chosen(run.curves, panels.VALIDATION), *panels.training(run.curves)])),
+        ("Curves", charts([*panels.choose_panels(run.curves, panels.VALIDATION), *panels.make_training_panels(run.curves)])),
         (
             "Belief",
-            belief(run) + charts(panels.chosen(run.curves, panels.BELIEF)) + html.gallery(shown["belief"], wide=True),
+            belief(run) + charts(panels.choose_panels(run.curves, panels.BELIEF)) + html.gallery(shown["belief"], wide=True),
         ),
-        ("The filter at work", charts(panels.health(run.curves)) + html.gallery(shown["particles"], wide=True)),
+        ("The filter at work", charts(panels.make_health_panels(run.curves)) + html.gallery(shown["particles"], wide=True)),
         ("More pictures", html.gallery(shown["more"], wide=True)),
         ("Settings", settings(run, changed)),
         ("Time and machine", machine(run)),
@@ -84,7 +84,7 @@ def run_page(run: Run, changed: Sequence[Change] | None, command: str) -> tuple[
 
 def head(run: Run) -> str:
     """Return what is read first."""
-    step, _ = last_validation(run.curves)
+    step, _ = read_last_validation(run.curves)
     train = run.curves.get("train/total")
     most = (run.config.get("trainer") or {}).get("max_steps")
     if run.metrics:
@@ -106,7 +106,7 @@ def head(run: Run) -> str:
 
 def tiles(run: Run) -> str:
     """Return a run's main figures."""
-    known = numbers(run)
+    known = collect_numbers(run)
     return html.tiles(
         [(form.format(known[key]).rstrip("%"), unit, label) for key, unit, label, form in HEADLINE if key in known]
     )
@@ -114,7 +114,7 @@ def tiles(run: Run) -> str:
 
 def signs(run: Run) -> str:
     """Return the table of the signs of failure."""
-    found = findings(run)
+    found = diagnose(run)
     bad = sum(finding.bad for finding in found)
     if not found:
         return ""
@@ -147,7 +147,7 @@ def results(run: Run) -> str:
     columns = [("test", run.metrics)]
     if run.metrics_train:
         columns = [("evaluation", run.metrics), ("test after training", run.metrics_train)]
-    known = [numbers(Run(**{**run.__dict__, "metrics": metrics})) for _, metrics in columns]
+    known = [collect_numbers(Run(**{**run.__dict__, "metrics": metrics})) for _, metrics in columns]
     rows = [
         (label, *(form.format(own[key]) if key in own else "–" for own in known))
         for key, label, form in ROWS
@@ -177,7 +177,7 @@ def cell(content: dict[str, Any], *keys: str) -> str:
 
 def belief(run: Run) -> str:
     """Return what the belief's numbers are, and mean."""
-    known = numbers(run)
+    known = collect_numbers(run)
     rows = [
         (escape(label), form.format(known[f"belief/{key}"]), f'<span class="soft">{escape(meaning)}</span>')
         for key, label, form, meaning in BELIEF
@@ -216,7 +216,7 @@ def short(text: str, most: int = 160) -> str:
 def machine(run: Run) -> str:
     """Return how long it took, on what, with which data and code."""
     metrics = run.metrics
-    rows = [(escape(label), escape(value)) for label, value in timings(run)]
+    rows = [(escape(label), escape(value)) for label, value in collect_timings(run)]
     rows += [
         (key, html.code(str(metrics[key])))
         for key in ("device", "git", "checkpoint", "seed")

@@ -15,14 +15,14 @@ class Change(NamedTuple):
     own: str | None
 
 
-def changes(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[Change]:
+def compare_settings(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[Change]:
     """Return the settings that differ, in the run's order, those that it lacks last."""
-    own, usual = leaves(config), leaves(default)
+    own, usual = flatten_settings(config), flatten_settings(default)
     keys = [key for key in (*own, *(k for k in usual if k not in own)) if key.split(".")[0] not in PASSING]
     return [Change(key, usual.get(key), own.get(key)) for key in keys if own.get(key) != usual.get(key)]
 
 
-def leaves(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     """Return a configuration's settings by dotted key; a list is one setting, unless it holds sections."""
     out: dict[str, str] = {}
     for key, value in config.items():
@@ -30,7 +30,7 @@ def leaves(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
         if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
             value = {str(i): item for i, item in enumerate(value)}
         if isinstance(value, Mapping):
-            out |= leaves(value, f"{name}.")
+            out |= flatten_settings(value, f"{name}.")
         else:
             out[name] = value if isinstance(value, str) else json.dumps(value)
     return out

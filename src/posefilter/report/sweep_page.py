@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from html import escape
 
 from posefilter.report import html
-from posefilter.report.figures import Line, Panel
+from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run
+from posefilter.report.images import group_by_section
 from posefilter.report.panels import PERCENT, SHARE
-from posefilter.report.pictures import by_section
 from posefilter.report.run_page import settings, tiles, worst_and_best
 from posefilter.report.settings import Change
-from posefilter.report.sweeps import Group, Job, Sweep, best_group, best_job, groups
+from posefilter.report.sweeps import Group, Job, Sweep, find_best_group, find_best_job, group_jobs
 
 FIGURES = (  # name, title, unit, limits, format
     ("add/auc", "ADD AUC", "", PERCENT, "{:.1f}"),
@@ -31,14 +31,14 @@ def sweep_page(
 
     best: the best run as read from its folder, None where only the summary is left; changed: as for a run's page.
     """
-    found = groups(sweep)
+    found = group_jobs(sweep)
     names = [name for name, *_ in FIGURES if any(name in job.numbers for job in sweep.jobs)]
     plots, files = "", dict[str, bytes]()
     for axis in sweep.shown:
         content, pngs = html.charts(over(axis, sweep, found, names))
         plots, files = plots + (f"<h3>{escape(axis)}</h3>{content}" if content else ""), files | pngs
     cost, more = html.charts(against_time(found))
-    winner = best_job(sweep)
+    winner = find_best_job(sweep)
     sections = [
         ("Table", table(sweep, found, names)),
         ("Over the swept settings", plots),
@@ -92,7 +92,7 @@ def table(sweep: Sweep, found: Sequence[Group], names: Sequence[str]) -> str:
     ]
     start = len(sweep.shown)
     say = "<p>The best is marked. Where there are several seeds: mean ± half the range from the worst to the best.</p>"
-    return say + html.table(titles, rows, numeric=range(start, len(titles)), marked=best_group(found), kind="sweep")
+    return say + html.table(titles, rows, numeric=range(start, len(titles)), marked=find_best_group(found), kind="sweep")
 
 
 def mean_and_half_range(values: Sequence[float], form: str) -> str:
@@ -195,7 +195,7 @@ def best_run(winner: Job, best: Run | None, changed: Sequence[Change] | None) ->
     out = f"<p>{html.code(told(winner.place))}<br>{html.code(winner.folder)}</p>"
     if best is None:
         return out
-    return out + worst_and_best(by_section(best.pictures)) + "<h3>Its settings</h3>" + settings(best, changed)
+    return out + worst_and_best(group_by_section(best.pictures)) + "<h3>Its settings</h3>" + settings(best, changed)
 
 
 def singles(sweep: Sweep, names: Sequence[str]) -> str:

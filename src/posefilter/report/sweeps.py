@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.metrics.scores import overall
+from posefilter.report.diagnostics import flatten
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
-from posefilter.report.signs import flatten
 
 SILENT = ("out", "resume", "console", "threads")
 COLUMNS = {  # of summary.csv, and the figures of metrics.json that they hold
@@ -76,30 +76,30 @@ def read_sweep(folder: Path) -> Sweep:
     started = sorted(path.parent.parent for path in folder.rglob(".hydra/overrides.yaml"))
     unfinished = [str(path.relative_to(folder)) for path in started if path not in found and path != folder]
     if found:
-        axes, jobs = jobs_of_runs(folder, found)
+        axes, jobs = read_jobs(folder, found)
     elif (folder / "summary.csv").is_file():
-        axes, jobs = jobs_of_csv(folder / "summary.csv")
+        axes, jobs = read_jobs_from_csv(folder / "summary.csv")
     else:
         raise UserError(f"sweep={folder}: none of its {len(started)} runs has ended yet")
-    keys = [key_of(declared(folder).get(axis, [])) for axis in axes]
+    keys = [make_sort_key(read_declared(folder).get(axis, [])) for axis in axes]
     jobs.sort(key=lambda job: [key(job.place[axis]) for axis, key in zip(axes, keys, strict=True)])
     return Sweep(folder, axes, jobs, unfinished)
 
 
-def jobs_of_runs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
+def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
     metrics = [read_json(path / "metrics.json") for path in found]
     said = [dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o) for own in metrics]
     keys = dict.fromkeys(key for pairs in said for key in pairs)
     axes = [key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in said}) > 1]
     jobs = [
-        Job({axis: number(pairs.get(axis, "default")) for axis in axes}, flatten(own), str(path.relative_to(folder)))
+        Job({axis: parse_number(pairs.get(axis, "default")) for axis in axes}, flatten(own), str(path.relative_to(folder)))
         for path, own, pairs in zip(found, metrics, said, strict=True)
     ]
     return axes, jobs
 
 
-def jobs_of_csv(path: Path) -> tuple[list[str], list[Job]]:
+def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -108,23 +108,23 @@ def jobs_of_csv(path: Path) -> tuple[list[str], list[Job]]:
         raise UserError(f"{path}: has no row")
     jobs = []
     for row in rows:
-        figures = {name: number(row[column]) for column, name in COLUMNS.items() if row.get(column)}
+        figures = {name: parse_number(row[column]) for column, name in COLUMNS.items() if row.get(column)}
         numbers = {name: float(value) for name, value in figures.items() if not isinstance(value, str)}
-        jobs.append(Job({axis: number(row[axis]) for axis in axes}, numbers, row.get("folder") or ""))
+        jobs.append(Job({axis: parse_number(row[axis]) for axis in axes}, numbers, row.get("folder") or ""))
     return axes, jobs
 
 
-def declared(folder: Path) -> dict[str, list[Value]]:
+def read_declared(folder: Path) -> dict[str, list[Value]]:
     """Return the values of each axis in the order in which they were asked for, as far as that is told."""
     hydra: dict[str, Any] = read_yaml(folder / "multirun.yaml").get("hydra") or {}
     asked = dict((hydra.get("sweeper") or {}).get("params") or {})
     for typed in (hydra.get("overrides") or {}).get("task") or []:
         key, _, values = str(typed).lstrip("+~").partition("=")
         asked[key] = values
-    return {str(key): [number(value.strip()) for value in str(values).split(",")] for key, values in asked.items()}
+    return {str(key): [parse_number(value.strip()) for value in str(values).split(",")] for key, values in asked.items()}
 
 
-def key_of(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
+def make_sort_key(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
     """Return a sorting key: numbers by size, names as they were asked for."""
     places = {str(value): i for i, value in enumerate(order)}
 
@@ -136,7 +136,7 @@ def key_of(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
     return key
 
 
-def number(text: str) -> Value:
+def parse_number(text: str) -> Value:
     """Return a text as the number that it is, else as it is."""
     for kind in (int, float):
         try:
@@ -146,7 +146,7 @@ def number(text: str) -> Value:
     return text
 
 
-def groups(sweep: Sweep) -> list[Group]:
+def group_jobs(sweep: Sweep) -> list[Group]:
     """Return the runs grouped by all axes but the seed, in the axes' order."""
     out: dict[tuple[Value, ...], Group] = {}
     for job in sweep.jobs:
@@ -161,12 +161,12 @@ def score(numbers: dict[str, float]) -> float:
     return overall(numbers.get("add/auc"), numbers.get("particles_on_object", least), numbers.get("iou", least))
 
 
-def best_job(sweep: Sweep) -> Job:
+def find_best_job(sweep: Sweep) -> Job:
     """Return the run with the highest score."""
     return max(sweep.jobs, key=lambda job: score(job.numbers))
 
 
-def best_group(found: Sequence[Group]) -> int:
+def find_best_group(found: Sequence[Group]) -> int:
     """Return which group has the highest mean score."""
     means = [sum(score(job.numbers) for job in group.jobs) / len(group.jobs) for group in found]
     return means.index(max(means))

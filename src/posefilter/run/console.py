@@ -7,7 +7,7 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from posefilter.report.signs import duration
+from posefilter.report.diagnostics import format_duration
 from posefilter.run.voice import PLAIN, say
 
 SHOWN = (  # metric, what people call it, format
@@ -72,13 +72,13 @@ class Lines(Callback):
         if now - self._last < self.pause:
             return
         self._last, done, batches = now, int(past[2]) + 1, sum(map(int, trainer.num_test_batches))
-        left = duration((now - self._began) / done * (batches - done))
+        left = format_duration((now - self._began) / done * (batches - done))
         say(self.console, "testing", f"batch {done} of {batches}: {left} left", batch=done, batches=batches)
 
     def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
         step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
         rate = (step - self._step) / max(self._last - self._began, 1e-9)
-        left = f", {duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
+        left = f", {format_duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
         words = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
         numbers = {name: float(value) for name, value in seen.items() if name == "train/total" or is_whole(name)}
         numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}

@@ -5,8 +5,8 @@ from pathlib import Path
 from posefilter.data.generate import Summary
 from posefilter.data.readers import open_reader
 from posefilter.errors import UserError
-from posefilter.pictures.canvas import save_picture
-from posefilter.pictures.preview import draw_preview
+from posefilter.figures.canvas import save_image
+from posefilter.figures.preview import draw_preview
 from posefilter.run.build import instantiate
 from posefilter.run.job import Job
 from posefilter.run.voice import PLAIN, ended, typed
@@ -39,5 +39,5 @@ def draw(summary: Summary, name: str) -> Path:
     """Write preview.png: four of the frames."""
     reader = open_reader("scenes", summary.out, name)
     path = summary.out / "preview.png"
-    save_picture(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
+    save_image(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
     return path

@@ -15,13 +15,13 @@ from posefilter.data.mesh import Mesh
 from posefilter.data.meshes import MeshStore
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
+from posefilter.figures.belief import draw_belief
+from posefilter.figures.canvas import save_image
+from posefilter.figures.overlay import draw_overlay
+from posefilter.figures.recording import check_viewer, record
+from posefilter.figures.view_data import collect_view_data
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.models.base import PoseEstimator
-from posefilter.pictures.belief import draw_belief
-from posefilter.pictures.canvas import save_picture
-from posefilter.pictures.overlay import draw_overlay
-from posefilter.pictures.recording import check_viewer, record
-from posefilter.pictures.shown import what_is_shown
 from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
@@ -64,13 +64,13 @@ def predict(job: Job) -> None:
     folder = job.folder
     folder.mkdir(parents=True, exist_ok=True)
     caption = f"{method.model.name}, score {float(belief.score[0]):.2f}"
-    save_picture(draw_overlay(rgb, K.numpy(), pose, shape, caption=caption), folder / "overlay.png")
-    save_picture(draw_belief(belief, method.model, rgb, K.numpy()), folder / "belief.png")
+    save_image(draw_overlay(rgb, K.numpy(), pose, shape, caption=caption), folder / "overlay.png")
+    save_image(draw_belief(belief, method.model, rgb, K.numpy()), folder / "belief.png")
     np.savez_compressed(folder / "belief.npz", poses=belief.poses[0].numpy(), weights=weights.float().numpy())
     answer = told(pose, belief_numbers(weights), float(belief.score[0]), seconds, method, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
-        record(what_is_shown(trace, batch, method.model, method.space, shape), folder / VIEW)
+        record(collect_view_data(trace, batch, method.model, method.space, shape), folder / VIEW)
     if cfg.console != PLAIN:
         print(f"{method.model.name} at {np.array2string(1000 * pose[:3, 3], precision=1)} mm, {seconds:.2f} s")
     files = {"pose": "pose.json", "overlay": "overlay.png", "belief": "belief.png", "numbers": "belief.npz"}

@@ -12,9 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 from posefilter.errors import UserError
 from posefilter.report.gather import Run, read_run
 from posefilter.report.run_page import run_page
-from posefilter.report.settings import Change, changes
+from posefilter.report.settings import Change, compare_settings
 from posefilter.report.sweep_page import sweep_page
-from posefilter.report.sweeps import best_job, read_sweep
+from posefilter.report.sweeps import find_best_job, read_sweep
 from posefilter.run.job import Job
 from posefilter.run.voice import ended
 
@@ -44,7 +44,7 @@ def report(job: Job) -> None:
         page, files = run_page(record, compared(record), command)
     else:
         found = read_sweep(folder)
-        winner = folder / best_job(found).folder
+        winner = folder / find_best_job(found).folder
         best = read_run(winner) if (winner / "metrics.json").is_file() else None
         page, files = sweep_page(found, best, compared(best) if best else None, command)
     out = Path(job.cfg.out) if job.cfg.out else folder / "report"
@@ -66,4 +66,4 @@ def compared(run: Run) -> list[Change] | None:
     except (HydraException, OmegaConfBaseException):  # the run is of another version, whose choices are gone
         return None
     assert isinstance(default, dict)
-    return changes(run.config, {str(key): value for key, value in default.items() if key != "hydra"})
+    return compare_settings(run.config, {str(key): value for key, value in default.items() if key != "hydra"})

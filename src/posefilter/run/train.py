@@ -12,7 +12,7 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import default_collate
 
-from posefilter.callbacks.story import Story
+from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator, score_of
@@ -120,7 +120,7 @@ def build_trainer(job: Job) -> Trainer:
         cfg.trainer.val_check_interval = steps
     callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
     for story in callbacks:
-        if isinstance(story, Story):
+        if isinstance(story, TensorBoardLayout):
             story.settings = comparable(job)
     callbacks.append(progress(cfg.console))
     loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]

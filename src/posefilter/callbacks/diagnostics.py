@@ -1,0 +1,101 @@
+"""Show how the image-space methods fail: curves over the iterations, the particles' trajectories, a short animation."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from posefilter.callbacks.drawings import AnimatedScene, animate
+from posefilter.callbacks.gallery import select_image
+from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.trajectories import trace_lineage
+from posefilter.figures.canvas import AXES, Color, to_image
+from posefilter.figures.curves import draw_shares
+from posefilter.figures.trajectories import draw_trajectories
+from posefilter.metrics.signs import SignsOfFailure
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Trace
+
+LISTS: dict[str, Color] = {
+    "on_object": AXES[1],
+    "off_frame": AXES[0],
+    "near_edge": AXES[2],
+    "near_corner": (240, 160, 30),
+}
+NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
+
+
+class Diagnostics(Callback):
+    """Log where the particles are, step by step, after each validation; draw it of a test, with trajectories of some images.
+
+    The numbers themselves are among the method's metrics (val/signs/...).  Silent for methods whose particles are no pixels.
+
+    Args:
+        folder: Where figures and animations are written; nowhere if null.
+        images: How many images are drawn.
+        share: Part of the validations' time that the curves may take; no limit if null.
+    """
+
+    def __init__(self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.images = images
+        self.budget = Budget(share)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self.budget.start()
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the shares of particles, step by step."""
+        self.budget.stop()
+        scores = cast(torch.nn.ModuleDict, pl_module.scores)
+        if "signs" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
+            return
+        found = cast(SignsOfFailure, scores["signs"]).compute()
+        for logger in trainer.loggers:
+            logger.log_metrics({f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step)
+        if self.budget.allows():
+            with self.budget.spend():
+                title = f"Signs of failure\nafter {trainer.global_step} steps of training"
+                self._post(trainer, "figures/diagnostics", "validation_diagnostics", draw_diagnostics(found, title))
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+    ) -> None:
+        """Draw and animation the first batch's trajectories."""
+        if batch_idx == 0 and has_pixel_particles(outputs):
+            self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw where the particles of the test were: of validations, the last one drawn may be an early one."""
+        scores = cast(torch.nn.ModuleDict, pl_module.scores)
+        if "signs" in scores and trainer.is_global_zero:
+            found = cast(SignsOfFailure, scores["signs"]).compute()
+            self._post(trainer, "figures/diagnostics_test", "test_diagnostics", draw_diagnostics(found, "Signs of failure\nof the test"))
+
+    def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
+        """Draw and animation the trajectories of a batch's first images."""
+        states = trace_lineage(trace.clouds)
+        for i in range(min(self.images, len(states))):
+            rgb, mask, number = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy(), int(batch.frame_id[i])
+            picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), f"Trajectories\nimage {number} of the test")
+            self._post(trainer, f"trajectories/test_{i}", f"test_trajectories_{i}", picture)
+            K, truth = (x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object))
+            scene = AnimatedScene(rgb, K, truth, mask)
+            animation = animate(method, select_image(trace, i), scene, f"The filter at work\nimage {number} of the test")
+            self._post(trainer, f"trajectories/animation_{i}", f"test_animation_{i}", animation)
+
+    def _post(self, trainer: Trainer, tag: str, file: str, picture: Any) -> None:
+        post_image(trainer, tag, picture, self.folder and self.folder / file)
+
+
+def has_pixel_particles(outputs: Any) -> bool:
+    """Tell whether a step's outputs are a trace of particles that are pixels."""
+    return isinstance(outputs, Trace) and outputs.clouds[-1].state.shape[2:] == (2,)
+
+
+def draw_diagnostics(found: dict[str, Any], title: str) -> Any:
+    """Draw the shares of particles on the object, off the frame, at an edge and in a corner against the step."""
+    foot = ", ".join(f"{name.replace('_', ' ')} {found[name]:.2f}" for name in NUMBERS)
+    return draw_shares({name: (found[name], color) for name, color in LISTS.items()}, title, foot)

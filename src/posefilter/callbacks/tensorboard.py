@@ -1,0 +1,78 @@
+"""Hand pictures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
+
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from lightning import Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torch.utils.tensorboard.writer import FileWriter
+
+from posefilter.figures.canvas import to_jpeg
+
+
+def post_image(trainer: Trainer, tag: str, drawn: np.ndarray | bytes, file: Path | None) -> None:
+    """Show a picture (H, W, 3) uint8, or a animation as the bytes of a GIF, under a tag at the trainer's step.
+
+    file: where it is written too, its suffix aside (None: nowhere). It is packed once for all: `add_image` would pack it
+    again for each logger, slowly, and knows no animations. As a JPEG: TensorBoard reckons a checksum byte by byte in Python,
+    which for a PNG takes longer than most figures take to draw.
+    """
+    packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_jpeg(drawn), ".jpg")
+    width, height = measure_size(drawn)
+    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
+    for writer in get_writers(trainer):
+        writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.with_name(file.name + suffix).write_bytes(packed)
+
+
+def measure_size(drawn: np.ndarray | bytes) -> tuple[int, int]:
+    """Return width and height of a picture, or of a GIF, which has them in its head [px]."""
+    if isinstance(drawn, bytes):
+        width, height = struct.unpack("<HH", drawn[6:10])
+        return width, height
+    return drawn.shape[1], drawn.shape[0]
+
+
+def get_writers(trainer: Trainer) -> list[FileWriter]:
+    """Return the writers of the trainer's TensorBoards."""
+    boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    return [board.experiment._get_file_writer() for board in boards]
+
+
+class Budget:
+    """Lets drawing take at most a share of the time that validations take.
+
+    share: None for no limit. The first drawing is always allowed, since nobody knows what it will cost.
+    """
+
+    def __init__(self, share: float | None) -> None:
+        self.share = share
+        self.validated, self.drawn, self.last = 0.0, 0.0, 0.0
+        self._start = 0.0
+
+    def start(self) -> None:
+        """Start the clock of a validation."""
+        self._start = time.perf_counter()
+
+    def stop(self) -> None:
+        """Stop it."""
+        self.validated += time.perf_counter() - self._start
+
+    def allows(self) -> bool:
+        """Tell whether another drawing, as dear as the last one, stays within the share."""
+        return self.share is None or self.last == 0 or self.drawn + self.last <= self.share * self.validated
+
+    @contextmanager
+    def spend(self) -> Iterator[None]:
+        """Count what is done within."""
+        start = time.perf_counter()
+        yield
+        self.last = time.perf_counter() - start
+        self.drawn += self.last

@@ -1,0 +1,83 @@
+"""Draw numbers that change over the filter's iterations."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from posefilter.figures.canvas import Color, arrange_grid
+from posefilter.figures.layout import DETAIL, WIDTH, add_caption, compose_figure, draw_legend, draw_text, tile_width
+from posefilter.figures.panels import Axis, draw_curve_panel
+
+_TITLES = {
+    "ess": ("effective particles", "share of all"),
+    "spread_m": ("spread of the centers", "mm"),
+    "spread_rad": ("spread of the rotations", "degrees"),
+    "spread_px": ("spread", "px"),
+    "sigma_m": ("noise level", "mm"),
+    "sigma_px": ("noise level", "px"),
+    "best_log_likelihood": ("best log-likelihood", "nat"),
+}
+_LINE: Color = (43, 108, 176)
+_HEIGHT = 190  # [px] of a panel
+
+
+def convert_unit(name: str, values: Sequence[float]) -> np.ndarray:
+    """Return numbers in the unit that their panel is labeled with."""
+    unit = _TITLES.get(name, ("", ""))[1]
+    return np.asarray(values, float) * {"mm": 1000, "degrees": 180 / np.pi}.get(unit, 1)
+
+
+def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health") -> np.ndarray:
+    """Draw how the filter fares over its iterations, one panel a quantity.
+
+    curves: by name, one number an iteration, means over `images` images; units as the names' endings say.
+    """
+    panels = []
+    width = tile_width(2)
+    for name, values in curves.items():
+        label, unit = _TITLES.get(name, (name.replace("_", " "), ""))
+        shown = convert_unit(name, values)
+        places = np.arange(len(shown), dtype=float)
+        low, high = choose_bounds(name, shown)
+        y = Axis(unit, low, high, choose_ticks(low, high))
+        panel = draw_curve_panel([(shown, _LINE)], places, make_iteration_axis(len(shown)), y, width, _HEIGHT, thick=3)
+        panels.append(add_caption(panel, label))
+    return compose_figure(
+        title, draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL), arrange_grid(panels, 2)
+    )
+
+
+def draw_shares(curves: Mapping[str, tuple[Sequence[float], Color]], title: str, foot: str) -> np.ndarray:
+    """Draw shares of the particles over the iterations, in percent, in one panel.  curves: numbers in [0, 1], a color."""
+    count = max(len(values) for values, _ in curves.values())
+    lines = [(100 * np.asarray(values, float), color) for values, color in curves.values()]
+    y = Axis("share of the particles [%]", -2, 102, (0, 25, 50, 75, 100))
+    panel = draw_curve_panel(lines, np.arange(count, dtype=float), make_iteration_axis(count), y, WIDTH, 380, thick=4)
+    entries = [(name.replace("_", " "), color) for name, (_, color) in curves.items()]
+    return compose_figure(title, panel, draw_legend(entries), draw_text(foot, DETAIL))
+
+
+def make_iteration_axis(count: int) -> Axis:
+    """Return the axis of `count` iterations, marked in whole numbers."""
+    step = max(1, -(-(count - 1) // 6))
+    return Axis("iteration", -0.3, max(count - 0.7, 0.7), tuple(range(0, count, step)))
+
+
+def choose_bounds(name: str, shown: np.ndarray) -> tuple[float, float]:
+    """Return where a panel ends: shares at 0 and 1, sizes at 0, the rest a little beyond its numbers."""
+    good = shown[np.isfinite(shown)]
+    if name == "ess" or not len(good):
+        return 0.0, 1.0
+    low, high = float(good.min()), float(good.max())
+    if low >= 0 and not name.startswith("best"):
+        return 0.0, max(high * 1.08, 1e-9)
+    pad = max(0.08 * (high - low), 1e-6)
+    return low - pad, high + pad
+
+
+def choose_ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
+    """Return round numbers, evenly spaced, within bounds."""
+    rough = (high - low) / most
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * (1 - 1e-9))
+    return tuple(float(round(i * step, 12)) for i in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1))

@@ -1,0 +1,82 @@
+"""A map of the sphere on which areas are true (Mollweide), and colors for the third angle of a rotation."""
+
+import math
+from functools import cache
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from PIL import Image, ImageDraw
+
+from posefilter.figures.canvas import INK, PAPER, Color, draw_lines, load_font
+from posefilter.figures.layout import DETAIL, WIDTH, draw_scale
+
+_TURN = colormaps["hsv"]
+_GRID: Color = (205, 209, 214)
+_WORDS: Color = (120, 126, 136)
+_RIM = 0.01  # of the width, left free beside the map
+# the projection's auxiliary angle, tabled: 2 t + sin 2 t = pi sin(latitude)
+_ANGLE = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 721)) * np.pi / 2  # denser at the poles, where it is steep
+_LATITUDE = np.arcsin(np.clip((2 * _ANGLE + np.sin(2 * _ANGLE)) / np.pi, -1, 1))
+
+
+def map_to_sphere(rotations: torch.Tensor, axis: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return where an axis of the object points, and the turn about it.  (*, 3, 3) camera_from_object -> (*) x 3 [rad].
+
+    Longitude: 0 towards the camera, positive to the image's right; latitude: positive upwards in the image; tilt: the angle
+    of the object's next axis from "up" at that point of the sphere, clockwise as seen from outside it.
+    """
+    direction, other = rotations[..., axis], rotations[..., (axis + 1) % 3]
+    longitude = torch.atan2(direction[..., 0], -direction[..., 2])
+    latitude = torch.asin((-direction[..., 1]).clamp(-1, 1))
+    east = torch.stack([longitude.cos(), torch.zeros_like(longitude), longitude.sin()], -1)
+    north = torch.linalg.cross(direction, east)
+    return longitude, latitude, torch.atan2((other * east).sum(-1), (other * north).sum(-1))
+
+
+def project_to_map(longitude: np.ndarray, latitude: np.ndarray, width: int) -> np.ndarray:
+    """Return where places are on a map of `width` and half as high.  (P,), (P,) [rad] -> (P, 2) [px]."""
+    angle = np.interp(latitude, _LATITUDE, _ANGLE)
+    reach = (0.5 - _RIM) * width
+    u = reach * np.asarray(longitude) / np.pi * np.cos(angle)
+    return np.stack([width / 2 + u, width / 4 - reach / 2 * np.sin(angle)], -1)
+
+
+def draw_blank_map(width: int) -> np.ndarray:
+    """Return the empty map: its rim, meridians and parallels, and where they lie as the camera sees it.  -> picture."""
+    return _draw_blank(width).copy()
+
+
+@cache
+def _draw_blank(width: int) -> np.ndarray:
+    picture = np.full((width // 2, width, 3), PAPER, np.uint8)
+    line = np.linspace(-np.pi / 2, np.pi / 2, 91)
+    meridians = [
+        project_to_map(np.full(91, np.deg2rad(degrees)), line, width) for degrees in (-135, -90, -45, 0, 45, 90, 135)
+    ]
+    parallels = [project_to_map(2 * line, np.full(91, np.deg2rad(degrees)), width) for degrees in (-60, -30, 0, 30, 60)]
+    draw_lines(picture, meridians + parallels, _GRID, max(1, width // 600), halo=False)
+    rim = np.concatenate(
+        [project_to_map(np.full(91, np.pi), line, width), project_to_map(np.full(91, -np.pi), line[::-1], width)]
+    )
+    draw_lines(picture, [rim], INK, max(2, width // 400), closed=True, halo=False)
+    image = Image.fromarray(picture)
+    pen, letters = ImageDraw.Draw(image), load_font(DETAIL * width // WIDTH)
+    for degrees, word in ((-90, "left"), (0, "to the camera"), (90, "right")):
+        (at,) = project_to_map(np.deg2rad([degrees]), np.zeros(1), width)
+        pen.text((at[0], at[1] + 2), word, fill=_WORDS, font=letters, anchor="mt")
+    for degrees, word in ((-60, "60° down"), (-30, "30° down"), (30, "30° up"), (60, "60° up")):
+        (at,) = project_to_map(np.zeros(1), np.deg2rad([degrees]), width)
+        pen.text((at[0], at[1] + 2), word, fill=_WORDS, font=letters, anchor="mt")
+    return np.asarray(image)
+
+
+def color_by_turn(turn: np.ndarray) -> np.ndarray:
+    """Return the colors of turns, which end as they began.  (P,) [rad] -> (P, 3) uint8."""
+    share = (np.asarray(turn) / math.pi + 1) / 2
+    return np.asarray(_TURN(share)[..., :3] * 255).round().astype(np.uint8)
+
+
+def draw_turn_scale() -> np.ndarray:
+    """Return what the colors mean, as wide as a figure."""
+    return draw_scale("turn: -180°", color_by_turn(np.linspace(-math.pi, math.pi, 256)), "180°")

@@ -1,0 +1,93 @@
+"""Draw particles that are pixels on their way over an image, and what they see on it: the paper's figures 2 and 4."""
+
+import numpy as np
+import torch
+
+from posefilter.figures.canvas import TRUTH, Color, View, draw_dots, draw_lines, draw_row, full_view
+from posefilter.figures.layout import CAPTION, DETAIL, WIDTH, compose_figure, draw_legend, draw_text
+from posefilter.figures.overlay import trace_outline
+from posefilter.figures.panels import arrange_row
+from posefilter.figures.particles import choose_steps
+from posefilter.geometry.lookup import touches
+
+ON: Color = (60, 220, 90)
+OFF: Color = (255, 80, 60)
+START: Color = (250, 220, 60)
+_ENDS = (("on the object", ON), ("off it", OFF))
+_NUMBER = 40  # [px] where a row's number stands
+
+
+def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Tell which particles stand on a mask.  (H, W) bool, (*, 2) [px] -> (*) bool."""
+    places = torch.from_numpy(np.asarray(pixels, np.float32).reshape(1, -1, 2))
+    return touches(torch.from_numpy(mask)[None, None], places)[0].numpy().reshape(pixels.shape[:-1])
+
+
+def draw_trajectories(rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, most: int = 100) -> np.ndarray:
+    """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off it).
+
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `most` of which are drawn. Half a frame more is shown on
+    each side where a particle has left it.
+    """
+    H, W = mask.shape
+    path = states[:, :most]
+    on = find_hits(mask, path[-1])
+    left = bool(((path < -0.5) | (path > [W - 0.5, H - 0.5])).any())
+    view = View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W)) if left else full_view(H, W, WIDTH)
+    picture = view.show(rgb)
+    draw_lines(picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True)
+    for end, color in ((False, OFF), (True, ON)):
+        chosen = view.place(path[:, on == end])
+        draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
+        draw_dots(picture, chosen[0], np.tile(np.array([START]), (chosen.shape[1], 1)), 2)
+        draw_dots(picture, chosen[-1], np.tile(np.array([color]), (chosen.shape[1], 1)), 3.5)
+    said = f"{len(states)} steps: {on.mean():.0%} end on the object"
+    return compose_figure(title, draw_text(said, CAPTION), picture, draw_legend([("start", START), *_ENDS]))
+
+
+def draw_glimpses(
+    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, patches: np.ndarray, title: str, most: int = 8
+) -> np.ndarray:
+    """Draw what a few particles saw, a row a particle, below their way over the image.
+
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, n, 2) [px]; patches (T, n, k, k, 3) uint8. Frames are green where the
+    particle stands on the object, and red where not. most: steps that are shown, the first and the last among them.
+    """
+    n, k = patches.shape[1:3]
+    on = find_hits(mask, states)
+    view = full_view(mask.shape[0], mask.shape[1], WIDTH)
+    picture = view.show(rgb)
+    draw_lines(picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True)
+    for i in range(n):
+        way = view.place(states[:, i])
+        draw_lines(picture, [way], TRUTH if on[-1, i] else OFF, 2)
+        draw_dots(picture, way, np.array([ON if hit else OFF for hit in on[:, i]]), 4)
+        draw_dots(picture, way[:1], np.array([START]), 4)
+        draw_label(picture, str(i + 1), way[-1])
+    shown = choose_steps(len(states), most)
+    size = min(90, (WIDTH - _NUMBER) // len(shown))
+    rows = [arrange_row([draw_text("", CAPTION, _NUMBER), *(draw_text(f"step {t}", DETAIL, size) for t in shown)])]
+    for i in range(n):
+        cells = [np.pad(draw_text(str(i + 1), CAPTION, _NUMBER), ((size // 5, 0), (0, 0), (0, 0)), constant_values=255)]
+        for t in shown:
+            cell = np.full((size, size, 3), 255, np.uint8)
+            cell[2:-2, 2:-2] = ON if on[t, i] else OFF
+            cell[5:-5, 5:-5] = enlarge(patches[t, i], size - 10)
+            cells.append(cell)
+        rows.append(arrange_row(cells))
+    said = draw_text(f"what each saw: {k} x {k} samples", CAPTION)
+    return compose_figure(title, picture, draw_legend([("start", START), *_ENDS]), said, np.concatenate(rows))
+
+
+def enlarge(patch: np.ndarray, size: int) -> np.ndarray:
+    """Return a small picture as a square of `size`, sample by sample."""
+    rows = np.minimum(np.arange(size) * len(patch) // size, len(patch) - 1)
+    return np.asarray(patch[rows][:, rows])
+
+
+def draw_label(picture: np.ndarray, text: str, at: np.ndarray) -> None:
+    """Write a small number beside a place, in place."""
+    note = draw_row(14 * len(text) + 10, text, size=20)[7:-7, 4:]
+    v = int(np.clip(at[1] - 32, 0, picture.shape[0] - note.shape[0]))
+    u = int(np.clip(at[0] + 6, 0, picture.shape[1] - note.shape[1]))
+    picture[v : v + note.shape[0], u : u + note.shape[1]] = note

@@ -1,0 +1,158 @@
+"""What the 3-D view shows, as plain arrays: a run of the filter on one image, in the camera's frame.
+
+Nothing here knows how it is displayed; figures/recording.py writes it to a file.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from posefilter.contracts import Space
+from posefilter.data.mesh import Mesh, creased_normals
+from posefilter.figures.canvas import to_image
+from posefilter.figures.overlay import Shape, get_vertices
+from posefilter.filters.modes import find_modes
+from posefilter.geometry.camera import back_project, pixel_grid, project
+from posefilter.geometry.pose import origin_of
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.types import Batch, ObjectModel, Trace
+
+_GREY = 170
+_APART = 0.1  # of the diameter: poses nearer to each other than this are one hypothesis, as ADD < 0.1 d has it
+_LEAST = 0.01  # of the weight: lighter modes are not shown
+_MOST = 8  # modes that are shown, the estimate's not counted
+
+
+class Moment(NamedTuple):
+    """The particles at one of the filter's steps, or at the end."""
+
+    poses: np.ndarray  # (N, 4, 4) camera_from_object that the particles stand for
+    centers: np.ndarray  # (N, 3) where these put the object's center [m]
+    pixels: np.ndarray  # (N, 2) where the particles are in the image [px]
+    weights: np.ndarray  # (N,), summing to 1
+    effective: float  # effective particles, as a share of all
+    sigma: float | None  # noise level of the step; None at the end
+
+
+class Hypothesis(NamedTuple):
+    """A pose that the belief holds for possible."""
+
+    pose: np.ndarray  # (4, 4) camera_from_object
+    weight: float  # share of the belief's weight
+
+
+class ViewData(NamedTuple):
+    """All that is shown of one image."""
+
+    name: str  # of the object
+    rgb: np.ndarray  # (H, W, 3) uint8, as the filter saw it
+    K: np.ndarray  # (3, 3) [px], pixel centers at integers
+    points: np.ndarray  # (P, 3) the pixels whose depth is known, back-projected [m]
+    colors: np.ndarray  # (P, 3) uint8
+    footprints: np.ndarray  # (P,) size of a pixel at that depth [m]
+    mesh: Mesh
+    center: np.ndarray  # (3,) of the object, in its own frame [m]
+    radius: float  # of the object [m]
+    unit: str  # of the noise level: "px", or "mm" where particles are poses
+    moments: tuple[Moment, ...]  # one a step of the filter, then the belief
+    estimate: Hypothesis  # as refined; its weight is that of the mode it belongs to
+    others: tuple[Hypothesis, ...]  # the other modes, the heaviest first
+    left_out: float  # share of the weight in modes too light to be shown
+    score: float
+
+
+def collect_view_data(
+    trace: Trace, batch: Batch, model: ObjectModel, space: Space, shape: Shape, image: int = 0
+) -> ViewData:
+    """Gather what is shown of one of a trace's images.  shape: the object's mesh, or the vertices of its hull [m]."""
+    K = batch.intrinsics[image].detach().cpu().double()
+    center = model.center.detach().cpu().double()
+    points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
+    belief = trace.belief
+    poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
+    estimate, others, left_out = find_hypotheses(poses, belief.log_weights[image].detach().cpu(), best, model)
+    unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
+    moments = []
+    for cloud, reading, step in zip(trace.clouds, trace.readings, trace.steps, strict=True):
+        pixels = None if isinstance(space, PoseSpace) else cloud.state[image]
+        sigma = float(step.sigma if step.sigma.ndim == 0 else step.sigma[image]) * unit
+        moments.append(make_moment(reading.pose[image], cloud.log_weights[image], pixels, center, K, sigma))
+    last = None if isinstance(space, PoseSpace) else trace.clouds[-1].state[image]
+    moments.append(make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None))
+    return ViewData(
+        name=model.name,
+        rgb=to_image(batch.rgb[image]),
+        K=K.numpy(),
+        points=points,
+        colors=colors,
+        footprints=points[:, 2] / float(K[0, 0]),
+        mesh=make_mesh(shape, model.name),
+        center=center.numpy(),
+        radius=model.radius,
+        unit="mm" if isinstance(space, PoseSpace) else "px",
+        moments=tuple(moments),
+        estimate=estimate,
+        others=others,
+        left_out=left_out,
+        score=float(belief.score[image]),
+    )
+
+
+def make_moment(
+    poses: Tensor, log_weights: Tensor, pixels: Tensor | None, center: Tensor, K: Tensor, sigma: float | None
+) -> Moment:
+    """Return the particles of one step.  (N, 4, 4), (N,), (N, 2) [px]; pixels None: where the poses put the center."""
+    poses = poses.detach().cpu().double()
+    weights = torch.softmax(log_weights.detach().cpu().double(), 0)
+    centers = origin_of(poses, center)
+    at = project(centers, K) if pixels is None else pixels.detach().cpu().double()
+    effective = float(1 / weights.square().sum() / len(weights))
+    return Moment(poses.numpy(), centers.numpy(), at.numpy(), weights.numpy(), effective, sigma)
+
+
+def color_points(rgb: Tensor, depth: Tensor, K: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Back-project the pixels whose depth is known.  (3, H, W), (1, H, W) [m], (3, 3) -> (P, 3) [m], (P, 3) uint8."""
+    z = depth[0].detach().cpu().double()
+    known = z > 0
+    pixels = pixel_grid(*z.shape).double()[known]
+    return back_project(pixels, z[known], K.detach().cpu().double()).numpy(), to_image(rgb)[known.numpy()]
+
+
+def find_hypotheses(
+    poses: Tensor, log_weights: Tensor, best: Tensor, model: ObjectModel
+) -> tuple[Hypothesis, tuple[Hypothesis, ...], float]:
+    """Return the estimate, the belief's other modes, and the weight in modes too light to be shown.
+
+    The estimate stands for the mode of the particle nearest to it, and has that one's weight; where no particle is within a
+    tenth of the diameter (a refinement led away from them all) it has none. (N, 4, 4), (N,), (4, 4).
+    """
+    space = PoseSpace((*model.center.tolist(),), model.radius)
+    apart = _APART * model.diameter
+    modes = find_modes(poses, log_weights, space, bandwidth=apart / 3, reach=3.0)
+    distance, nearest = space.distance(poses, best).min(0)
+    own = int(modes.member[nearest]) if float(distance) <= apart else None
+    rest = [i for i in range(len(modes.weights)) if i != own]
+    shown = [i for i in rest if float(modes.weights[i]) >= _LEAST][:_MOST]
+    others = tuple(Hypothesis(modes.states[i].numpy(), float(modes.weights[i])) for i in shown)
+    estimate = Hypothesis(best.numpy(), 0.0 if own is None else float(modes.weights[own]))
+    return estimate, others, float(sum(modes.weights[i] for i in rest if i not in shown))
+
+
+def make_mesh(shape: Shape, name: str) -> Mesh:
+    """Return the mesh to be shown: the object's own, or its convex hull in plain gray."""
+    if isinstance(shape, Mesh):
+        return shape
+    vertices = get_vertices(shape).astype(np.float64)
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError:  # a flat object has no volume: joggle it
+        hull = ConvexHull(vertices, qhull_options="QJ")
+    faces = hull.simplices.astype(np.int64)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0  # Qhull's triangles turn either way
+    faces[inward] = faces[inward][:, ::-1]
+    plain = np.full((1, 1, 3), _GREY, np.uint8)
+    return Mesh(name, vertices, faces, None, plain, None, creased_normals(vertices, faces))

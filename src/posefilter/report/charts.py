@@ -1,0 +1,181 @@
+"""Draw small charts, each for light and for dark pages."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from PIL import Image
+
+from posefilter.figures.canvas import create_figure, rasterize
+
+WIDTH_PX, HEIGHT_PX, FINER = 380, 250, 2  # as shown; drawn at twice that for sharp screens
+NOISY = 60  # points, from which on a line is drawn smoothed over its own faint self
+
+
+class Theme(NamedTuple):
+    """The colors of a page."""
+
+    name: str
+    paper: str
+    ink: str
+    soft: str
+    lines: tuple[str, ...]
+
+
+LIGHT = Theme("light", "#ffffff", "#1c2430", "#8a93a3", ("#2563c9", "#d9650d", "#0f8a5f", "#a03bb0", "#b58900", "#5b6675"))
+DARK = Theme("dark", "#171b23", "#e4e8ef", "#7d8797", ("#7aa8ff", "#ffa657", "#4fcf9d", "#d79be6", "#e6cf6a", "#a5afbf"))
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line, or the dots of one kind."""
+
+    label: str
+    x: Sequence[float]
+    y: Sequence[float]
+    low: Sequence[float] = ()  # of a band about the line, where there is one
+    high: Sequence[float] = ()
+    dots: Sequence[tuple[float, float]] = ()  # single runs, whose mean the line is
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart.  `categories`: names of 0, 1, ... along the side, instead of a horizontal axis of numbers."""
+
+    title: str
+    xlabel: str
+    unit: str
+    lines: Sequence[Line]
+    limits: tuple[float, float] | None = None  # of y
+    categories: Sequence[str] = ()
+    log_x: bool = False
+    joined: bool = True  # whether a line is one, or only its dots
+
+
+def draw_chart(panel: Panel, theme: Theme) -> bytes:
+    """Return a chart as a PNG of few colors."""
+    tall = measure_height(panel)
+    figure = create_figure(WIDTH_PX * FINER, tall * FINER, dpi=100 * FINER)
+    figure.set_layout_engine("constrained")
+    figure.set_facecolor(theme.paper)
+    axes = figure.subplots()
+    for number, line in enumerate(panel.lines):
+        color = theme.lines[number % len(theme.lines)]
+        if panel.categories:
+            draw_across(axes, line, color)
+        else:
+            draw_line(axes, line, color, panel.joined)
+    style_axes(axes, panel, theme)
+    if len(panel.lines) > 1:
+        place = (
+            {"loc": "outside lower center", "ncols": count_columns(panel)} if needs_legend_below(panel) else {"loc": "best"}
+        )
+        legend = figure.legend if needs_legend_below(panel) else axes.legend
+        legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2, **place)
+    return to_small_png(figure)
+
+
+def needs_legend_below(panel: Panel) -> bool:
+    """Tell whether a chart's legend stands below it, since it would hide what is drawn."""
+    return len(panel.lines) > 1 and (bool(panel.categories) or len(panel.lines) > 4 or not panel.joined)
+
+
+def count_columns(panel: Panel) -> int:
+    """Return in how many columns a legend below a chart fits the chart's width."""
+    return 2 if max(len(line.label) for line in panel.lines) <= 26 else 1
+
+
+def measure_height(panel: Panel) -> int:
+    """Return a chart's height [px]."""
+    legend = 17 * -(-len(panel.lines) // count_columns(panel)) if needs_legend_below(panel) else 0
+    return legend + (74 + 25 * max(len(panel.categories), 3) if panel.categories else HEIGHT_PX)
+
+
+def draw_line(axes: Axes, line: Line, color: str, joined: bool) -> None:
+    """Draw one line over numbers."""
+    if len(line.x) > NOISY:
+        axes.plot(line.x, line.y, color=color, linewidth=0.7, alpha=0.3)
+        axes.plot(line.x, smooth(line.y), color=color, linewidth=1.7, label=line.label)
+        return
+    if len(line.low):
+        axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.16, linewidth=0)
+    style = "o-" if joined else "o"
+    few = len(line.x) <= 20
+    axes.plot(line.x, line.y, style if few else "-", color=color, linewidth=1.7, markersize=4.5, label=line.label)
+    if line.dots:
+        axes.plot(*zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0)
+
+
+def draw_across(axes: Axes, line: Line, color: str) -> None:
+    """Draw values to the right of named rows: range, single runs, mean."""
+    if len(line.low):
+        axes.hlines(line.x, line.low, line.high, color=color, linewidth=5, alpha=0.25)
+    if line.dots:
+        rows, values = zip(*line.dots, strict=True)
+        axes.plot(values, rows, "o", color=color, alpha=0.45, markersize=3.5)
+    axes.plot(line.y, line.x, "o", color=color, markersize=6.5, label=line.label)
+
+
+def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
+    """Give a chart its title, axes, legend and colors."""
+    axes.set_facecolor(theme.paper)
+    title = f"{panel.title} [{panel.unit}]" if panel.unit else panel.title
+    axes.set_title(title, fontsize=10, color=theme.ink, loc="left", fontweight="bold")
+    axes.tick_params(colors=theme.soft, labelcolor=theme.ink, labelsize=8.5, length=3)
+    axes.grid(color=theme.soft, alpha=0.25, linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(theme.soft)
+    if panel.categories:
+        axes.set_yticks(range(len(panel.categories)), [shorten(name) for name in panel.categories])
+        axes.set_ylim(len(panel.categories) - 0.5, -0.5)
+        if panel.limits:
+            axes.set_xlim(*panel.limits)
+    else:
+        axes.set_xlabel(panel.xlabel, fontsize=8.5, color=theme.ink)
+        if panel.log_x:
+            axes.set_xscale("log")
+            ticks = sorted({x for line in panel.lines for x in line.x})
+            axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
+            axes.minorticks_off()
+        else:
+            axes.xaxis.set_major_locator(
+                MaxNLocator(6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x))
+            )
+        if panel.limits:
+            axes.set_ylim(*panel.limits)
+
+
+def smooth(values: Sequence[float]) -> np.ndarray:
+    """Return a running mean over about a twelfth of a line; what is not finite does not count.
+
+    Narrower at the start, where losses fall steeply; at the end one-sided, since a narrow mean would show a last jump as a
+    trend.
+    """
+    y = np.asarray(values, float)
+    reach = max(1, len(y) // 24)
+    known = np.isfinite(y)
+    total = np.concatenate([[0.0], np.cumsum(np.where(known, y, 0))])
+    count = np.concatenate([[0], np.cumsum(known)])
+    at = np.arange(len(y))
+    back = np.minimum(reach, at)
+    low, high = at - back, at + np.minimum(back, len(y) - 1 - at) + 1
+    n = count[high] - count[low]
+    return np.where(n > 0, (total[high] - total[low]) / np.maximum(n, 1), math.nan)
+
+
+def shorten(name: str, most: int = 22) -> str:
+    """Return a name that fits beside a chart."""
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def to_small_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG of 128 colors, a third of the plain one."""
+    stream = BytesIO()
+    Image.fromarray(rasterize(figure)).quantize(128, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()

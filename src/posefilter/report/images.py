@@ -1,0 +1,101 @@
+"""The pictures that a run left: which section each belongs to, and how each is packed into a page."""
+
+import base64
+import re
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+from PIL import Image, UnidentifiedImageError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
+SECTIONS = {  # the first whose words a picture's name has; what is in none is "more"
+    "worst": {"worst"},
+    "best": {"best"},
+    "overlays": {"overlay", "overlays", "estimate", "estimates", "pose", "poses"},
+    "belief": {
+        "belief",
+        "beliefs",
+        "so3",
+        "rotations",
+        "likelihood",
+        "field",
+        "points",
+        "proposals",
+        "relevance",
+        "marginals",
+    },
+    "particles": {
+        "trajectories",
+        "particles",
+        "cloud",
+        "clouds",
+        "animation",
+        "video",
+        "row",
+        "silhouettes",
+        "diagnostics",
+        "health",
+        "filter",
+    },
+}
+LARGEST_PX = 2000
+SHEET_PX = 900  # from which width on a picture is a figure of several, which a phone scrolls
+KEPT_BYTES = 60_000
+
+
+class StoredImage(NamedTuple):
+    """A picture as it is in its file."""
+
+    name: str
+    caption: str
+    data: bytes
+
+
+def read_images(folder: Path) -> list[StoredImage]:
+    """Return the pictures of a folder, sorted by name as people count; empty where there is none."""
+    if not folder.is_dir():
+        return []
+    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=lambda p: sort_by_number(p.name))
+    return [StoredImage(path.stem, path.stem.replace("_", " "), path.read_bytes()) for path in files]
+
+
+def sort_by_number(name: str) -> list[tuple[int, str]]:
+    """Return a sorting key in which 2 comes before 10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def split_words(name: str) -> frozenset[str]:
+    """Return the words of a name, whatever joins them."""
+    return frozenset(part for part in re.split(r"[^a-z0-9]+", name.lower()) if part)
+
+
+def group_by_section(pictures: list[StoredImage]) -> dict[str, list[StoredImage]]:
+    """Return the pictures of each section, in its order; "more" holds the rest."""
+    out: dict[str, list[StoredImage]] = {section: [] for section in (*SECTIONS, "more")}
+    for picture in pictures:
+        own = split_words(picture.name)
+        section = next((section for section, keys in SECTIONS.items() if own & keys), "more")
+        out[section].append(picture)
+    return out
+
+
+def encode_image(data: bytes) -> tuple[str, int, int]:
+    """Return a picture as a data URI with its width and height [px]: large ones smaller, animations as they are.
+
+    Raises ValueError where the bytes are no picture.
+    """
+    try:
+        with Image.open(BytesIO(data)) as image:
+            kind, (width, height) = (image.format or "").lower(), image.size
+            if len(data) > KEPT_BYTES and getattr(image, "n_frames", 1) == 1:
+                image.thumbnail((LARGEST_PX, LARGEST_PX))
+                width, height = image.size
+                stream = BytesIO()
+                image.convert("RGB").save(stream, "WEBP", quality=86, method=2)
+                data, kind = stream.getvalue(), "webp"
+            else:
+                image.load()
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise ValueError(f"no picture: {error}") from error
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}", width, height

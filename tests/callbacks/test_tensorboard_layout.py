@@ -1,0 +1,98 @@
+"""TensorBoard reads back what was written for it: layout, settings, final metrics."""
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.backend.event_processing.data_provider import MultiplexerDataProvider
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.backend.event_processing.plugin_event_multiplexer import EventMultiplexer
+from tensorboard.context import RequestContext
+from tensorboard.plugins.base_plugin import TBContext
+from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
+from tensorboard.plugins.hparams.backend_context import Context
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from tensorboard.util.tensor_util import make_ndarray
+
+from posefilter.callbacks.tensorboard_layout import LAYOUT, TensorBoardLayout
+
+
+def run(folder: Path, particles: int, auc: float, refine: str = "none") -> None:
+    """Go through a run's hooks, with the numbers that a training and a test would have left."""
+    logger = TensorBoardLogger(folder, name="", version="")
+    trainer: Any = SimpleNamespace(loggers=[logger], global_step=10, is_global_zero=True, sanity_checking=False)
+    layout, method = TensorBoardLayout(), torch.nn.Module()
+    layout.settings = {"refine": refine, "filter.particles": particles, "data.settle": False, "seed": 0}
+    trainer.callback_metrics = {}
+    layout.on_fit_start(trainer, method)  # type: ignore[arg-type]
+    for step, score in ((10, 40.0), (20, 35.0)):
+        trainer.global_step, trainer.callback_metrics = step, {"val/score": torch.tensor(score)}
+        layout.on_validation_end(trainer, method)  # type: ignore[arg-type]
+    trainer.callback_metrics = {
+        "test/add/auc": torch.tensor(auc),
+        "test/iou": torch.tensor(0.5),
+        "test/else": torch.tensor(1),
+    }
+    layout.on_test_end(trainer, method)  # type: ignore[arg-type]
+    logger.finalize("success")
+
+
+def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
+    run(tmp_path, 50, 61.5, "gradient")
+    board = EventAccumulator(str(tmp_path / "hparams"))
+    board.Reload()
+    plugin = board.SummaryMetadata("_hparams_/session_start_info").plugin_data
+    start = HParamsPluginData.FromString(plugin.content).session_start_info.hparams
+    assert plugin.plugin_name == "hparams"
+    assert start["filter.particles"].number_value == 50
+    assert start["refine"].string_value == "gradient"
+    assert start["data.settle"].string_value == "false"
+    assert [e.value for e in board.Scalars("validation/score")] == [40.0, 35.0]
+    assert [e.value for e in board.Scalars("validation/best_score")] == [40.0, 40.0]
+    assert board.Scalars("test/add/auc")[0].value == 61.5
+    assert set(board.Tags()["scalars"]) == {"validation/score", "validation/best_score", "test/add/auc", "test/iou"}
+
+
+def test_runs_of_a_sweep_are_compared_by_what_differs(tmp_path: Path) -> None:
+    run(tmp_path / "a", 50, 61.5)
+    run(tmp_path / "b", 100, 65.0)
+    runs = EventMultiplexer().AddRunsFromDirectory(str(tmp_path))
+    runs.Reload()
+    context = Context(TBContext(data_provider=MultiplexerDataProvider(runs, str(tmp_path))))
+    found = context.hparams_metadata(RequestContext(), "")
+    data = context.hparams_from_data_provider(RequestContext(), "", 100)
+    experiment = context.experiment_from_metadata(RequestContext(), "", True, found, data)
+    first = experiment.hparam_infos[0]
+    assert first.name == "filter.particles"
+    assert first.differs
+    assert not any(info.differs for info in experiment.hparam_infos[1:])
+    assert {metric.name.tag for metric in experiment.metric_infos} == {
+        "validation/score", "validation/best_score", "test/add/auc", "test/iou",
+    }  # fmt: skip
+
+
+def test_layout_is_read_back_in_the_storys_order(tmp_path: Path) -> None:
+    run(tmp_path, 50, 61.5)
+    board = EventAccumulator(str(tmp_path))
+    board.Reload()
+    layout = Layout.FromString(make_ndarray(board.Tensors("custom_scalars__config__")[0].tensor_proto).item())
+    assert [category.title for category in layout.category] == list(LAYOUT)
+    assert layout.category[0].chart[0].multiline.tag == ["val/score$"]
+
+
+def test_every_chart_finds_what_methods_log() -> None:
+    logged = [
+        "val/score", "val/add/auc", "val/add_s/auc", "val/add/median_mm", "val/add/recall_01d", "val/iou",
+        "val/particles_on_object", "train/total", "train/likelihood", "train/learning_rate", "train/coordinate_error_mm",
+        "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00", "filter/spread_px/step_00",
+        "filter/sigma_px/step_00", "signs/off_frame/last", "val/belief/coverage_50", "val/belief/mass_2cm",
+        "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_share", "speed/drawing_share",
+    ]  # fmt: skip
+    for charts in LAYOUT.values():
+        for title, (_, tags) in charts.items():
+            assert any(re.match(tag, name) for tag in tags for name in logged), title
+    losses = LAYOUT["2  Does it learn?"]["losses"][1][0]
+    assert [name for name in logged if re.match(losses, name)] == ["train/total", "train/likelihood"]
