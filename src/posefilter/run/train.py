@@ -25,6 +25,7 @@ from posefilter.run.method import build_method, check_loss, method_of, read_chec
 from posefilter.run.results import record, show, write_json
 from posefilter.run.resume import last_checkpoint
 from posefilter.run.voice import PLAIN, say, typed
+from posefilter.run.warm_start import warm_start
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +45,9 @@ def train(job: Job) -> float:
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
     method.adopt(data.object_model(0))
+    if job.cfg.warm_start:
+        copied, left = warm_start(method, read_checkpoint(job.cfg.warm_start))
+        log.info("warm start from %s: %d tensors copied, %d left as drawn", job.cfg.warm_start, copied, left)
     rehearse(method, data)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
     start = start_from(job)
