@@ -72,7 +72,12 @@ class Diagnostics(Callback):
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" in scores and trainer.is_global_zero:
             found = cast(SignsOfFailure, scores["signs"]).compute()
-            self._post(trainer, "figures/diagnostics_test", "test_diagnostics", draw_diagnostics(found, "Signs of failure\nof the test"))
+            self._post(
+                trainer,
+                "figures/diagnostics_test",
+                "test_diagnostics",
+                draw_diagnostics(found, "Signs of failure\nof the test"),
+            )
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
         """Draw and animation the trajectories of a batch's first images."""
