@@ -24,23 +24,23 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from posefilter.metrics.registry import find_metric, read_number
 from posefilter.report.events import read_events
 
+KEYS = (
+    "particles_on_object", "signs/on_object/first", "iou", "add/auc", "add/recall_01d", "add_s/auc", "signs/distinct/last",
+    "signs/pairwise_cosine", "signs/heading", "signs/offset_r2", "signs/off_frame/last", "signs/near_edge/last",
+    "signs/near_corner/last", "signs/auroc",
+)  # fmt: skip
+
+
+def column(key: str) -> Callable[[dict[str, Any]], float | None]:
+    """Return what reads a number out of a run, in the unit of its column."""
+    return lambda run: None if (value := read_number(run, key)) is None else find_metric(key).convert(value)
+
+
 COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "on object %": lambda m: 100 * m["particles_on_object"],
-    "began on it %": lambda m: 100 * m["signs"]["on_object"][0],
-    "box IoU": lambda m: m["iou"],
-    "ADD AUC": lambda m: m["add"]["auc"],
-    "ADD < 0.1 d %": lambda m: m["add"]["recall_01d"],
-    "ADD-S AUC": lambda m: m["add_s"]["auc"],
-    "distinct %": lambda m: 100 * m["signs"]["distinct"][-1],
-    "same direction": lambda m: m["signs"]["pairwise_cosine"],
-    "heading": lambda m: m["signs"]["heading"],
-    "offset R2": lambda m: m["signs"]["offset_r2"],
-    "off frame %": lambda m: 100 * m["signs"]["off_frame"][-1],
-    "at an edge %": lambda m: 100 * m["signs"]["near_edge"][-1],
-    "in a corner %": lambda m: 100 * m["signs"]["near_corner"][-1],
-    "AUROC": lambda m: m["signs"]["auroc"],
+    **{find_metric(key).column: column(key) for key in KEYS},
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
 RELATIVE = "relative time"
@@ -163,10 +163,10 @@ def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     columns = {
         **COLUMNS,
-        "s / image": lambda m: m["seconds_per_image"],
+        "s / image": column("seconds_per_image"),
         "seed": lambda m: m["seed"],
-        "steps": lambda m: m["training"]["steps"],
-        "tested step": lambda m: m["training"]["tested_step"],
+        "steps": column("training/steps"),
+        "tested step": column("training/tested_step"),
     }
     writer.writerow(["table", "method", "variant", "changed", *columns, "device", "torch"])
     for name, runs in found.items():

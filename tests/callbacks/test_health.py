@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from posefilter.callbacks.health import choose_evenly, measure_health, name_scalars
-from posefilter.figures.curves import choose_bounds, choose_ticks, convert_unit, draw_health
+from posefilter.figures.curves import choose_bounds, choose_ticks, draw_health
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
+from posefilter.metrics.registry import find_metric
 from posefilter.types import Belief, Cloud, Reading, Step, Trace
 
 
@@ -73,15 +74,15 @@ def test_figure_shows_the_numbers_where_its_axes_say() -> None:
         top = len(picture) - 6 - 48 - high
         assert 1 - (rows[places == places.min()].mean() - top) / (high - 1) == pytest.approx(first, abs=0.03)
         assert 1 - (rows[places == places.max()].mean() - top) / (high - 1) == pytest.approx(last, abs=0.03)
-    assert convert_unit("spread_m", [0.1]).tolist() == [100.0]
-    assert convert_unit("spread_rad", [math.pi]).tolist() == [180.0]
+    assert find_metric("filter/spread_m").convert(0.1) == 100.0
+    assert find_metric("filter/spread_rad").convert(math.pi) == 180.0
 
 
 def test_axes_hold_the_numbers_and_have_round_ticks() -> None:
-    assert choose_bounds("ess", np.array([0.2, 0.3])) == (0.0, 1.0)
-    assert choose_bounds("spread_m", np.array([2.0, 10.0])) == pytest.approx((0.0, 10.8))
-    low, high = choose_bounds("best_log_likelihood", np.array([-3.0, 5.0]))
+    assert choose_bounds(find_metric("filter/ess"), np.array([20.0, 30.0])) == (0.0, 100.0)
+    assert choose_bounds(find_metric("filter/spread_m"), np.array([2.0, 10.0])) == pytest.approx((0.0, 10.8))
+    low, high = choose_bounds(find_metric("filter/best_log_likelihood"), np.array([-3.0, 5.0]))
     assert low < -3 < 5 < high
-    assert choose_bounds("sigma_m", np.array([np.nan])) == (0.0, 1.0)
+    assert choose_bounds(find_metric("filter/sigma_m"), np.array([np.nan])) == (0.0, 1.0)
     assert choose_ticks(0.0, 10.8) == (0.0, 5.0, 10.0)
     assert choose_ticks(-3.6, 5.6) == (-2.5, 0.0, 2.5, 5.0)

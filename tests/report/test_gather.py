@@ -37,7 +37,7 @@ def test_a_resumed_run_is_one_curve() -> None:
 
 def test_signs_of_failure_are_found(run: Path) -> None:
     """Those beyond their limits, and no others."""
-    found = {finding.sign.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))}
+    found = {finding.diagnostic.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))}
     assert found["signs/pairwise_cosine"] == (0.95, True)
     assert found["signs/off_frame/last"] == (0.625, True)  # the last step's
     assert found["signs/offset_r2"] == (0.5, False)

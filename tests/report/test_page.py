@@ -9,17 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jinja2 import Environment
 from PIL import Image
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import MARK
 
+from posefilter.report.blocks import Paragraph, Section, Text, Tile, show_images
 from posefilter.report.charts import DARK, LIGHT, Line, Panel, draw_chart, smooth
 from posefilter.report.gather import read_run
-from posefilter.report.html import gallery
 from posefilter.report.images import StoredImage
-from posefilter.report.run_page import run_page
+from posefilter.report.page import Page
+from posefilter.report.run_page import make_run_page
 from posefilter.report.settings import Change
-from posefilter.report.sweep_page import sweep_page
+from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import read_sweep
 
 HOME = Path(__file__).parents[2]
@@ -53,7 +55,8 @@ def outside(page: str) -> Outside:
 
 def test_the_page_tells_the_run(run: Path) -> None:
     """Figures, signs, settings, by their values; names are escaped; nothing is fetched."""
-    page, files = run_page(read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x")
+    content = make_run_page(read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x")
+    page, files = content.render(), content.files()
     for text in (
         "87.5",
         "ADD AUC",
@@ -82,7 +85,8 @@ def test_a_bare_run_still_has_a_page(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text(
         '{"instances": 2, "missed": 0, "add": null, "iou": 0.25, "particles_on_object": 0.5}'
     )
-    page, files = run_page(read_run(tmp_path), None, "x")
+    content = make_run_page(read_run(tmp_path), None, "x")
+    page, files = content.render(), content.files()
     assert "0.250" in page
     assert "No TensorBoard events" in page
     assert "No pictures" in page
@@ -92,8 +96,30 @@ def test_a_bare_run_still_has_a_page(tmp_path: Path) -> None:
 
 def test_a_broken_picture_is_named() -> None:
     """It does not end the report."""
-    assert "worst_3" in gallery([StoredImage("worst_3", "worst 3", b"nothing")])
-    assert 'class="gone"' in gallery([StoredImage("worst_3", "worst 3", b"nothing")])
+    section = Section("Images", show_images([StoredImage("worst_3", "worst 3", b"nothing")]))
+    page = Page("t", "h", [], [], [], [section], Paragraph(["x"])).render()
+    assert re.search(r'<p class="gone">worst_3: [^<]+</p>', page)
+
+
+HOSTILE = "<script>alert(1)</script>\"'&"
+
+
+def test_a_hostile_name_is_only_words(run: Path) -> None:
+    """Wherever a name, a setting or a caption goes on a page, it is escaped: no element comes of it."""
+    there = run.rename(run.parent / HOSTILE.replace("/", "|"))
+    (there / "metrics.json").write_text((there / "metrics.json").read_text().replace("contrast", "<script>loss"))
+    page = make_run_page(read_run(there), [Change(HOSTILE, HOSTILE, HOSTILE)], HOSTILE).render()
+    assert outside(page).fetched == []
+    assert "<script>" not in page
+    assert page.count("&lt;script&gt;") >= 6
+    blocks = [Paragraph([HOSTILE, Text(HOSTILE, "code")]), *show_images([StoredImage(HOSTILE, HOSTILE, b"")])]
+    built = Page(
+        HOSTILE, HOSTILE, [], [Tile(HOSTILE, HOSTILE, HOSTILE)], [HOSTILE], [Section("s", blocks)], Paragraph([HOSTILE])
+    )
+    text = built.render()
+    assert "<script>" not in text
+    assert text.count("&lt;script&gt;") == 10
+    assert "<script>" in Environment(autoescape=False).from_string("{{ name }}").render(name=HOSTILE)  # the check can fail
 
 
 def test_charts_have_both_themes() -> None:
@@ -126,10 +152,10 @@ def close_to(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 @pytest.mark.slow
 def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
     """On a desk and on a phone, light and dark: no complaint, every picture there, nothing wider than the window."""
-    text, _ = run_page(read_run(run), [Change("a.long.key." * 9, "1", "x" * 150)], "x")
+    text = make_run_page(read_run(run), [Change("a.long.key." * 9, "1", "x" * 150)], "x").render()
     (tmp_path / "run.html").write_text(text)
     best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
-    (tmp_path / "sweep.html").write_text(sweep_page(read_sweep(sweep), best, [], "x")[0])
+    (tmp_path / "sweep.html").write_text(make_sweep_page(read_sweep(sweep), best, [], "x").render())
     with browser(tmp_path / "profile") as page:
         for name in ("run", "sweep"):
             pictures = (tmp_path / f"{name}.html").read_text().count("<img")
@@ -150,7 +176,7 @@ def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_browser_notices(run: Path, tmp_path: Path) -> None:
     """A script that is refused, a broken picture and a line too wide are each seen: the test above can fail."""
-    text, _ = run_page(read_run(run), [], "x")
+    text = make_run_page(read_run(run), [], "x").render()
     bad = '<img src="data:image/png;base64,AAAA"><div style="width:700px">x</div><script>1</script></body>'
     (tmp_path / "bad.html").write_text(text.replace("</body>", bad))
     with browser(tmp_path / "profile") as page:
@@ -188,11 +214,12 @@ def test_the_sweep_page(sweep: Path) -> None:
     """Means over seeds, the best marked, what is unfinished named; nothing is fetched."""
     found = read_sweep(sweep)
     best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
-    page, files = sweep_page(found, best, [], "x")
+    content = make_sweep_page(found, best, [], "x")
+    page, files = content.render(), content.files()
     marked = re.search(r'<tr class="marked">.*?</tr>', page)
     assert marked
     assert "80.3 ± 2.5" in marked[0]
     assert "Without a result: filter.particles=1000,refine=none,seed=2" in page
     assert "78.0 to 83.0 (sd 2.5)" in page
     assert outside(page).fetched == []
-    assert {"add-auc-filter-particles.png", "add-auc-refine.png", "add-auc-time-an-image-s.png"} <= set(files)
+    assert {"add-auc-filter-particles.png", "add-auc-refine.png", "add-auc-time-per-image-s.png"} <= set(files)

@@ -1,13 +1,15 @@
 """How a sweep's runs are grouped, ordered and summed up."""
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.report.sweep_page import mean_and_half_range, over, spread, sweep_page
-from posefilter.report.sweeps import find_best_group, find_best_job, group_jobs, read_sweep
+from posefilter.metrics.registry import find_metric
+from posefilter.report.sweep_page import chart_over, format_mean, format_spread, make_sweep_page
+from posefilter.report.sweeps import find_best_group, find_best_job, find_ties, group_jobs, read_sweep
 
 
 def test_axes_groups_and_best(sweep: Path) -> None:
@@ -30,7 +32,7 @@ def test_axes_groups_and_best(sweep: Path) -> None:
 def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     """Over the particles, a line a refinement, with the seeds' range about it."""
     found = read_sweep(sweep)
-    panel = over("filter.particles", found, group_jobs(found), ["add/auc"])[0]
+    panel = chart_over("filter.particles", found, group_jobs(found), [find_metric("add/auc")])[0]
     none, gradient = panel.lines
     assert none.label == "refine=none"
     assert list(gradient.x) == [50.0, 1000.0]
@@ -38,15 +40,30 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     assert list(gradient.low) == pytest.approx([68.5, 78.0])
     assert list(gradient.high) == pytest.approx([73.5, 83.0])
     assert panel.log_x
-    assert over("refine", found, group_jobs(found), ["add/auc"])[0].categories == ["none", "gradient"]
+    assert chart_over("refine", found, group_jobs(found), [find_metric("add/auc")])[0].categories == ["none", "gradient"]
 
 
 def test_cells() -> None:
     """Means with half the range; extremes with the standard deviation."""
-    assert mean_and_half_range([1.0, 2.0, 6.0], "{:.1f}") == "3.0 ± 2.5"
-    assert mean_and_half_range([2.0], "{:.1f}") == "2.0"
-    assert mean_and_half_range([], "{:.1f}") == "–"
-    assert spread([1.0, 3.0], "{:.2f}") == "1.00 to 3.00 (sd 1.41)"
+    auc, share = find_metric("add/auc"), find_metric("particles_on_object")
+    assert format_mean([1.0, 2.0, 6.0], auc) == "3.0 ± 2.5"
+    assert format_mean([0.02], share) == "2.0"  # in the unit of its column
+    assert format_mean([], auc) == "–"
+    assert format_spread([0.01, 0.03], share) == "1.0 to 3.0 (sd 1.4)"
+
+
+def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
+    """To one decimal: a hundredth of a point more is no better, a tenth is."""
+    best, other = (sweep / f"filter.particles=1000,refine=gradient,seed={seed}" / "metrics.json" for seed in (2, 1))
+    first, second = json.loads(best.read_text()), json.loads(other.read_text())
+    for auc, median, seed, ties in ((82.98, 2.0, 1, 2), (82.98, 9.0, 2, 2), (82.8, 2.0, 2, 1)):
+        second["add"] |= {"auc": auc, "median_mm": median}
+        other.write_text(json.dumps(second))
+        found = read_sweep(sweep)
+        assert find_best_job(found).place["seed"] == seed
+        assert find_ties(found) == ties
+        assert ("least median ADD" in make_sweep_page(found, None, None, "x").render()) == (ties > 1)
+    assert first["add"]["auc"] == 83.0
 
 
 def test_summary_alone_is_enough(tmp_path: Path) -> None:
@@ -57,7 +74,8 @@ def test_summary_alone_is_enough(tmp_path: Path) -> None:
     assert found.axes == ["filter.particles"]
     assert [job.place["filter.particles"] for job in found.jobs] == [50, 1000]
     assert find_best_job(found).numbers == {"add/auc": 80.5, "seconds_per_image": 2.0}
-    page, files = sweep_page(found, None, None, "x")
+    content = make_sweep_page(found, None, None, "x")
+    page, files = content.render(), content.files()
     assert "those of summary.csv" in page
     assert "add-auc-filter-particles.png" in files
 

@@ -118,6 +118,6 @@ def test_commands_can_be_typed_as_they_stand(value: str) -> None:
 
 def test_words_and_hydras_own_log() -> None:
     assert told(METRICS) == "loss 1.25, ADD AUC 71.0"
-    assert briefly({"train/total": 2.0, "val/particles_on_object": 0.5, "val/iou": 1.0}) == "loss 2, on the object 50%"
+    assert briefly({"train/total": 2.0, "val/particles_on_object": 0.5, "val/iou": 1.0}) == "loss 2, on object 50.0 %"
     assert logging_for(["console=rich"]) == []
     assert len(logging_for(["model=x", "console=plain"])) == 1

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from posefilter.run.sweeps import draw, read_rows, summarise
+from posefilter.metrics.registry import PERCENT
+from posefilter.report.summary import draw_summary
+from posefilter.run.sweeps import read_rows, summarise
 
 
 def sweep(folder: Path, key: str, words: list[str]) -> Path:
@@ -25,14 +27,38 @@ def test_a_ladder_is_read_as_one_climbs_it(tmp_path: Path) -> None:
     summarise(sweep(tmp_path, "rung", rungs))
     with (tmp_path / "summary.csv").open() as file:
         assert [row["rung"] for row in csv.DictReader(file)] == rungs
-    panel = draw(*read_rows(tmp_path)).axes[0]
+    panel = draw_summary(*read_rows(tmp_path)).axes[0]
     assert [text.get_text() for text in panel.get_yticklabels()] == rungs
     assert panel.yaxis_inverted(), "from the top"
-    assert [bar.get_width() for bar in panel.patches] == pytest.approx([place / 10 for place in range(5)])
+    assert panel.lines[0].get_xdata() == pytest.approx([10 * place for place in range(5)])  # [%]
 
 
 def test_numbers_are_read_by_size(tmp_path: Path) -> None:
     summarise(sweep(tmp_path, "filter.particles", ["1000", "50", "100"]))
     rows, _ = read_rows(tmp_path)
     assert [row["filter.particles"] for row in rows] == [50, 100, 1000]
-    assert draw(*read_rows(tmp_path)).axes[0].get_xscale() == "log"
+    assert draw_summary(*read_rows(tmp_path)).axes[0].get_xscale() == "log"
+
+
+def test_an_axis_has_the_tried_values_and_a_share_its_whole_range(tmp_path: Path) -> None:
+    """So that figures of several sweeps can be compared, and a value is read where it was tried."""
+    summarise(sweep(tmp_path, "filter.steps", ["3", "10", "7"]))
+    panel = draw_summary(*read_rows(tmp_path)).axes[0]
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["3", "7", "10"]
+    assert panel.get_ylim() == pytest.approx(PERCENT)
+    assert panel.get_title(loc="left") == "particles on the object [%]"
+
+
+@pytest.mark.parametrize("words", [["1", "2"], ["a", "b"]])
+def test_one_seed_is_no_trend(tmp_path: Path, words: list[str]) -> None:
+    """Nothing is joined, and the title says why; with two seeds the means are."""
+    rows = [{"folder": word, "filter": float(word) if word in "12" else word, "add_auc": 50.0} for word in words]
+    once = draw_summary(rows, ["filter"])
+    assert "one seed each" in once.get_suptitle()
+    assert [line.get_linestyle() for line in once.axes[0].lines] == ["None"]
+    assert not once.axes[0].patches
+    twice = draw_summary([*rows, *({**row, "seed": 1, "add_auc": 70.0} for row in rows)], ["filter", "seed"])
+    assert "one seed" not in twice.get_suptitle()
+    panel = twice.axes[0]
+    means = [bar.get_width() for bar in panel.patches] if words == ["a", "b"] else panel.lines[0].get_ydata()
+    assert means == pytest.approx([60.0, 60.0])

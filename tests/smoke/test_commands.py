@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from posefilter.errors import UserError
+from posefilter.metrics.registry import find_metric
 from posefilter.run import run_command
 from posefilter.run.evaluate import evaluate
 from posefilter.run.train import train
@@ -23,6 +24,20 @@ def numbers(metrics: dict) -> dict:
     """Return what must agree between a training's test and an evaluation."""
     keys = ("instances", "missed", "add", "add_s", "iou", "particles_on_object", "belief")
     return {key: metrics[key] for key in keys}
+
+
+def check_registry(metrics: dict) -> None:
+    """Assert that each number which a run writes down is known by name: nothing else can be shown."""
+    keys = [key for key in list_numbers(metrics) if key != "seed" and not key.startswith("data/")]
+    assert len(keys) > 10
+    assert all(find_metric(key).label for key in keys)
+
+
+def list_numbers(content: object, name: str = "") -> list[str]:
+    """Return where numbers are, and lists of numbers."""
+    if isinstance(content, dict):
+        return [key for own, value in content.items() for key in list_numbers(value, f"{name}/{own}" if name else own)]
+    return [name] if isinstance(content, int | float) or (isinstance(content, list) and name.startswith("signs")) else []
 
 
 def read(folder: Path) -> dict:
@@ -54,6 +69,7 @@ def test_a_run_leaves_what_was_promised(trained: Path) -> None:
     assert 0 < metrics["training"]["tested_step"] <= 8
     assert metrics["training"]["seconds_per_step"] > 0
     assert metrics["training"]["cpu_seconds_per_step"] > 0
+    check_registry(metrics)
 
 
 def test_checkpoints_are_plain_data(trained: Path) -> None:
@@ -148,6 +164,7 @@ def test_every_image_space_method_goes_the_whole_way(model: str, tiny_job, tmp_p
     metrics = read(tmp_path)
     assert (metrics["add"] is None) == (model in ("cnn_patch", "downsized"))
     assert 0 <= metrics["particles_on_object"] <= 1
+    check_registry(metrics)
 
 
 def test_a_training_shorter_than_its_interval_is_validated_at_its_end(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -1,1 +1,1 @@
-"""Pictures of what a filter saw and believes: arrays in, arrays or figures out.  Nothing here knows Lightning."""
+"""Figures of what a filter sees and believes: arrays in, images out.  Nothing here knows Lightning."""

@@ -7,41 +7,33 @@ import numpy as np
 from posefilter.figures.canvas import Color, arrange_grid
 from posefilter.figures.layout import DETAIL, WIDTH, add_caption, compose_figure, draw_legend, draw_text, tile_width
 from posefilter.figures.panels import Axis, draw_curve_panel
+from posefilter.metrics.registry import HIGHER, PERCENT, MetricInfo, find_metric
 
-_TITLES = {
-    "ess": ("effective particles", "share of all"),
-    "spread_m": ("spread of the centers", "mm"),
-    "spread_rad": ("spread of the rotations", "degrees"),
-    "spread_px": ("spread", "px"),
-    "sigma_m": ("noise level", "mm"),
-    "sigma_px": ("noise level", "px"),
-    "best_log_likelihood": ("best log-likelihood", "nat"),
-}
 _LINE: Color = (43, 108, 176)
 _HEIGHT = 190  # [px] of a panel
-
-
-def convert_unit(name: str, values: Sequence[float]) -> np.ndarray:
-    """Return numbers in the unit that their panel is labeled with."""
-    unit = _TITLES.get(name, ("", ""))[1]
-    return np.asarray(values, float) * {"mm": 1000, "degrees": 180 / np.pi}.get(unit, 1)
 
 
 def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health") -> np.ndarray:
     """Draw how the filter fares over its iterations, one panel a quantity.
 
-    curves: by name, one number an iteration, means over `images` images; units as the names' endings say.
+    Args:
+        curves: One number an iteration by name (`ess`, `spread_m`, ...), as stored.
+        images: How many images these are the means of.
+        title: Of the figure.
+
+    Returns:
+        A figure (H, WIDTH, 3) uint8.
     """
     panels = []
     width = tile_width(2)
     for name, values in curves.items():
-        label, unit = _TITLES.get(name, (name.replace("_", " "), ""))
-        shown = convert_unit(name, values)
-        places = np.arange(len(shown), dtype=float)
-        low, high = choose_bounds(name, shown)
-        y = Axis(unit, low, high, choose_ticks(low, high))
-        panel = draw_curve_panel([(shown, _LINE)], places, make_iteration_axis(len(shown)), y, width, _HEIGHT, thick=3)
-        panels.append(add_caption(panel, label))
+        info = find_metric(f"filter/{name}")
+        numbers = info.factor * np.asarray(values, float)
+        low, high = choose_bounds(info, numbers)
+        y = Axis(info.unit, low, high, choose_ticks(low, high))
+        places = np.arange(len(numbers), dtype=float)
+        panel = draw_curve_panel([(numbers, _LINE)], places, make_iteration_axis(len(numbers)), y, width, _HEIGHT, thick=3)
+        panels.append(add_caption(panel, info.label))
     return compose_figure(
         title, draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL), arrange_grid(panels, 2)
     )
@@ -63,13 +55,15 @@ def make_iteration_axis(count: int) -> Axis:
     return Axis("iteration", -0.3, max(count - 0.7, 0.7), tuple(range(0, count, step)))
 
 
-def choose_bounds(name: str, shown: np.ndarray) -> tuple[float, float]:
-    """Return where a panel ends: shares at 0 and 1, sizes at 0, the rest a little beyond its numbers."""
-    good = shown[np.isfinite(shown)]
-    if name == "ess" or not len(good):
+def choose_bounds(info: MetricInfo, values: np.ndarray) -> tuple[float, float]:
+    """Return where a panel ends: shares at 0 and 100, sizes at 0, the rest a little beyond its numbers."""
+    if info.limits == PERCENT:
+        return 0.0, 100.0
+    good = values[np.isfinite(values)]
+    if not len(good):
         return 0.0, 1.0
     low, high = float(good.min()), float(good.max())
-    if low >= 0 and not name.startswith("best"):
+    if low >= 0 and info.direction != HIGHER:
         return 0.0, max(high * 1.08, 1e-9)
     pad = max(0.08 * (high - low), 1e-6)
     return low - pad, high + pad

@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from PIL import Image
 
 from posefilter.figures.canvas import create_figure, rasterize
 
 WIDTH_PX, HEIGHT_PX, FINER = 380, 250, 2  # as shown; drawn at twice that for sharp screens
+MOST_TICKS = 10  # swept values that are marked on an axis
 NOISY = 60  # points, from which on a line is drawn smoothed over its own faint self
 
 
@@ -56,6 +57,8 @@ class Panel:
     categories: Sequence[str] = ()
     log_x: bool = False
     joined: bool = True  # whether a line is one, or only its dots
+    ticks: Sequence[float] = ()  # of x, where it is not free: the values that were tried
+    log_y: bool = False
 
 
 def draw_chart(panel: Panel, theme: Theme) -> bytes:
@@ -140,10 +143,13 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
         axes.set_xlabel(panel.xlabel, fontsize=8.5, color=theme.ink)
         if panel.log_x:
             axes.set_xscale("log")
-            ticks = sorted({x for line in panel.lines for x in line.x})
+        if panel.log_y:
+            axes.set_yscale("log")
+        ticks = sorted(set(panel.ticks))
+        if 0 < len(ticks) <= MOST_TICKS:
             axes.set_xticks(ticks, [f"{x:g}" for x in ticks])
-            axes.minorticks_off()
-        else:
+            axes.xaxis.set_minor_locator(NullLocator())
+        elif not panel.log_x:
             axes.xaxis.set_major_locator(
                 MaxNLocator(6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x))
             )

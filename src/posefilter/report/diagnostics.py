@@ -1,72 +1,62 @@
-"""Signs of failure: which of a run's numbers say that something is wrong, and what that something is."""
+"""Diagnostics: which of a run's numbers say that something is wrong, and what that something is."""
 
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from posefilter.metrics.registry import MetricInfo, find_metric
 from posefilter.report.events import Curve
 from posefilter.report.gather import Run
 
 
 class Diagnostic(NamedTuple):
-    """A number that tells of a failure when it is beyond its limit."""
+    """A number that tells of a failure when it is beyond its limit, on the side that is worse."""
 
-    key: str  # of `numbers`
-    label: str
-    limit: float
-    above: bool  # whether it is too much that is bad
+    key: str  # of `collect_numbers`
+    limit: float  # as stored
     meaning: str  # what a number beyond the limit says
+
+    @property
+    def info(self) -> MetricInfo:
+        """Return how the number is called and written."""
+        return find_metric(self.key)
+
+    def is_bad(self, value: float) -> bool:
+        """Tell whether a number is beyond the limit."""
+        return self.info.direction * (value - self.limit) < 0
 
 
 class Finding(NamedTuple):
-    """A sign of one run."""
+    """A diagnostic of one run."""
 
-    sign: Diagnostic
+    diagnostic: Diagnostic
     value: float
     bad: bool
 
 
 DIAGNOSTICS = (
-    Diagnostic("missed_share", "images without an estimate", 0.0, True, "The filter gave no finite pose."),
+    Diagnostic("missed_share", 0.0, "The filter gave no finite pose."),
     Diagnostic(
-        "belief/truth_outscored_by_wrong",
-        "images in which a wrong pose outscores the truth",
-        0.02,
-        True,
-        "The likelihood prefers a wrong pose: no amount of searching would help.",
+        "belief/truth_outscored_by_wrong", 0.02, "The likelihood prefers a wrong pose: no amount of searching would help."
     ),
-    Diagnostic(
-        "belief/coverage_90", "truths within the belief's 90 % region [%]", 75.0, False, "The belief is too sure of itself."
-    ),
-    Diagnostic("signs/pairwise_cosine", "agreement of the displacements", 0.8, True, "All particles move in one direction."),
-    Diagnostic(
-        "signs/offset_r2", "true offsets explained (R²)", 0.1, False, "Displacements say no more than their mean would."
-    ),
-    Diagnostic(
-        "signs/heading", "cosine of displacement and true offset", 0.2, False, "Particles do not head for the object."
-    ),
-    Diagnostic("signs/auroc", "AUROC of the likelihood", 0.7, False, "The likelihood hardly tells object from background."),
-    Diagnostic("signs/off_frame/last", "particles off the frame at the end", 0.1, True, "Particles drift out of the image."),
-    Diagnostic(
-        "signs/near_edge/last", "particles at an edge at the end", 0.4, True, "Particles gather at the image's edges."
-    ),
-    Diagnostic(
-        "signs/near_corner/last", "particles in a corner at the end", 0.2, True, "Particles gather in the image's corners."
-    ),
-    Diagnostic("particles_on_object", "particles on the object at the end", 0.2, False, "Few particles find the object."),
-    Diagnostic("fallen", "validation score lost since its best", 5.0, True, "Training went past its best: see the curves."),
-    Diagnostic("not_finite", "training scalars that are no numbers", 0.0, True, "The training diverged."),
+    Diagnostic("belief/coverage_90", 75.0, "The belief is too sure of itself."),
+    Diagnostic("signs/pairwise_cosine", 0.8, "All particles move in one direction."),
+    Diagnostic("signs/offset_r2", 0.1, "Displacements say no more than their mean would."),
+    Diagnostic("signs/heading", 0.2, "Particles do not head for the object."),
+    Diagnostic("signs/auroc", 0.7, "The likelihood hardly tells object from background."),
+    Diagnostic("signs/off_frame/last", 0.1, "Particles drift out of the image."),
+    Diagnostic("signs/near_edge/last", 0.4, "Particles gather at the image's edges."),
+    Diagnostic("signs/near_corner/last", 0.2, "Particles gather in the image's corners."),
+    Diagnostic("particles_on_object", 0.2, "Few particles find the object."),
+    Diagnostic("fallen", 5.0, "Training went past its best: see the curves."),
+    Diagnostic("not_finite", 0.0, "The training diverged."),
 )
 
 
 def diagnose(run: Run) -> list[Finding]:
-    """Return the signs that a run tells of, the bad ones first."""
+    """Return the diagnostics that a run has numbers for, the bad ones first."""
     known = collect_numbers(run)
-    found = [
-        Finding(sign, known[sign.key], (known[sign.key] > sign.limit) if sign.above else (known[sign.key] < sign.limit))
-        for sign in DIAGNOSTICS
-        if sign.key in known
-    ]
+    found = [Finding(one, known[one.key], one.is_bad(known[one.key])) for one in DIAGNOSTICS if one.key in known]
     return sorted(found, key=lambda finding: not finding.bad)
 
 

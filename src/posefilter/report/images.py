@@ -40,7 +40,7 @@ SECTIONS = {  # the first whose words a picture's name has; what is in none is "
     },
 }
 LARGEST_PX = 2000
-SHEET_PX = 900  # from which width on a picture is a figure of several, which a phone scrolls
+WIDE_PX = 900  # from which width on an image is several in a row, which a phone scrolls
 KEPT_BYTES = 60_000
 
 
@@ -99,3 +99,8 @@ def encode_image(data: bytes) -> tuple[str, int, int]:
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise ValueError(f"no picture: {error}") from error
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}", width, height
+
+
+def encode_png(png: bytes) -> str:
+    """Return a PNG as a data URI."""
+    return "data:image/png;base64," + base64.b64encode(png).decode()

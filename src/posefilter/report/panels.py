@@ -3,80 +3,50 @@
 import re
 from collections.abc import Mapping, Sequence
 
+from posefilter.metrics.registry import find_metric
 from posefilter.report.charts import Line, Panel
 from posefilter.report.events import Curve
 
-PERCENT, SHARE = (-3.0, 103.0), (-0.03, 1.03)
-# title, unit, limits, factor, {tag: label}; drawn where one of the tags was logged
-VALIDATION = (
-    ("Area under the curve", "", PERCENT, 1.0, {"val/add/auc": "ADD", "val/add_s/auc": "ADD-S"}),
-    ("Recall, ADD", "%", PERCENT, 1.0, {"val/add/recall_01d": "0.1 diameter", "val/add/recall_2cm": "2 cm"}),
-    ("Median error", "mm", None, 1.0, {"val/add/median_mm": "ADD", "val/add_s/median_mm": "ADD-S"}),
-    (
-        "On the object",
-        "",
-        SHARE,
-        1.0,
-        {"val/iou": "box IoU", "val/particles_on_object": "share of particles"},
-    ),
-)
-BELIEF = (
-    ("Belief near the truth", "", SHARE, 1.0, {"val/belief/mass_01d": "0.1 diameter", "val/belief/mass_2cm": "2 cm"}),
-    ("Coverage", "%", PERCENT, 1.0, {"val/belief/coverage_50": "50 % region", "val/belief/coverage_90": "90 % region"}),
-    (
-        "Truth outscored",
-        "share of images",
-        SHARE,
-        1.0,
-        {"val/belief/truth_outscored": "by any pose", "val/belief/truth_outscored_by_wrong": "by a wrong one"},
-    ),
-    ("Effective particles", "", None, 1.0, {"val/belief/effective_particles": "1 / Σw²"}),
-    ("Spread of the centers", "mm", None, 1000.0, {"val/belief/spread_m": "weighted rms"}),
-    ("Spread of the rotations", "degrees", None, 57.29578, {"val/belief/spread_rad": "weighted rms"}),
-)
-SIGNS = (
-    (
-        "Where particles end",
-        "share",
-        SHARE,
-        1.0,
-        {
-            "signs/on_object/last": "on the object",
-            "signs/off_frame/last": "off the frame",
-            "signs/near_edge/last": "at an edge",
-            "signs/near_corner/last": "in a corner",
-        },
-    ),
-    (
-        "Displacements",
-        "",
-        (-1.05, 1.05),
-        1.0,
-        {"val/signs/pairwise_cosine": "agreement", "val/signs/offset_r2": "R²", "val/signs/heading": "heading"},
-    ),
-    ("Likelihood, AUROC", "", SHARE, 1.0, {"val/signs/auroc": "AUROC"}),
-)
-HEALTH = {  # quantity: title, unit, factor, limits
-    "ess": ("Effective particles", "share of all", 1.0, SHARE),
-    "spread_m": ("Spread of the centers", "mm", 1000.0, None),
-    "spread_rad": ("Spread of the rotations", "degrees", 57.29578, None),
-    "spread_px": ("Spread", "px", 1.0, None),
-    "sigma_m": ("Noise level", "mm", 1000.0, None),
-    "sigma_px": ("Noise level", "px", 1.0, None),
-    "best_log_likelihood": ("Best log-likelihood", "nat", 1.0, None),
+# a chart's title, and the logged scalars that it shows; drawn where one of them was logged
+VALIDATION = {
+    "Area under the curve": ("val/add/auc", "val/add_s/auc"),
+    "Recall": ("val/add/recall_01d", "val/add/recall_2cm"),
+    "Median error": ("val/add/median_mm", "val/add_s/median_mm"),
+    "Box IoU": ("val/iou",),
+    "Particles on the object": ("val/particles_on_object",),
 }
-Choice = tuple[str, str, tuple[float, float] | None, float, dict[str, str]]
+BELIEF = {
+    "Belief near the truth": ("val/belief/mass_01d", "val/belief/mass_2cm"),
+    "Coverage of the truth": ("val/belief/coverage_50", "val/belief/coverage_90"),
+    "Truth outscored": ("val/belief/truth_outscored", "val/belief/truth_outscored_by_wrong"),
+    "Effective particles": ("val/belief/effective_particles",),
+    "Spread of the centers": ("val/belief/spread_m",),
+    "Spread of the rotations": ("val/belief/spread_rad",),
+}
+SIGNS = {
+    "Where particles end": (
+        "signs/on_object/last",
+        "signs/off_frame/last",
+        "signs/near_edge/last",
+        "signs/near_corner/last",
+    ),
+    "Displacements": ("val/signs/pairwise_cosine", "val/signs/offset_r2", "val/signs/heading"),
+    "Likelihood": ("val/signs/auroc",),
+}
 
 
-def choose_panels(curves: Mapping[str, Curve], choices: Sequence[Choice]) -> list[Panel]:
+def choose_panels(curves: Mapping[str, Curve], charts: Mapping[str, Sequence[str]]) -> list[Panel]:
     """Return the charts over the training's steps for which there is something logged."""
     out = []
-    for title, unit, limits, factor, tags in choices:
+    for title, keys in charts.items():
+        infos = {key: find_metric(key) for key in keys if key in curves}
         lines = [
-            Line(label, curves[tag].steps, scale_curve(curves[tag], factor)) for tag, label in tags.items() if tag in curves
+            Line(info.short or info.label, curves[key].steps, scale_curve(curves[key], info.factor))
+            for key, info in infos.items()
         ]
         if lines:
-            out.append(Panel(title, "training step", unit, lines, limits))
+            first = next(iter(infos.values()))
+            out.append(Panel(title, "training step", first.unit, lines, first.limits))
     return out
 
 
@@ -109,9 +79,9 @@ def make_health_panels(curves: Mapping[str, Curve]) -> list[Panel]:
             found.setdefault(match[1], {})[int(match[2])] = curve.values[-1]
     out = []
     for name, values in found.items():
-        title, unit, factor, limits = HEALTH.get(name, (name.replace("_", " ").capitalize(), "", 1.0, None))
-        steps = sorted(values)
-        out.append(Panel(title, "iteration", unit, [Line(name, steps, [factor * values[step] for step in steps])], limits))
+        info, steps = find_metric(f"filter/{name}"), sorted(values)
+        line = Line(info.label, steps, [info.convert(values[step]) for step in steps])
+        out.append(Panel(info.label.capitalize(), "iteration", info.unit, [line], info.limits))
     return out
 
 

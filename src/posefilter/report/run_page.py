@@ -1,239 +1,258 @@
 """Lay a run out on one page."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
-from html import escape
 from typing import Any
 
-from posefilter.report import html, panels
-from posefilter.report.diagnostics import collect_numbers, collect_timings, diagnose, read_last_validation
+from posefilter.metrics.registry import METRICS, find_metric, read_number
+from posefilter.report import panels
+from posefilter.report.blocks import (
+    Block,
+    Cell,
+    Fold,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    Text,
+    Tile,
+    draw_charts,
+    show_images,
+)  # fmt: skip
+from posefilter.report.diagnostics import (
+    collect_numbers,
+    collect_timings,
+    diagnose,
+    read_last_validation,
+)
 from posefilter.report.gather import Run
-from posefilter.report.images import group_by_section
+from posefilter.report.images import StoredImage, group_by_section
+from posefilter.report.page import Page
 from posefilter.report.settings import Change
 
-HEADLINE = (  # key, unit, label, format
-    ("add/auc", "", "ADD AUC", "{:.1f}"),
-    ("add_s/auc", "", "ADD-S AUC", "{:.1f}"),
-    ("add/recall_01d", "%", "ADD below 0.1 diameter", "{:.1f}"),
-    ("add/median_mm", "mm", "median ADD", "{:.1f}"),
-    ("iou", "", "box IoU", "{:.3f}"),
-    ("particles_on_object", "%", "particles on the object", "{:.1%}"),
-    ("seconds_per_image", "s", "time an image", "{:.3g}"),
-)
+HEADLINE = (
+    "add/auc", "add_s/auc", "add/recall_01d", "add/median_mm", "iou", "particles_on_object", "seconds_per_image",
+)  # fmt: skip
 ROWS = (
-    ("instances", "images", "{:.0f}"),
-    ("missed", "missed", "{:.0f}"),
-    ("add/auc", "ADD AUC", "{:.1f}"),
-    ("add/recall_01d", "ADD below 0.1 diameter", "{:.1f} %"),
-    ("add/recall_2cm", "ADD below 2 cm", "{:.1f} %"),
-    ("add/median_mm", "ADD, median", "{:.1f} mm"),
-    ("add_s/auc", "ADD-S AUC", "{:.1f}"),
-    ("add_s/recall_01d", "ADD-S below 0.1 diameter", "{:.1f} %"),
-    ("add_s/recall_2cm", "ADD-S below 2 cm", "{:.1f} %"),
-    ("add_s/median_mm", "ADD-S, median", "{:.1f} mm"),
-    ("iou", "box IoU", "{:.3f}"),
-    ("particles_on_object", "particles on the object", "{:.1%}"),
-    ("seconds_per_image", "time an image", "{:.3f} s"),
-)
-BELIEF = (
-    ("effective_particles", "effective particles", "{:.1f}", "1 / Σw²: how many particles carry the weight"),
-    ("entropy", "entropy", "{:.2f} nat", "of the weights: 0 where one particle has all"),
-    ("spread_m", "spread of the centers", "{:.3f} m", "weighted root mean square about the mean"),
-    ("spread_rad", "spread of the rotations", "{:.2f} rad", "the same, of the angle"),
-    ("mass_01d", "weight within 0.1 diameters of the truth", "{:.1%}", "1 where the belief is sure and right"),
-    ("mass_2cm", "weight within 2 cm of the truth", "{:.1%}", ""),
-    ("rank", "depth of the truth in the belief", "{:.2f}", "0.5 where calibrated; near 1: the truth lies outside"),
-    ("coverage_50", "truths within the 50 % region", "{:.0f} %", "50 where calibrated; fewer: too sure"),
-    ("coverage_90", "truths within the 90 % region", "{:.0f} %", "90 where calibrated; fewer: too sure"),
-    ("truth_outscored", "images in which a particle outscores the truth", "{:.1%}", ""),
-    ("truth_outscored_by_wrong", "images in which a wrong pose outscores it", "{:.1%}", "what no search can mend"),
-)
+    "instances", "missed", "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm",
+    "add_s/auc", "add_s/recall_01d", "add_s/recall_2cm", "add_s/median_mm",
+    "iou", "particles_on_object", "seconds_per_image",
+)  # fmt: skip
+BELIEF = tuple(key for key in METRICS if key.startswith("belief/"))
+BY_VISIBILITY = ("add/auc", "add/recall_01d", "add/median_mm", "add_s/auc")
+APART = ((0.0, 0.3), (0.3, 0.5), (0.5, 0.8), (0.8, 1.0))  # ranges of visibility that share no image
 
 
-def run_page(run: Run, changed: Sequence[Change] | None, command: str) -> tuple[str, dict[str, bytes]]:
-    """Return the page, and its charts as PNGs by file name.
+def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> Page:
+    """Return what a run's page says.
 
-    changed: settings that differ from the defaults; None where there is nothing to compare with. command: what made the
-    page.
+    Args:
+        run: What its folder holds.
+        changed: Settings that differ from the defaults; None where there is nothing to compare with.
+        command: What made the page.
     """
-    files: dict[str, bytes] = {}
-
-    def charts(found: Sequence[panels.Panel]) -> str:
-        content, pngs = html.charts(found)
-        files.update(pngs)
-        return content
-
-    shown = group_by_section([p for p in run.pictures if p.name not in ("filter_health", "filter/health")])
+    images = group_by_section([p for p in run.pictures if p.name not in ("filter_health", "filter/health")])
+    curves = [
+        *panels.choose_panels(run.curves, panels.VALIDATION),
+        *panels.make_training_panels(run.curves),
+    ]
+    beliefs = draw_charts(panels.choose_panels(run.curves, panels.BELIEF))
     sections = [
-        ("Signs of failure", signs(run) + charts(panels.choose_panels(run.curves, panels.SIGNS))),
-        ("Worst and best", worst_and_best(shown)),
-        ("Results", results(run)),
-        ("Curves", charts([*panels.choose_panels(run.curves, panels.VALIDATION), *panels.make_training_panels(run.curves)])),
-        (
-            "Belief",
-            belief(run) + charts(panels.choose_panels(run.curves, panels.BELIEF)) + html.gallery(shown["belief"], wide=True),
+        Section(
+            "Diagnostics",
+            [*list_diagnostics(run), *draw_charts(panels.choose_panels(run.curves, panels.SIGNS))],
         ),
-        ("The filter at work", charts(panels.make_health_panels(run.curves)) + html.gallery(shown["particles"], wide=True)),
-        ("More pictures", html.gallery(shown["more"], wide=True)),
-        ("Settings", settings(run, changed)),
-        ("Time and machine", machine(run)),
+        Section("Worst and best", show_worst_and_best(images)),
+        Section("Results", list_results(run)),
+        Section("Curves", draw_charts(curves)),
+        Section("Belief", [*list_belief(run), *beliefs, *show_images(images["belief"], wide=True)]),
+        Section(
+            "The filter at work",
+            [
+                *draw_charts(panels.make_health_panels(run.curves)),
+                *show_images(images["particles"], wide=True),
+            ],
+        ),
+        Section("More images", show_images(images["more"], wide=True)),
+        Section("Settings", list_settings(run, changed)),
+        Section("Time and machine", [list_machine(run)]),
     ]
     title = f"{run.folder.resolve().name}: {run.named('model')}"
-    return html.page(title, head(run), sections, foot(run, command)), files
+    return Page(
+        title,
+        run.named("model"),
+        head_lines(run),
+        make_tiles(run),
+        run.missing,
+        sections,
+        make_foot(run, command),
+    )
 
 
-def head(run: Run) -> str:
-    """Return what is read first."""
+def head_lines(run: Run) -> list[Paragraph]:
+    """Return what stands below the heading: how far the run is, what it is, where it is."""
     step, _ = read_last_validation(run.curves)
     train = run.curves.get("train/total")
     most = (run.config.get("trainer") or {}).get("max_steps")
     if run.metrics:
-        badge = '<span class="badge done">tested</span>'
-        told = f"on {int(run.metrics.get('instances') or 0)} images"
+        badge, state = Text("tested", "done"), f"on {int(run.metrics.get('instances') or 0)} images"
     else:
-        badge = '<span class="badge">not tested yet</span>'
-        told = f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "") if train else "nothing logged yet"
-        told += f"; figures of the validation at step {step + 1}" if step is not None else ""
+        badge = Text("not tested yet", "badge")
+        state = f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "") if train else "nothing logged yet"
+        state += f"; numbers of the validation at step {step + 1}" if step is not None else ""
     objects = ", ".join(run.data.get("objects") or []) or str((run.config.get("data") or {}).get("object") or "")
     line = " · ".join(part for part in (run.named("variant"), f"loss {run.named('loss')}", objects) if part)
-    return (
-        f"<h1>{escape(run.named('model'))}</h1>"
-        f"<p>{badge} {escape(told)}<br>{escape(line)}<br>{html.code(str(run.folder))}</p>"
-        + tiles(run)
-        + html.notes(run.missing)
-    )
+    return [
+        Paragraph([badge, state]),
+        Paragraph([line]),
+        Paragraph([Text(str(run.folder), "code")]),
+    ]
 
 
-def tiles(run: Run) -> str:
-    """Return a run's main figures."""
+def make_tiles(run: Run) -> list[Tile]:
+    """Return a run's main numbers."""
     known = collect_numbers(run)
-    return html.tiles(
-        [(form.format(known[key]).rstrip("%"), unit, label) for key, unit, label, form in HEADLINE if key in known]
-    )
+    infos = [find_metric(key) for key in HEADLINE if key in known]
+    return [Tile(info.format(known[info.key]), info.unit, info.label) for info in infos]
 
 
-def signs(run: Run) -> str:
-    """Return the table of the signs of failure."""
+def list_diagnostics(run: Run) -> list[Block]:
+    """Return the table of the diagnostics."""
     found = diagnose(run)
     bad = sum(finding.bad for finding in found)
     if not found:
-        return ""
-    say = f"{bad} of {len(found)} signs are there." if bad else f"None of {len(found)} signs is there."
-    rows = [
-        (
-            '<span class="bad">✗ yes</span>' if bad else '<span class="good">✓ no</span>',
-            escape(sign.label),
-            f"{value:.3g}",
-            f'<span class="soft">bad {"above" if sign.above else "below"} {sign.limit:g}</span>',
-            escape(sign.meaning) if bad else f'<span class="soft">{escape(sign.meaning)}</span>',
+        return []
+    say = f"{bad} of {len(found)} signs of failure are there." if bad else f"None of {len(found)} signs of failure is there."
+    rows: list[list[Cell]] = []
+    for one, value, is_bad in found:
+        side = "above" if one.info.direction < 0 else "below"
+        rows.append(
+            [
+                Text("✗ yes", "bad") if is_bad else Text("✓ no", "good"),
+                one.info.label,
+                one.info.describe(value),
+                Text(f"bad {side} {one.info.describe(one.limit)}", "soft"),
+                one.meaning if is_bad else Text(one.meaning, "soft"),
+            ]
         )
-        for sign, value, bad in found
-    ]
-    return f"<p>{say}</p>" + html.table(
-        ("there?", "measured", "value", "", "it would mean"), rows, numeric=(2, 3), kind="signs"
-    )
+    head = ("there?", "measured", "value", "", "it would mean")
+    return [Paragraph([say]), Table(head, rows, numeric=(2, 3), form="signs")]
 
 
-def worst_and_best(shown: dict[str, list[Any]]) -> str:
-    """Return the gallery."""
-    parts = (("Worst", "worst"), ("Best", "best"), ("Estimates", "overlays"))
-    return "".join(f"<h3>{title}</h3>{html.gallery(shown[key])}" for title, key in parts if shown[key])
+def show_worst_and_best(images: Mapping[str, list[StoredImage]]) -> list[Block]:
+    """Return the worst and the best images, those of the test before those of the last validation."""
+    out: list[Block] = []
+    for title, key in (("Worst", "worst"), ("Best", "best"), ("Estimates", "overlays")):
+        ordered = sorted(images[key], key=lambda image: not image.name.startswith("test"))
+        shown = show_images(ordered)
+        out += [Heading(title), *shown] if shown else []
+    return out
 
 
-def results(run: Run) -> str:
+def list_results(run: Run) -> list[Block]:
     """Return the final table, and the errors by visibility."""
     if not run.metrics:
-        return ""
-    columns = [("test", run.metrics)]
+        return []
+    columns = {"test": run.metrics}
     if run.metrics_train:
-        columns = [("evaluation", run.metrics), ("test after training", run.metrics_train)]
-    known = [collect_numbers(Run(**{**run.__dict__, "metrics": metrics})) for _, metrics in columns]
-    rows = [
-        (label, *(form.format(own[key]) if key in own else "–" for own in known))
-        for key, label, form in ROWS
-        if any(key in own for own in known)
-    ]
-    out = html.table(("", *(name for name, _ in columns)), rows, numeric=range(1, len(columns) + 1), kind="narrow")
-    by_visibility = run.metrics.get("by_visibility") or {}
-    rows = [
-        (
-            escape(name).replace("-", " to "),
-            str(own["instances"]),
-            *(cell(own, *keys) for keys in (("add", "auc"), ("add", "recall_01d"), ("add", "median_mm"), ("add_s", "auc"))),
-        )
-        for name, own in by_visibility.items()
-    ]
-    titles = ("visible share", "images", "ADD AUC", "ADD < 0.1 d [%]", "median ADD [mm]", "ADD-S AUC")
-    return out + ("<h3>By visibility</h3>" + html.table(titles, rows, numeric=range(1, 6)) if rows else "")
+        columns = {"evaluation": run.metrics, "test after training": run.metrics_train}
+    return [compare_numbers(columns), *list_visibility(run.metrics)]
 
 
-def cell(content: dict[str, Any], *keys: str) -> str:
-    """Return a nested number, a dash where there is none."""
-    value: Any = content
-    for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return "–" if value is None else f"{value:.1f}"
+def compare_numbers(columns: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return the main numbers, a column a metrics.json; what none of them has is left out."""
+    rows: list[list[Cell]] = []
+    for info in map(find_metric, ROWS):
+        values = [read_number(metrics, info.key) for metrics in columns.values()]
+        if any(value is not None for value in values):
+            rows.append([info.label, *("–" if value is None else info.describe(value) for value in values)])
+    return Table(("", *columns), rows, numeric=range(1, len(columns) + 1), form="narrow")
 
 
-def belief(run: Run) -> str:
+def list_visibility(metrics: Mapping[str, Any]) -> list[Block]:
+    """Return errors by visibility: ranges that share no image, and apart from them those from a share upwards."""
+    found = {tuple(float(end) for end in name.split("-")): own for name, own in (metrics.get("by_visibility") or {}).items()}
+    apart = {f"{low:g} to {high:g}": found[low, high] for low, high in APART if (low, high) in found}
+    above = {f"at least {ends[0]:g}": own for ends, own in sorted(found.items()) if ends not in APART}
+    out: list[Block] = []
+    for heading, ranges in (
+        ("By visibility", apart),
+        ("Of images in which enough is visible", above),
+    ):
+        rows = [
+            [name, str(own["instances"]), *(format_number(own, key) for key in BY_VISIBILITY)]
+            for name, own in ranges.items()
+        ]
+        head = ("visible share", "images", *(find_metric(key).title for key in BY_VISIBILITY))
+        out += [Heading(heading), Table(head, rows, numeric=range(1, len(head)))] if rows else []
+    return out
+
+
+def format_number(metrics: Mapping[str, Any], key: str) -> str:
+    """Return a number of a metrics.json as a cell, a dash where there is none."""
+    value = read_number(metrics, key)
+    return "–" if value is None else find_metric(key).format(value)
+
+
+def list_belief(run: Run) -> list[Block]:
     """Return what the belief's numbers are, and mean."""
     known = collect_numbers(run)
-    rows = [
-        (escape(label), form.format(known[f"belief/{key}"]), f'<span class="soft">{escape(meaning)}</span>')
-        for key, label, form, meaning in BELIEF
-        if f"belief/{key}" in known
-    ]
-    return html.table(("mean over the images", "", ""), rows, numeric=(1,), kind="meanings")
+    infos = [find_metric(key) for key in BELIEF if key in known]
+    rows = [[info.label, info.describe(known[info.key]), Text(info.meaning, "soft")] for info in infos]
+    return [Table(("mean over the images", "", ""), rows, numeric=(1,), form="meanings")]
 
 
-def settings(run: Run, changed: Sequence[Change] | None) -> str:
+def list_settings(run: Run, changed: Sequence[Change] | None) -> list[Block]:
     """Return how the run differs from the default, and its choices."""
     typed = " ".join(run.overrides)
-    out = f"<p>Typed: {html.code(typed) if typed else 'nothing: all is default'}</p>" if run.config or run.overrides else ""
+    out: list[Block] = []
+    if run.config or run.overrides:
+        out.append(Paragraph(["Typed:", Text(typed, "code") if typed else "nothing: all is default"]))
     if changed is None:
-        out += '<p class="soft">These settings cannot be compared with today\'s defaults.</p>' if run.config else ""
+        out += [Paragraph([Text("These settings cannot be compared with today's defaults.", "soft")])] if run.config else []
     else:
-        rows = [
-            (html.code(key), *(html.code(short(value)) if value is not None else "–" for value in (own, default)))
-            for key, default, own in changed
-        ]
-        name = f"model={run.named('model')} variant={run.named('variant')}"
-        say = f"Settings that differ from the defaults of {html.code(name)} in this version of the code:"
-        out += f"<p>{say if rows else say.replace('Settings that', 'No settings')}</p>" + html.table(
-            ("setting", "this run", "default"), rows, kind="settings"
-        )
-    own = [
-        (html.code(k), html.code(v)) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"
-    ]
-    return out + html.fold(f"All {len(own)} choices", html.table(("group", "choice"), own)) if own else out
+        name = Text(f"model={run.named('model')} variant={run.named('variant')}", "code")
+        which = "Settings that" if changed else "No settings"
+        out.append(Paragraph([f"{which} differ from the defaults of", name, "in this version of the code."]))
+        out.append(list_changes(changed, ("this run", "default")))
+    choices = [(k, v) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"]
+    rows = [[Text(group, "code"), Text(choice, "code")] for group, choice in choices]
+    return [*out, Fold(f"All {len(rows)} choices", [Table(("group", "choice"), rows)])] if rows else out
 
 
-def short(text: str, most: int = 160) -> str:
+def list_changes(changed: Sequence[Change], names: tuple[str, str]) -> Table:
+    """Return the settings in which two configurations differ; names: of the own and of the other one."""
+
+    def cell(value: str | None) -> Cell:
+        return "–" if value is None else Text(shorten(value), "code")
+
+    rows = [[Text(key, "code"), cell(own), cell(other)] for key, other, own in changed]
+    return Table(("setting", *names), rows, form="settings")
+
+
+def shorten(text: str, most: int = 160) -> str:
     """Return a setting that fits in a table."""
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-def machine(run: Run) -> str:
+def list_machine(run: Run) -> Table:
     """Return how long it took, on what, with which data and code."""
     metrics = run.metrics
-    rows = [(escape(label), escape(value)) for label, value in collect_timings(run)]
-    rows += [
-        (key, html.code(str(metrics[key])))
-        for key in ("device", "git", "checkpoint", "seed")
-        if metrics.get(key) is not None
-    ]
+    rows: list[list[Cell]] = [[label, value] for label, value in collect_timings(run)]
+    for key in ("device", "git", "checkpoint", "seed"):
+        rows += [[key, Text(str(metrics[key]), "code")]] if metrics.get(key) is not None else []
     if versions := metrics.get("versions"):
-        rows.append(("versions", escape(", ".join(f"{name} {value}" for name, value in versions.items()))))
+        rows.append(["versions", ", ".join(f"{name} {value}" for name, value in versions.items())])
     data = metrics.get("data") or run.data
     if data.get("root"):
-        rows.append(("data", f"{escape(str(data.get('source')))}, {html.code(str(data['root']))}"))
+        rows.append([f"data, from {data.get('source')}", Text(str(data["root"]), "code")])
     for name, split in (data.get("splits") or {}).items():
-        rows.append((f"data, {escape(name)}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"))
-    return html.table(("", ""), rows, kind="pairs")
+        rows.append([f"data, {name}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"])
+    return Table(("", ""), rows, form="pairs")
 
 
-def foot(run: Run, command: str) -> str:
+def make_foot(run: Run, command: str) -> Paragraph:
     """Return where the page is from."""
     times = [curve.times[-1] for curve in run.curves.values()]
-    last = f" Last logged {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}." if times else ""
-    return f"Made with {html.code(command)}.{last}"
+    last = [f"Last logged {datetime.fromtimestamp(max(times)):%Y-%m-%d %H:%M}."] if times else []
+    return Paragraph(["Made with", Text(command, "code"), *last])

@@ -1,110 +1,150 @@
 """Lay a sweep out on one page."""
 
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
+from statistics import mean, stdev
 
-from posefilter.report import html
+from posefilter.metrics.registry import MetricInfo, find_metric
+from posefilter.report.blocks import (
+    Block,
+    Cell,
+    Fold,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    Text,
+    draw_charts,
+)
 from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run
 from posefilter.report.images import group_by_section
-from posefilter.report.panels import PERCENT, SHARE
-from posefilter.report.run_page import settings, tiles, worst_and_best
+from posefilter.report.page import Page
+from posefilter.report.run_page import list_settings, make_tiles, show_worst_and_best
 from posefilter.report.settings import Change
-from posefilter.report.sweeps import Group, Job, Sweep, find_best_group, find_best_job, group_jobs
+from posefilter.report.sweeps import (
+    COLUMNS,
+    Group,
+    Job,
+    Sweep,
+    Value,
+    find_best_group,
+    find_best_job,
+    find_ties,
+    group_jobs,
+)  # fmt: skip
 
-FIGURES = (  # name, title, unit, limits, format
-    ("add/auc", "ADD AUC", "", PERCENT, "{:.1f}"),
-    ("add_s/auc", "ADD-S AUC", "", PERCENT, "{:.1f}"),
-    ("add/recall_01d", "ADD < 0.1 diameter", "%", PERCENT, "{:.1f}"),
-    ("add/median_mm", "Median ADD", "mm", None, "{:.1f}"),
-    ("iou", "Box IoU", "", SHARE, "{:.3f}"),
-    ("particles_on_object", "On the object", "share", SHARE, "{:.3f}"),
-    ("seconds_per_image", "Time an image", "s", None, "{:.3g}"),
-)
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
 
 
-def sweep_page(
-    sweep: Sweep, best: Run | None, changed: Sequence[Change] | None, command: str
-) -> tuple[str, dict[str, bytes]]:
-    """Return the page, and its charts as PNGs by file name.
+def make_sweep_page(sweep: Sweep, best: Run | None, changed: Sequence[Change] | None, command: str) -> Page:
+    """Return what a sweep's page says.
 
-    best: the best run as read from its folder, None where only the summary is left; changed: as for a run's page.
+    Args:
+        sweep: Its runs.
+        best: The best run as read from its folder, None where only the summary is left.
+        changed: As for a run's page, of the best run.
+        command: What made the page.
     """
     found = group_jobs(sweep)
-    names = [name for name, *_ in FIGURES if any(name in job.numbers for job in sweep.jobs)]
-    plots, files = "", dict[str, bytes]()
+    infos = list_metrics(sweep)
+    plots: list[Block] = []
     for axis in sweep.shown:
-        content, pngs = html.charts(over(axis, sweep, found, names))
-        plots, files = plots + (f"<h3>{escape(axis)}</h3>{content}" if content else ""), files | pngs
-    cost, more = html.charts(against_time(found))
+        charts = draw_charts(chart_over(axis, sweep, found, infos))
+        plots += [Heading(axis), *note_seeds(found), *charts] if charts else []
     winner = find_best_job(sweep)
     sections = [
-        ("Table", table(sweep, found, names)),
-        ("Over the swept settings", plots),
-        ("Quality against time", cost),
-        ("Spread over seeds", seeds(found, names)),
-        ("Best run", best_run(winner, best, changed)),
-        ("Single runs", singles(sweep, names) if len(found) < len(sweep.jobs) else ""),
+        Section("Table", tabulate_groups(sweep, found, infos)),
+        Section("Over the swept settings", plots),
+        Section("Quality against time", draw_charts(chart_against_time(found))),
+        Section("Spread over seeds", tabulate_seeds(found, infos)),
+        Section("Best run", show_best(winner, best, changed)),
+        Section("Single runs", list_jobs(sweep, infos) if len(found) < len(sweep.jobs) else []),
     ]
-    return html.page(
-        f"Sweep {sweep.folder.resolve().name}", head(sweep, winner, best), sections, f"Made with {html.code(command)}."
-    ), {
-        **files,
-        **more,
-    }
-
-
-def head(sweep: Sweep, winner: Job, best: Run | None) -> str:
-    """Return what is read first."""
     over_what = ", ".join(f"{axis} ({len(sweep.values(axis))})" for axis in sweep.axes) or "nothing"
-    left = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
-    if best is None:
-        left.append("The runs themselves are not there: figures are those of summary.csv.")
-    count = f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}" if sweep.unfinished else str(len(sweep.jobs))
-    badge = f'<span class="badge {"bad" if sweep.unfinished else "done"}">{count} runs</span>'
-    return (
-        f"<h1>Sweep over {escape(over_what)}</h1><p>{badge} best: {html.code(told(winner.place) or winner.folder)}<br>"
-        f"{html.code(str(sweep.folder))}</p>" + (tiles(best) if best else "") + html.notes(left)
+    foot = Paragraph(["Made with", Text(command, "code")])
+    title, tiles = f"Sweep {sweep.folder.resolve().name}", make_tiles(best) if best else []
+    return Page(
+        title,
+        f"Sweep over {over_what}",
+        head_lines(sweep, winner),
+        tiles,
+        list_notes(sweep, best),
+        sections,
+        foot,
     )
 
 
-def told(place: dict[str, int | float | str]) -> str:
+def list_metrics(sweep: Sweep) -> list[MetricInfo]:
+    """Return what the runs have numbers of."""
+    return [find_metric(key) for key in COLUMNS.values() if any(key in job.numbers for job in sweep.jobs)]
+
+
+def head_lines(sweep: Sweep, winner: Job) -> list[Paragraph]:
+    """Return what stands below the heading: how many runs, which is the best, where they are."""
+    count = f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}" if sweep.unfinished else str(len(sweep.jobs))
+    badge = Text(f"{count} runs", "badge" if sweep.unfinished else "done")
+    tied = find_ties(sweep)
+    why = [Text(f"({tied} runs have its score to one decimal; it has the least median ADD)", "soft")] if tied > 1 else []
+    name = Text(spell(winner.place) or winner.folder, "code")
+    return [Paragraph([badge, "best:", name, *why]), Paragraph([Text(str(sweep.folder), "code")])]
+
+
+def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
+    """Return what a reader should know first: which runs have no result, and whether the runs themselves are there."""
+    notes = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
+    return notes if best else [*notes, "The runs themselves are not there: numbers are those of summary.csv."]
+
+
+def spell(place: Mapping[str, Value]) -> str:
     """Return a place among the axes as it would be typed."""
     return " ".join(f"{axis}={value}" for axis, value in place.items())
 
 
-def table(sweep: Sweep, found: Sequence[Group], names: Sequence[str]) -> str:
+def tabulate_groups(sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Block]:
     """Return a row a setting: means, with half the range over seeds."""
-    shown = [entry for entry in FIGURES if entry[0] in names]
-    rows = [
-        (
-            *(html.code(str(group.place[axis])) for axis in sweep.shown),
+    rows: list[list[Cell]] = [
+        [
+            *(Text(str(group.place[axis]), "code") for axis in sweep.shown),
             str(len(group.jobs)),
-            *(mean_and_half_range(group.of(name), form) for name, _, _, _, form in shown),
-        )
+            *(format_mean(group.of(info.key), info) for info in infos),
+        ]
         for group in found
     ]
-    titles = [
-        *map(escape, sweep.shown),
-        "runs",
-        *(f"{escape(title)}{f' [{unit}]' if unit else ''}" for _, title, unit, _, _ in shown),
+    head = [*sweep.shown, "runs", *(info.title for info in infos)]
+    say = "The best is marked. Where there are several seeds: mean ± half the range from the worst to the best."
+    numeric = range(len(sweep.shown), len(head))
+    return [
+        Paragraph([say]),
+        Table(head, rows, numeric, marked=find_best_group(found), form="sweep"),
     ]
-    start = len(sweep.shown)
-    say = "<p>The best is marked. Where there are several seeds: mean ± half the range from the worst to the best.</p>"
-    return say + html.table(titles, rows, numeric=range(start, len(titles)), marked=find_best_group(found), kind="sweep")
 
 
-def mean_and_half_range(values: Sequence[float], form: str) -> str:
-    """Return numbers as one cell."""
+def format_mean(values: Sequence[float], info: MetricInfo) -> str:
+    """Return numbers of several seeds as one cell."""
     if not values:
         return "–"
-    mean = form.format(sum(values) / len(values))
-    return mean if len(values) == 1 else f"{mean} ± {form.format((max(values) - min(values)) / 2)}"
+    half = (max(values) - min(values)) / 2
+    return info.format(mean(values)) + ("" if len(values) == 1 else f" ± {info.format(half)}")
 
 
-def over(axis: str, sweep: Sweep, found: Sequence[Group], names: Sequence[str]) -> list[Panel]:
-    """Return a chart for each figure over one axis; another axis of few values becomes lines."""
+def note_seeds(found: Sequence[Group]) -> list[Block]:
+    """Return a caveat where every setting was run with one seed: two numbers are no trend."""
+    if any(len(group.jobs) > 1 for group in found):
+        return []
+    return [
+        Paragraph(
+            [
+                Text(
+                    "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see.",
+                    "soft",
+                )
+            ]
+        )
+    ]
+
+
+def chart_over(axis: str, sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Panel]:
+    """Return a chart for each metric over one axis; another axis of few values becomes lines."""
     values = sweep.values(axis)
     if len(values) < 2:
         return []
@@ -115,28 +155,47 @@ def over(axis: str, sweep: Sweep, found: Sequence[Group], names: Sequence[str]) 
     low = min(spots.values())
     log_x = numeric and low > 0 and max(spots.values()) / low >= 8
     out = []
-    for name, title, unit, limits, _ in FIGURES:
-        if name not in names:
-            continue
+    for info in infos:
         lines = [
-            line_over(axis, spots, [g for g in found if kind is None or g.place[kind[0]] == kind[1]], name, kind)
+            line_over(
+                axis,
+                spots,
+                [g for g in found if kind is None or g.place[kind[0]] == kind[1]],
+                info,
+                kind,
+            )
             for kind in kinds
         ]
         lines = [line for line in lines if len(line.x)]
         if lines:
-            out.append(Panel(title, axis, unit, lines, limits, () if numeric else [str(v) for v in values], log_x))
+            categories = () if numeric else [str(v) for v in values]
+            out.append(
+                Panel(
+                    info.label,
+                    axis,
+                    info.unit,
+                    lines,
+                    info.limits,
+                    categories,
+                    log_x,
+                    ticks=tuple(spots.values()),
+                )
+            )
     return out
 
 
 def line_over(
     axis: str,
-    spots: dict[int | float | str, float],
+    spots: Mapping[Value, float],
     found: Sequence[Group],
-    name: str,
-    kind: tuple[str, int | float | str] | None,
+    info: MetricInfo,
+    kind: tuple[str, Value] | None,
 ) -> Line:
     """Return means over an axis with the range, and single runs, of some groups."""
-    at = {spot: [y for g in found if g.place[axis] == value for y in g.of(name)] for value, spot in spots.items()}
+    at = {
+        spot: [info.convert(y) for g in found if g.place[axis] == value for y in g.of(info.key)]
+        for value, spot in spots.items()
+    }
     at = {spot: ys for spot, ys in at.items() if ys}
     several = any(len(ys) > 1 for ys in at.values())
     return Line(
@@ -149,66 +208,71 @@ def line_over(
     )
 
 
-def against_time(found: Sequence[Group]) -> list[Panel]:
+def chart_against_time(found: Sequence[Group]) -> list[Panel]:
     """Return quality against what it costs, a dot a setting."""
     if len(found) < 2:
         return []
-    for name, title, unit, limits, _ in (FIGURES[0], FIGURES[5]):  # what sweeps maximise: the one, or else the other
-        pairs = [(group, group.of("seconds_per_image"), group.of(name)) for group in found]
-        lines = [Line(told(g.place), [sum(x) / len(x)], [sum(y) / len(y)]) for g, x, y in pairs if x and y]
+    cost = find_metric("seconds_per_image")
+    for info in map(find_metric, ("add/auc", "particles_on_object")):  # what sweeps maximize: the one, or else the other
+        pairs = [(group, group.of(cost.key), [info.convert(y) for y in group.of(info.key)]) for group in found]
+        lines = [Line(spell(g.place), [mean(x)], [mean(y)]) for g, x, y in pairs if x and y]
         if len(lines) > MOST_LINES:  # too many for a legend: the table tells them apart
             lines = [Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])]
         if lines:
-            return [Panel(title, "time an image [s]", unit, lines, limits, joined=False)]
+            return [Panel(info.label, cost.title, info.unit, lines, info.limits, joined=False)]
     return []
 
 
-def seeds(found: Sequence[Group], names: Sequence[str]) -> str:
+def tabulate_seeds(found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Block]:
     """Return how far seeds lie apart, setting by setting; nothing where there is one seed each."""
-    shown = [entry for entry in FIGURES[:-1] if entry[0] in names][:4]
+    shown = [info for info in infos if info.key != "seconds_per_image"][:4]
     several = [group for group in found if len(group.jobs) > 1]
     if not several and len(found) > 1 and list(found[0].place) == ["seed"]:
         several = [Group({}, [job for group in found for job in group.jobs])]
-    rows = [
-        (
-            html.code(told(group.place) or "all"),
+    rows: list[list[Cell]] = [
+        [
+            Text(spell(group.place) or "all", "code"),
             str(len(group.jobs)),
-            *(spread(group.of(name), form) for name, _, _, _, form in shown),
-        )
+            *(format_spread(group.of(info.key), info) for info in shown),
+        ]
         for group in several
     ]
-    titles = ("setting", "runs", *(escape(title) for _, title, *_ in shown))
-    return html.table(titles, rows, numeric=range(1, len(titles)), kind="sweep")
+    head = ("setting", "runs", *(info.title for info in shown))
+    return [Table(head, rows, numeric=range(1, len(head)), form="sweep")]
 
 
-def spread(values: Sequence[float], form: str) -> str:
-    """Return the worst and the best of some numbers, and their standard deviation."""
+def format_spread(values: Sequence[float], info: MetricInfo) -> str:
+    """Return the least and the greatest of some numbers, and their standard deviation."""
     if len(values) < 2:
         return "–"
-    mean = sum(values) / len(values)
-    deviation = (sum((value - mean) ** 2 for value in values) / (len(values) - 1)) ** 0.5
-    return f"{form.format(min(values))} to {form.format(max(values))} (sd {form.format(deviation)})"
+    return f"{info.format(min(values))} to {info.format(max(values))} (sd {info.format(stdev(values))})"
 
 
-def best_run(winner: Job, best: Run | None, changed: Sequence[Change] | None) -> str:
-    """Return the best run's place, pictures and settings."""
-    out = f"<p>{html.code(told(winner.place))}<br>{html.code(winner.folder)}</p>"
+def show_best(winner: Job, best: Run | None, changed: Sequence[Change] | None) -> list[Block]:
+    """Return the best run's place, images and settings."""
+    where: list[Block] = [
+        Paragraph([Text(spell(winner.place), "code")]),
+        Paragraph([Text(winner.folder, "code")]),
+    ]
     if best is None:
-        return out
-    return out + worst_and_best(group_by_section(best.pictures)) + "<h3>Its settings</h3>" + settings(best, changed)
+        return where
+    images = show_worst_and_best(group_by_section(best.pictures))
+    return [*where, *images, Heading("Its settings"), *list_settings(best, changed)]
 
 
-def singles(sweep: Sweep, names: Sequence[str]) -> str:
+def list_jobs(sweep: Sweep, infos: Sequence[MetricInfo]) -> list[Block]:
     """Return every run, folded away."""
-    shown = [entry for entry in FIGURES if entry[0] in names]
-    rows = [
-        (
-            *(html.code(str(job.place[axis])) for axis in sweep.axes),
-            *(form.format(job.numbers[name]) if name in job.numbers else "–" for name, _, _, _, form in shown),
-        )
+    rows: list[list[Cell]] = [
+        [
+            *(Text(str(job.place[axis]), "code") for axis in sweep.axes),
+            *(info.format(job.numbers[info.key]) if info.key in job.numbers else "–" for info in infos),
+        ]
         for job in sweep.jobs
     ]
-    titles = [*map(escape, sweep.axes), *(escape(title) for _, title, *_ in shown)]
-    return html.fold(
-        f"All {len(rows)} runs", html.table(titles, rows, numeric=range(len(sweep.axes), len(titles)), kind="sweep")
-    )
+    head = [*sweep.axes, *(info.title for info in infos)]
+    return [
+        Fold(
+            f"All {len(rows)} runs",
+            [Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")],
+        )
+    ]

@@ -1,9 +1,11 @@
 """Gather a sweep: its runs, the settings in which they differ, and runs that differ in nothing but the seed as one."""
 
 import csv
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
@@ -12,15 +14,12 @@ from posefilter.report.diagnostics import flatten
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
 
 SILENT = ("out", "resume", "console", "threads")
-COLUMNS = {  # of summary.csv, and the figures of metrics.json that they hold
-    "add_auc": "add/auc",
-    "add_recall_01d": "add/recall_01d",
-    "add_median_mm": "add/median_mm",
-    "add_s_auc": "add_s/auc",
-    "iou": "iou",
-    "particles_on_object": "particles_on_object",
-    "seconds_per_image": "seconds_per_image",
-}
+COLUMNS = {  # of summary.csv, and the metrics that they hold
+    key.replace("/", "_"): key
+    for key in (
+        "add/auc", "add/recall_01d", "add/median_mm", "add_s/auc", "iou", "particles_on_object", "seconds_per_image",
+    )
+}  # fmt: skip
 Value = int | float | str
 
 
@@ -155,18 +154,30 @@ def group_jobs(sweep: Sweep) -> list[Group]:
     return list(out.values())
 
 
-def score(numbers: dict[str, float]) -> float:
-    """Return what sweeps maximise (see `overall`)."""
+def score(numbers: Mapping[str, float]) -> float:
+    """Return what sweeps maximize (see `overall`)."""
     least = float("-inf")
     return overall(numbers.get("add/auc"), numbers.get("particles_on_object", least), numbers.get("iou", least))
 
 
+def rank(jobs: Sequence[Job]) -> tuple[float, float]:
+    """Return what the best of all has most of: the mean score to one decimal, then (where it ties) the least median ADD."""
+    medians = [job.numbers.get("add/median_mm", math.inf) for job in jobs]
+    return round(mean(score(job.numbers) for job in jobs), 1), -mean(medians)
+
+
 def find_best_job(sweep: Sweep) -> Job:
-    """Return the run with the highest score."""
-    return max(sweep.jobs, key=lambda job: score(job.numbers))
+    """Return the run with the highest score; of those that tie, the one with the least median ADD."""
+    return max(sweep.jobs, key=lambda job: rank([job]))
+
+
+def find_ties(sweep: Sweep) -> int:
+    """Return how many runs have the best run's score to one decimal."""
+    best = rank([find_best_job(sweep)])[0]
+    return sum(rank([job])[0] == best for job in sweep.jobs)
 
 
 def find_best_group(found: Sequence[Group]) -> int:
-    """Return which group has the highest mean score."""
-    means = [sum(score(job.numbers) for job in group.jobs) / len(group.jobs) for group in found]
-    return means.index(max(means))
+    """Return which group has the highest mean score; of those that tie, the one with the least median ADD."""
+    ranks = [rank(group.jobs) for group in found]
+    return ranks.index(max(ranks))

@@ -7,16 +7,11 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from posefilter.metrics.registry import find_metric
 from posefilter.report.diagnostics import format_duration
 from posefilter.run.voice import PLAIN, say
 
-SHOWN = (  # metric, what people call it, format
-    ("train/total", "loss", "{:.3g}"),
-    ("val/add/auc", "ADD AUC", "{:.1f}"),
-    ("val/add/median_mm", "median ADD", "{:.1f} mm"),
-    ("val/iou", "box IoU", "{:.3f}"),
-    ("val/particles_on_object", "on the object", "{:.0%}"),
-)
+SHOWN = ("train/total", "val/add/auc", "val/add/median_mm", "val/iou", "val/particles_on_object")
 
 
 def progress(console: str) -> Callback:
@@ -26,7 +21,8 @@ def progress(console: str) -> Callback:
 
 def told(metrics: dict[str, Any]) -> str:
     """Return the metrics that matter in words: `loss 1.25, ADD AUC 71.0`."""
-    return ", ".join(f"{label} {form.format(float(metrics[name]))}" for name, label, form in SHOWN if name in metrics)
+    known = [(find_metric(name), float(metrics[name])) for name in SHOWN if name in metrics]
+    return ", ".join(f"{info.short or info.label} {info.describe(value)}" for info, value in known)
 
 
 def briefly(metrics: dict[str, Any]) -> str:

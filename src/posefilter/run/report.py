@@ -11,9 +11,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.errors import UserError
 from posefilter.report.gather import Run, read_run
-from posefilter.report.run_page import run_page
+from posefilter.report.run_page import make_run_page
 from posefilter.report.settings import Change, compare_settings
-from posefilter.report.sweep_page import sweep_page
+from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import find_best_job, read_sweep
 from posefilter.run.job import Job
 from posefilter.run.voice import ended
@@ -41,15 +41,16 @@ def report(job: Job) -> None:
     command = f"python report.py {'run' if sweep is None else 'sweep'}={folder}"
     if sweep is None:
         record = read_run(folder)
-        page, files = run_page(record, compared(record), command)
+        page = make_run_page(record, compared(record), command)
     else:
         found = read_sweep(folder)
         winner = folder / find_best_job(found).folder
         best = read_run(winner) if (winner / "metrics.json").is_file() else None
-        page, files = sweep_page(found, best, compared(best) if best else None, command)
+        page = make_sweep_page(found, best, compared(best) if best else None, command)
     out = Path(job.cfg.out) if job.cfg.out else folder / "report"
     out.mkdir(parents=True, exist_ok=True)
-    (out / "report.html").write_text(page)
+    (out / "report.html").write_text(page.render())
+    files = page.files()
     for name, png in files.items():
         (out / name).write_bytes(png)
     ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})

@@ -5,21 +5,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from posefilter.metrics.registry import find_metric, read_number
 from posefilter.run.job import Job
 from posefilter.run.machine import device_name, git_state, versions
 from posefilter.run.voice import PLAIN, Files, ended, finite, show_table
 
 _ROWS = (
-    ("ADD AUC", ("add", "auc"), "{:.1f}"),
-    ("ADD < 0.1 diameter", ("add", "recall_01d"), "{:.1f} %"),
-    ("ADD < 2 cm", ("add", "recall_2cm"), "{:.1f} %"),
-    ("ADD, median", ("add", "median_mm"), "{:.1f} mm"),
-    ("ADD-S AUC", ("add_s", "auc"), "{:.1f}"),
-    ("ADD-S, median", ("add_s", "median_mm"), "{:.1f} mm"),
-    ("box IoU", ("iou",), "{:.3f}"),
-    ("particles on the object", ("particles_on_object",), "{:.1%}"),
-    ("time an image", ("seconds_per_image",), "{:.3f} s"),
-)
+    "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
+    "iou", "particles_on_object", "seconds_per_image",
+)  # fmt: skip
 _TOLD = ("instances", "missed", "add", "add_s", "iou", "particles_on_object", "seconds_per_image", "belief")  # to machines
 
 
@@ -51,12 +45,10 @@ def write_json(path: Path, content: Any) -> None:
 def show(metrics: dict[str, Any], title: str, console: str, event: str, files: Files, following: Sequence[str] = ()) -> None:
     """Print the table, where everything was written, and what may be typed next; for machines, all of it as one line."""
     rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
-    for label, path, form in _ROWS:
-        value: Any = metrics
-        for key in path:
-            value = value.get(key) if isinstance(value, dict) else None
-        if isinstance(value, int | float):
-            rows.append((label, form.format(value)))
+    numbers = {key: read_number(metrics, key) for key in _ROWS}
+    rows += [
+        (find_metric(key).label, find_metric(key).describe(value)) for key, value in numbers.items() if value is not None
+    ]
     if console != PLAIN:
         show_table(title, rows)
     told = {key: metrics[key] for key in _TOLD if key in metrics}

@@ -1,0 +1,316 @@
+"""What each number of metrics.json is called, how it is written, and which way is better.
+
+One table for all who show numbers.  Keys are those of metrics.json, nested ones joined by "/"
+(`add/auc`).  A list, one number an iteration, is read at its ends: `signs/off_frame/first` and
+`signs/off_frame/last`.  `filter/...` are the filter's quantities by iteration and `train/...` those
+of a training, which are only logged.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from posefilter.errors import UserError
+
+HIGHER, LOWER, NEITHER = 1, -1, 0  # which way is better
+PERCENT = (-3.0, 103.0)  # limits of a chart of percentages: what lies at an end is seen
+
+
+class MetricInfo(NamedTuple):
+    """A number's name, and how it is shown.
+
+    Attributes:
+        key: Its place in metrics.json.
+        label: Its name in tables and charts.
+        unit: Of what is shown; empty for plain numbers.
+        form: Format specification of what is shown.
+        direction: HIGHER, LOWER or NEITHER: which way is better.
+        factor: What is shown, over what is stored.
+        limits: Ends of a chart's axis, in units of what is shown; None where these follow the numbers.
+        short: Name where room is scarce; the label if empty.
+        meaning: What it says, in a few words.
+    """
+
+    key: str
+    label: str
+    unit: str = ""
+    form: str = ".1f"
+    direction: int = NEITHER
+    factor: float = 1.0
+    limits: tuple[float, float] | None = None
+    short: str = ""
+    meaning: str = ""
+
+    @property
+    def title(self) -> str:
+        """Return the label with its unit, for a column's head: `median ADD [mm]`."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    @property
+    def column(self) -> str:
+        """Return the short name with its unit: `on object %`."""
+        return f"{self.short or self.label} {self.unit}".strip()
+
+    def convert(self, value: float) -> float:
+        """Return a stored number in the unit in which it is shown."""
+        return self.factor * value
+
+    def format(self, value: float) -> str:
+        """Return a stored number as it is written, without its unit."""
+        return format(self.convert(value), self.form)
+
+    def describe(self, value: float) -> str:
+        """Return a stored number as it is written, with its unit: `94.7 %`."""
+        return f"{self.format(value)} {self.unit}".strip()
+
+
+def _describe_errors(name: str, label: str) -> tuple[MetricInfo, ...]:
+    return (
+        MetricInfo(f"{name}/auc", f"{label} AUC", "", ".1f", HIGHER, limits=PERCENT),
+        MetricInfo(
+            f"{name}/recall_01d",
+            f"{label} < 0.1 diameter",
+            "%",
+            ".1f",
+            HIGHER,
+            limits=PERCENT,
+            short=f"{label} < 0.1 d",
+        ),
+        MetricInfo(f"{name}/recall_2cm", f"{label} < 2 cm", "%", ".1f", HIGHER, limits=PERCENT),
+        MetricInfo(f"{name}/median_mm", f"median {label}", "mm", ".1f", LOWER),
+    )
+
+
+_METRICS = (
+    MetricInfo("instances", "images", form=".0f"),
+    MetricInfo("missed", "missed", form=".0f", direction=LOWER, meaning="images without a finite pose"),
+    *_describe_errors("add", "ADD"),
+    *_describe_errors("add_s", "ADD-S"),
+    MetricInfo("iou", "box IoU", form=".3f", direction=HIGHER, limits=(-0.03, 1.03)),
+    MetricInfo(
+        "particles_on_object",
+        "particles on the object",
+        "%",
+        ".1f",
+        HIGHER,
+        100.0,
+        PERCENT,
+        "on object",
+    ),
+    MetricInfo("seconds_per_image", "time per image", "s", ".3g", LOWER, short="s / image"),
+    # the belief, means over the images
+    MetricInfo(
+        "belief/effective_particles",
+        "effective particles",
+        form=".1f",
+        meaning="1 / Σw²: how many particles carry the weight",
+    ),
+    MetricInfo(
+        "belief/entropy",
+        "entropy",
+        "nat",
+        ".2f",
+        meaning="of the weights: 0 where one particle has all",
+    ),
+    MetricInfo(
+        "belief/spread_m",
+        "spread of the centers",
+        "mm",
+        ".1f",
+        factor=1000.0,
+        meaning="weighted root mean square about the mean",
+    ),
+    MetricInfo(
+        "belief/spread_rad",
+        "spread of the rotations",
+        "degrees",
+        ".1f",
+        factor=180 / math.pi,
+        meaning="the same, of the angle",
+    ),
+    MetricInfo(
+        "belief/mass_01d",
+        "weight within 0.1 diameter of the truth",
+        "%",
+        ".1f",
+        HIGHER,
+        100.0,
+        PERCENT,
+        "within 0.1 diameter",
+        "100 where the belief is sure and right",
+    ),
+    MetricInfo(
+        "belief/mass_2cm",
+        "weight within 2 cm of the truth",
+        "%",
+        ".1f",
+        HIGHER,
+        100.0,
+        PERCENT,
+        "within 2 cm",
+    ),
+    MetricInfo(
+        "belief/rank",
+        "depth of the truth in the belief",
+        form=".2f",
+        meaning="0.5 where calibrated; near 1: the truth lies outside",
+    ),
+    MetricInfo(
+        "belief/coverage_50",
+        "truths within the 50 % region",
+        "%",
+        ".0f",
+        limits=PERCENT,
+        short="50 % region",
+        meaning="50 where calibrated; fewer: too sure",
+    ),
+    MetricInfo(
+        "belief/coverage_90",
+        "truths within the 90 % region",
+        "%",
+        ".0f",
+        HIGHER,
+        limits=PERCENT,
+        short="90 % region",
+        meaning="90 where calibrated; fewer: too sure",
+    ),
+    MetricInfo(
+        "belief/truth_outscored",
+        "images in which a particle outscores the truth",
+        "%",
+        ".1f",
+        LOWER,
+        100.0,
+        PERCENT,
+        "by any pose",
+    ),
+    MetricInfo(
+        "belief/truth_outscored_by_wrong",
+        "images in which a wrong pose outscores the truth",
+        "%",
+        ".1f",
+        LOWER,
+        100.0,
+        PERCENT,
+        "by a wrong pose",
+        "what no search can mend",
+    ),
+    # where particles that are pixels are; lists over the iterations
+    MetricInfo("signs/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
+    MetricInfo(
+        "signs/on_object/first",
+        "on the object at the start",
+        "%",
+        ".1f",
+        HIGHER,
+        100.0,
+        PERCENT,
+        "began on it",
+    ),
+    MetricInfo(
+        "signs/on_object/last",
+        "on the object at the end",
+        "%",
+        ".1f",
+        HIGHER,
+        100.0,
+        PERCENT,
+        "on the object",
+    ),
+    MetricInfo("signs/off_frame", "off the frame", "%", ".1f", LOWER, 100.0, PERCENT, "off frame"),
+    MetricInfo("signs/near_edge", "at an edge", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo("signs/near_corner", "in a corner", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo("signs/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"),
+    MetricInfo(
+        "signs/pairwise_cosine",
+        "agreement of the displacements",
+        form=".2f",
+        direction=LOWER,
+        limits=(-1.05, 1.05),
+        short="same direction",
+    ),
+    MetricInfo(
+        "signs/offset_r2",
+        "true offsets explained (R²)",
+        form=".2f",
+        direction=HIGHER,
+        limits=(-1.05, 1.05),
+        short="offset R2",
+    ),
+    MetricInfo(
+        "signs/heading",
+        "cosine of displacement and true offset",
+        form=".2f",
+        direction=HIGHER,
+        limits=(-1.05, 1.05),
+        short="heading",
+    ),
+    MetricInfo(
+        "signs/auroc",
+        "AUROC of the likelihood",
+        form=".2f",
+        direction=HIGHER,
+        limits=(-0.03, 1.03),
+        short="AUROC",
+    ),
+    # of a training
+    MetricInfo("training/steps", "training steps", form=".0f", short="steps"),
+    MetricInfo("training/tested_step", "tested step", form=".0f"),
+    MetricInfo("training/seconds_per_step", "time per training step", "s", ".3g", LOWER),
+    MetricInfo("training/cpu_seconds_per_step", "processor time per training step", "s", ".3g", LOWER),
+    MetricInfo("train/total", "loss", form=".3g", direction=LOWER),
+    MetricInfo("score", "score", form=".1f", direction=HIGHER, limits=PERCENT),
+    MetricInfo("best_score", "best score", form=".1f", direction=HIGHER, limits=PERCENT),
+    # the filter, iteration by iteration
+    MetricInfo("filter/ess", "effective particles", "%", ".0f", factor=100.0, limits=PERCENT),
+    MetricInfo("filter/spread_m", "spread of the centers", "mm", ".1f", factor=1000.0),
+    MetricInfo("filter/spread_rad", "spread of the rotations", "degrees", ".1f", factor=180 / math.pi),
+    MetricInfo("filter/spread_px", "spread", "px", ".1f"),
+    MetricInfo("filter/sigma_m", "noise level", "mm", ".1f", factor=1000.0),
+    MetricInfo("filter/sigma_px", "noise level", "px", ".1f"),
+    MetricInfo("filter/best_log_likelihood", "best log-likelihood", "nat", ".1f", HIGHER),
+    # of a run, derived from several of the above
+    MetricInfo("missed_share", "images without an estimate", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo("fallen", "validation score lost since its best", form=".1f", direction=LOWER),
+    MetricInfo("not_finite", "training scalars that are no numbers", form=".0f", direction=LOWER),
+)
+METRICS = {info.key: info for info in _METRICS}
+
+
+def find_metric(key: str) -> MetricInfo:
+    """Return what is known of a number.
+
+    Args:
+        key: Its key.  That of a logged scalar (`val/add/auc`), of a range of visibility
+            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list (`signs/off_frame/last`)
+            lead to the same number.
+
+    Raises:
+        UserError: Where there is no such number.
+    """
+    bare = re.sub(r"^(?:(?:val|test)/)?(?:by_visibility/[\d.]+-[\d.]+/)?", "", key)
+    for name in (bare, re.sub(r"/(?:first|last)$", "", bare), re.sub(r"/step_\d+$", "", bare)):
+        if name in METRICS:
+            return METRICS[name]
+    raise UserError(f"{key}: there is no such metric; there are {', '.join(METRICS)}")
+
+
+def read_number(metrics: Mapping[str, Any], key: str) -> float | None:
+    """Return one number of a metrics.json, as it is stored.
+
+    Args:
+        metrics: The file's content.
+        key: Its key; `.../first` and `.../last` are the ends of a list.
+
+    Returns:
+        The number, None where the file has none or it is not finite.
+    """
+    value: Any = metrics
+    for name in key.split("/"):
+        if isinstance(value, list) and name in ("first", "last"):
+            value = (value or [None])[0 if name == "first" else -1]
+        else:
+            value = value.get(name) if isinstance(value, Mapping) else None
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if number and math.isfinite(value) else None

@@ -1,0 +1,164 @@
+"""What pages are made of: plain data, which the templates turn into HTML.
+
+Nothing here is HTML, so nothing here needs escaping.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, NamedTuple
+
+from posefilter.report.charts import DARK, LIGHT, WIDTH_PX, Panel, draw_chart, measure_height
+from posefilter.report.images import WIDE_PX, StoredImage, encode_image, encode_png
+
+Style = Literal["", "code", "soft", "good", "bad", "done", "badge"]
+
+
+class Text(NamedTuple):
+    """Words in a style."""
+
+    text: str
+    style: Style = ""
+
+
+Cell = str | Text
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading within a section."""
+
+    kind: ClassVar = "heading"
+    text: str
+
+
+@dataclass(frozen=True)
+class Paragraph:
+    """A paragraph of words in several styles."""
+
+    kind: ClassVar = "paragraph"
+    parts: Sequence[Cell]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table, which scrolls within itself where it is too wide; without rows it is left out.
+
+    Attributes:
+        head: The columns' names; no head where all are empty.
+        rows: Cells, row by row.
+        numeric: Columns of numbers.
+        marked: A row that stands out.
+        form: How it folds on a phone, or `narrow`; see page.css.
+    """
+
+    kind: ClassVar = "table"
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    numeric: Sequence[int] = ()
+    marked: int | None = None
+    form: str = ""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Blocks that open on demand."""
+
+    kind: ClassVar = "fold"
+    title: str
+    blocks: Sequence["Block"]
+
+
+class Chart(NamedTuple):
+    """A chart for light and for dark pages, as data URIs."""
+
+    light: str
+    dark: str
+    width: int
+    height: int
+    words: str  # for those who do not see it
+    file: str  # name of the light one's PNG
+    png: bytes
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Charts side by side."""
+
+    kind: ClassVar = "charts"
+    charts: Sequence[Chart]
+
+
+class GalleryImage(NamedTuple):
+    """An image in a page; `error` says what is wrong with one that cannot be shown."""
+
+    caption: str
+    source: str = ""
+    width: int = 0
+    height: int = 0
+    error: str = ""
+
+    @property
+    def wide(self) -> bool:
+        """Tell whether it is several images in a row, which a phone scrolls."""
+        return self.width >= WIDE_PX
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Images with their captions."""
+
+    kind: ClassVar = "gallery"
+    images: Sequence[GalleryImage]
+    wide: bool = False
+
+
+class Tile(NamedTuple):
+    """A large number at the top of a page."""
+
+    value: str
+    unit: str
+    label: str
+
+
+Block = Heading | Paragraph | Table | Fold | Charts | Gallery
+
+
+class Section(NamedTuple):
+    """A part of a page with its own heading."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+def draw_charts(panels: Sequence[Panel]) -> list[Charts]:
+    """Return charts side by side, each drawn for light and for dark pages; nothing where there is none."""
+    charts = []
+    for panel in panels:
+        light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
+        file = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}.png"
+        uris = encode_png(light), encode_png(dark)
+        charts.append(Chart(*uris, WIDTH_PX, measure_height(panel), describe_panel(panel), file, light))
+    return [Charts(charts)] if charts else []
+
+
+def show_images(images: Sequence[StoredImage], wide: bool = False) -> list[Gallery]:
+    """Return a gallery; an image that cannot be read says so in its place."""
+    out = []
+    for image in images:
+        try:
+            source, width, height = encode_image(image.data)
+            out.append(GalleryImage(image.caption, source, width, height))
+        except ValueError as error:
+            out.append(GalleryImage(image.name, error=str(error)))
+    return [Gallery(out, wide)] if out else []
+
+
+def describe_panel(panel: Panel) -> str:
+    """Return a chart in words."""
+    ends = "; ".join(f"{line.label} {line.y[-1]:.4g}" for line in panel.lines if len(line.y))
+    return f"{panel.title} over {panel.xlabel}, at the end: {ends}"
+
+
+def make_slug(name: str) -> str:
+    """Return a name fit for an address within the page, and for a file."""
+    return "-".join("".join(c if c.isalnum() else " " for c in name.lower()).split())

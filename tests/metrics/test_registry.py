@@ -1,0 +1,88 @@
+"""The registry of metrics: it knows every number that a run writes down, and writes each as it should be read."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.metrics.registry import HIGHER, LOWER, METRICS, find_metric, read_number
+
+HOME = Path(__file__).parents[2]
+
+
+def test_keys_are_unique_and_labels_tell_metrics_of_a_table_apart() -> None:
+    tables = [[key for key in METRICS if key.startswith(prefix)] for prefix in ("add", "belief/", "signs/")]
+    for keys in tables:
+        labels = [METRICS[key].title for key in keys]
+        assert len(set(labels)) == len(labels)
+    assert all(key == info.key for key, info in METRICS.items())
+
+
+def test_a_number_is_written_in_its_unit() -> None:
+    assert find_metric("particles_on_object").describe(0.5) == "50.0 %"
+    assert find_metric("belief/spread_m").describe(0.0123) == "12.3 mm"
+    assert find_metric("add/median_mm").title == "median ADD [mm]"
+    assert find_metric("iou").describe(0.8766) == "0.877"
+    assert find_metric("signs/on_object/first").column == "began on it %"
+
+
+@pytest.mark.parametrize(
+    ("key", "known"),
+    [
+        ("val/add/auc", "add/auc"),
+        ("test/iou", "iou"),
+        ("by_visibility/0.3-0.5/add_s/median_mm", "add_s/median_mm"),
+        ("val/by_visibility/0-0.3/instances", "instances"),
+        ("signs/off_frame/last", "signs/off_frame"),
+        ("val/signs/heading", "signs/heading"),
+        ("filter/ess/step_03", "filter/ess"),
+    ],
+)
+def test_every_way_to_write_a_key_leads_to_its_metric(key: str, known: str) -> None:
+    assert find_metric(key).key == known
+
+
+def test_an_unknown_key_is_named() -> None:
+    with pytest.raises(UserError, match="add/acu: there is no such metric"):
+        find_metric("add/acu")
+
+
+def test_numbers_are_read_where_they_are() -> None:
+    metrics = {
+        "add": {"auc": 71},
+        "signs": {"on_object": [0.1, 0.7]},
+        "iou": float("nan"),
+        "seed": True,
+        "name": "x",
+    }
+    assert read_number(metrics, "add/auc") == 71.0
+    assert read_number(metrics, "signs/on_object/first") == 0.1
+    assert read_number(metrics, "signs/on_object/last") == 0.7
+    for key in ("add/median_mm", "add_s/auc", "iou", "seed", "name", "signs/on_object", "add"):
+        assert read_number(metrics, key) is None
+
+
+def test_better_is_the_way_that_a_better_filter_goes() -> None:
+    """An error, a time and what is lost should be small; a share that is found, an area and a score should be large."""
+    for key, info in METRICS.items():
+        if re.search(r"median|seconds|missed|off_frame|outscored", key):
+            assert info.direction == LOWER, key
+        if re.search(r"auc|recall|iou|on_object|mass|score$", key):
+            assert info.direction == HIGHER, key
+
+
+def test_documents_name_the_same_columns() -> None:
+    """The tables of runs are asked for by the columns' names: each name that a document asks for is a metric's."""
+    asked = {
+        name.strip()
+        for page in (HOME / "docs").rglob("*.md")
+        for names in re.findall(r"<!-- table: \w+ \(([^)]*)\)", page.read_text())
+        for name in names.split(",")
+    }
+    columns = {info.column for info in METRICS.values()} | {
+        "loss jumps",
+        "CPU min",
+        "relative time",
+    }
+    assert asked <= columns
