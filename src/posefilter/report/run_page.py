@@ -198,7 +198,7 @@ def list_belief(run: Run) -> list[Block]:
     """Return what the belief's numbers are, and mean."""
     known = collect_numbers(run)
     infos = [find_metric(key) for key in BELIEF if key in known]
-    rows = [[info.label, info.describe(known[info.key]), Text(info.meaning, "soft")] for info in infos]
+    rows: list[list[Cell]] = [[info.label, info.describe(known[info.key]), Text(info.meaning, "soft")] for info in infos]
     return [Table(("mean over the images", "", ""), rows, numeric=(1,), form="meanings")]
 
 
