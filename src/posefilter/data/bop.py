@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from posefilter.data import ycb
+from posefilter.data.confine import check_inside
 from posefilter.data.decode import expect_size, need, numbers, read_color, read_depth, read_json, read_label
 from posefilter.data.frames import BadData, FrameRecord, NotShown, Sample
 from posefilter.data.meshes import MeshStore
@@ -106,7 +107,7 @@ class BopReader(BaseReader):
     def read(self, i: int) -> Sample:
         """Return record i at the dataset's resolution, its visibility still unknown.  Raises BadData."""
         entry = self._entries[i]
-        color_path, depth_path, mask_path = entry.record.files[:3]
+        color_path, depth_path, mask_path = self._files(entry.record)[:3]
         rgb, depth, mask = read_color(color_path), read_depth(depth_path, entry.units), read_label(mask_path) > 0
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
@@ -120,10 +121,10 @@ class BopReader(BaseReader):
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labelled object.  -> (H, W) bool."""
         entry = self._entries[i]
-        mask = read_label(entry.record.files[2]) > 0
+        mask = read_label(self._files(entry.record)[2]) > 0
         out = np.zeros_like(mask)
         for path in entry.siblings:
-            out |= read_label(path) > 0
+            out |= read_label(check_inside(path, self.root)) > 0
         return out & ~mask
 
     def _name(self, number: int) -> str:
@@ -134,7 +135,11 @@ class BopReader(BaseReader):
     def _read_scene(self, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return a scene's truth and cameras by image, both empty where they are broken and on_error is "skip"."""
         try:
-            return read_json(folder / "scene_gt.json"), read_json(folder / "scene_camera.json")
+            truth, cameras = (read_json(check_inside(folder / f"scene_{kind}.json", self.root)) for kind in ("gt", "camera"))
+            for name, content in (("gt", truth), ("camera", cameras)):
+                if not (isinstance(content, dict) and all(image.isdecimal() for image in content)):
+                    raise BadData(folder / f"scene_{name}.json", "not records by the number of the image")
+            return truth, cameras
         except BadData as error:
             self._leave_out(error)
             return {}, {}

@@ -5,6 +5,7 @@ Colour stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it coun
 
 import hashlib
 import os
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,12 @@ from typing import Protocol
 
 import numpy as np
 
+from posefilter.data.confine import check_inside
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 
 CACHES = ("memory", "disk", "none")
+_HEADER = 4096  # bytes, at most, ahead of an array
 _UNITS = 10_000.0  # a metre
 _LAYOUT = 2  # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is read
 
@@ -83,6 +86,7 @@ class DiskCache:
 
     def __init__(self, folder: Path, version: str) -> None:
         """Use a folder; `version` says all that decides the content beside the source files (size, class list, meshes)."""
+        check_inside(folder, folder.parent)  # a dataset may bring a link of that name
         self.folder = folder / hashlib.sha256(f"{_LAYOUT} {version}".encode()).hexdigest()[:16]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -99,16 +103,10 @@ class DiskCache:
             path = self._path(record.key, _stamp(record), ".npz")
             if not (path.is_file() and self._image_path(record).is_file()):
                 return None
-            with np.load(path) as kept:
-                height, width, object_id = (int(x) for x in kept["numbers"])
-                self._records[record.key] = Prepared(
-                    kept["mask_bits"],
-                    (height, width),
-                    kept["intrinsics"],
-                    kept["pose"],
-                    object_id,
-                    float(kept["visibility"]),
-                )
+            try:
+                self._records[record.key] = _read_prepared(path)
+            except (OSError, ValueError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+                raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}") from error
         return self._records[record.key]
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
@@ -133,7 +131,10 @@ class DiskCache:
         one = self.find(record)
         if one is None:
             raise UserError(f"{record.files[0]}: changed while it was in use; start again")
-        return unpack(np.load(self._image_path(record)), one, frame_id)
+        path, (height, width) = self._image_path(record), one.shape
+        if path.stat().st_size > 5 * height * width + _HEADER:
+            raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}")
+        return unpack(np.load(path), one, frame_id)
 
     def _image_path(self, record: FrameRecord) -> Path:
         return self._path(record.name, _stamp(record, 2), ".npy")
@@ -195,6 +196,19 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     return Sample(
         rgb, depth, mask, one.intrinsics.copy(), one.camera_from_object.copy(), one.object_id, frame_id, one.visibility
     )
+
+
+def _read_prepared(path: Path) -> Prepared:
+    """Read what was kept of a record.  Raises ValueError where the file is larger than what it says."""
+    with zipfile.ZipFile(path) as archive:
+        if sum(part.file_size for part in archive.infolist()) > path.stat().st_size:
+            raise ValueError("its parts claim to be larger than the file")
+    with np.load(path) as kept:
+        height, width, object_id = (int(x) for x in kept["numbers"])
+        bits, visibility = kept["mask_bits"], float(kept["visibility"])
+        if len(bits) != -(-height * width // 8):
+            raise ValueError("its mask is not of the image's size")
+        return Prepared(bits, (height, width), kept["intrinsics"], kept["pose"], object_id, visibility)
 
 
 def _stamp(record: FrameRecord, files: int | None = None) -> str:

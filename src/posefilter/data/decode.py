@@ -1,16 +1,21 @@
 """Decode a dataset's files, and say in one line what is wrong with them."""
 
+import io
 import json
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from posefilter.data.frames import SATURATED, BadData
 
+MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 megapixels passes
+MOST_BYTES = 1 << 29  # of an image's or JSON's file
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
@@ -48,12 +53,34 @@ def read_label(path: Path) -> np.ndarray:
 
 def read_json(path: Path) -> Any:
     """Parse a JSON file."""
+    try:
+        return json.loads(read_bytes(path))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
+
+
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """Read a file.  Raises BadData where it is missing, or larger than such a file can be."""
     if not path.is_file():
         raise BadData(path, "missing file")
+    if path.stat().st_size > most:
+        raise BadData(path, "file too large", f"{path.stat().st_size:,} bytes, at most {most:,}")
+    return path.read_bytes()
+
+
+def check_picture(path: Path, data: bytes) -> None:
+    """Raise BadData where an image's header promises more pixels than photographs have: decoding would fill the memory."""
     try:
-        return json.loads(path.read_bytes())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as image:
+                width, height = image.size
+    except Image.DecompressionBombError as error:
+        raise BadData(path, "image too large", str(error)) from error
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, struct.error) as error:
+        raise BadData(path, "truncated or corrupt image", "its header cannot be read") from error
+    if max(width, height) > MOST_SIDE or width * height > MOST_PIXELS:
+        raise BadData(path, "image too large", f"{width}x{height} pixels, at most {MOST_SIDE} a side")
 
 
 def need(record: Any, key: str, path: Path, where: str = "") -> Any:
@@ -68,7 +95,7 @@ def numbers(record: Any, key: str, path: Path, shape: tuple[int, ...], where: st
     value = need(record, key, path, where)
     try:
         array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BadData(path, f"'{where}{key}' is not numbers", str(error)) from error
     if array.size != int(np.prod(shape)):
         raise BadData(path, f"'{where}{key}' has the wrong size", f"{array.shape}, expected {shape}")
@@ -85,13 +112,15 @@ def expect_size(path: Path, image: np.ndarray, height: int, width: int, of: str)
 
 
 def _read_image(path: Path) -> np.ndarray:
-    if not path.is_file():
-        raise BadData(path, "missing file")
-    data = path.read_bytes()
+    data = read_bytes(path)
     flaw = _flaw(data)
     if flaw:
         raise BadData(path, "truncated or corrupt image", flaw)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    check_picture(path, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise BadData(path, "truncated or corrupt image", "cannot be decoded") from error
     if image is None:
         raise BadData(path, "truncated or corrupt image", "cannot be decoded")
     return image

@@ -2,8 +2,12 @@
 
 import hashlib
 import shutil
+import stat
+import tarfile
 import urllib.error
 import urllib.request
+import zipfile
+import zlib
 from http.client import HTTPException, HTTPResponse
 from pathlib import Path
 from urllib.parse import urlparse
@@ -11,9 +15,11 @@ from urllib.parse import urlparse
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from posefilter.data.bars import bars
+from posefilter.data.confine import stays_inside
 from posefilter.errors import UserError
 
 _BLOCK = 1 << 20
+_MOST_GROWTH = 100  # times an archive's size, unpacked
 _COLUMNS = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
 
 
@@ -57,10 +63,14 @@ def fetch(
 
 
 def unpack(archive: Path | str, folder: Path | str) -> Path:
-    """Unpack a zip or tar archive, whole or not at all; return the folder.  Raises UserError where it is corrupt."""
+    """Unpack a zip or tar archive, whole or not at all; return the folder.
+
+    Raises UserError where it is corrupt, names places outside of the folder, holds links, or grows out of bounds.
+    """
     archive, folder = Path(archive), Path(folder)
     if folder.exists():
         raise UserError(f"{folder}: exists already; remove it, or choose another folder to unpack {archive.name} into")
+    check_members(archive)
     partial = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -71,6 +81,27 @@ def unpack(archive: Path | str, folder: Path | str) -> Path:
         raise UserError(f"{archive}: cannot be unpacked ({error})") from error
     partial.replace(folder)
     return folder
+
+
+def check_members(archive: Path) -> None:
+    """Raise UserError unless an archive holds plain files and folders below its own, of a size that it can have."""
+    try:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as opened:
+                members = [(m.filename, m.file_size, not stat.S_ISLNK(m.external_attr >> 16)) for m in opened.infolist()]
+        else:
+            with tarfile.open(archive) as opened_tar:
+                members = [(m.name, m.size, m.isfile() or m.isdir()) for m in opened_tar]
+    except (OSError, tarfile.TarError, zipfile.BadZipFile, EOFError, zlib.error) as error:
+        raise UserError(f"{archive}: cannot be unpacked ({error})") from error
+    for name, _, plain in members:
+        if not plain:
+            raise UserError(f"{archive}: {name[:80]!r} in it is a link or device, which is not unpacked")
+        if not stays_inside(name, Path()):
+            raise UserError(f"{archive}: {name[:80]!r} in it leads out of its folder")
+    total = sum(size for _, size, _ in members)
+    if total > _MOST_GROWTH * archive.stat().st_size + _BLOCK:
+        raise UserError(f"{archive}: would grow to {total:,} bytes, more than {_MOST_GROWTH} times its size")
 
 
 def _transfer(url: str, partial: Path, timeout: float, bar: Progress, task: object) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from posefilter.data import ycb
+from posefilter.data.confine import check_inside
 from posefilter.data.decode import expect_size, need, read_color, read_depth, read_json, read_label
 from posefilter.data.fat_settings import (
     FRAME,
@@ -97,7 +98,7 @@ class FatReader(BaseReader):
         """Return record i at the dataset's resolution, its visibility still unknown.  Raises BadData."""
         entry = self._entries[i]
         record, camera = entry.record, entry.camera
-        color_path, depth_path, seg_path = record.files[:3]
+        color_path, depth_path, seg_path = self._files(record)[:3]
         rgb, depth, seg = read_color(color_path), read_depth(depth_path, DEPTH_UNITS), read_label(seg_path)
         for path, image in zip(record.files, (rgb, depth, seg), strict=False):
             expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
@@ -116,7 +117,7 @@ class FatReader(BaseReader):
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labelled object.  -> (H, W) bool."""
         entry = self._entries[i]
-        seg = read_label(entry.record.files[2])
+        seg = read_label(self._files(entry.record)[2])
         return (seg != 0) & ~self._mask(entry, seg, entry.record.files[2])
 
     def _mask(self, entry: _Entry, seg: np.ndarray, path: Path) -> np.ndarray:
@@ -133,7 +134,8 @@ class FatReader(BaseReader):
     def _settings(self, folder: Path) -> tuple[dict[str, FatClass], dict[str, FatCamera]] | None:
         """Return a folder's classes and cameras, None where they are broken and on_error is "skip"."""
         try:
-            return object_settings(folder / "_object_settings.json"), camera_settings(folder / "_camera_settings.json")
+            objects, cameras = (check_inside(folder / f"_{kind}_settings.json", self.root) for kind in ("object", "camera"))
+            return object_settings(objects), camera_settings(cameras)
         except BadData as error:
             self._leave_out(error)
             return None
@@ -163,10 +165,10 @@ class FatReader(BaseReader):
         self, scene_id: int, im_id: int, files: tuple[Path, ...], classes: dict[str, FatClass], camera: FatCamera
     ) -> list[_Entry]:
         path = files[3]
-        content = read_json(path)
+        content = read_json(check_inside(path, self.root))
         found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
         for k, one in enumerate(need(content, "objects", path)):
-            name = mesh_name(need(one, "class", path, f"objects[{k}]."))
+            name = mesh_name(need(one, "class", path, f"objects[{k}]."), path)
             if name not in classes:
                 raise BadData(path, "unknown class", f"'{name}' is not in the folder's _object_settings.json")
             if name in self.objects:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from posefilter.data.confine import is_plain_name
 from posefilter.data.decode import need, numbers, read_json
 from posefilter.data.frames import BadData
 from posefilter.errors import UserError
@@ -52,8 +53,12 @@ def scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
             yield from scene_folders(root / name, parts)
 
 
-def mesh_name(fat_class: Any) -> str:
-    return str(fat_class).removesuffix("_16k")
+def mesh_name(fat_class: Any, path: Path) -> str:
+    """Return the name of a class's mesh.  Raises BadData where it is no plain name."""
+    name = str(fat_class).removesuffix("_16k")
+    if not is_plain_name(name):
+        raise BadData(path, "class with an impossible name", repr(name[:40]))
+    return name
 
 
 def object_settings(path: Path) -> dict[str, FatClass]:
@@ -67,7 +72,7 @@ def object_settings(path: Path) -> dict[str, FatClass]:
             raise BadData(path, f"'{where}fixed_model_transform' is not 100 x a rotation with its shift in the last row")
         size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM if "cuboid_dimensions" in one else None
         seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
-        classes[mesh_name(need(one, "class", path, where))] = FatClass(seg_id, aligned, size)
+        classes[mesh_name(need(one, "class", path, where), path)] = FatClass(seg_id, aligned, size)
     return classes
 
 

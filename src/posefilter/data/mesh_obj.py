@@ -6,6 +6,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from posefilter.data.confine import check_inside
+from posefilter.data.decode import check_picture, read_bytes
 from posefilter.errors import UserError
 
 
@@ -32,16 +34,20 @@ class RawMesh(NamedTuple):
 
 
 def read_image(path: Path, source: Path) -> np.ndarray:
-    """Read a texture as (h, w, 3) uint8 RGB."""
+    """Read a texture as (h, w, 3) uint8 RGB; it must lie in the folder of what names it."""
+    check_inside(path, source.parent)
     if not path.is_file():
         raise UserError(f"{path}: missing texture, named by {source.name}")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    data = read_bytes(path)
+    check_picture(path, data)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise UserError(f"{path}: not a readable picture (is it cut short?), named by {source.name}")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _read_mtl(path: Path, source: Path) -> dict[str, Material]:
+    check_inside(path, source.parent)
     if not path.is_file():
         raise UserError(f"{path}: missing material file, named by {source.name}")
     materials: dict[str, Material] = {}

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from posefilter.data.frames import BadData, Sample
+from posefilter.data.confine import check_inside
+from posefilter.data.frames import BadData, FrameRecord, Sample
 from posefilter.data.meshes import BUILTIN, MeshStore
 from posefilter.data.silhouette import Geometry
 
@@ -27,6 +28,10 @@ class BaseReader:
         return (
             float("nan") if self._geometry is None else self._geometry.visible_share(self.objects[sample.object_id], sample)
         )
+
+    def _files(self, record: FrameRecord) -> tuple[Path, ...]:
+        """Return a record's files.  Raises UserError where one is a link that leads out of the dataset."""
+        return tuple(check_inside(path, self.root) for path in record.files)
 
     def _leave_out(self, error: BadData) -> None:
         """Count a broken frame, or raise its error."""

@@ -1,5 +1,6 @@
 """Read YCB-Video as it was published: `data/<scene>/NNNNNN-{color,depth,label}.png` and `-meta.mat`, and `data_syn`."""
 
+import io
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import torch
 from scipy.io.matlab import MatReadError
 
 from posefilter.data import ycb
-from posefilter.data.decode import expect_size, numbers, read_color, read_depth, read_label
+from posefilter.data.confine import check_inside, is_plain_name
+from posefilter.data.decode import expect_size, numbers, read_bytes, read_color, read_depth, read_label
 from posefilter.data.frames import BadData, FrameRecord, NotShown, Sample
 from posefilter.data.meshes import MeshStore
 from posefilter.data.naming import choose_objects
@@ -21,6 +23,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.pose import is_rigid
 
 _KEYS = ["cls_indexes", "poses", "factor_depth", "intrinsic_matrix"]
+_LARGEST_META, _LONGEST_LIST = 1 << 25, 1 << 22  # bytes of a -meta.mat, of which there may be 2 MB, and of a list
 _SYN, _SYN_SCENE, _SYN_BLOCK = "data_syn", 1000, 100  # rendered frames have no scenes: blocks stand in, numbered from here
 
 
@@ -92,7 +95,7 @@ class YCBVideoReader(BaseReader):
     def read(self, i: int) -> Sample:
         """Return record i at the dataset's resolution, its visibility still unknown.  Raises BadData."""
         entry = self._entries[i]
-        color_path, depth_path, label_path, _ = entry.record.files
+        color_path, depth_path, label_path, _ = self._files(entry.record)
         rgb, depth, label = read_color(color_path), read_depth(depth_path, entry.units), read_label(label_path)
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
@@ -104,7 +107,7 @@ class YCBVideoReader(BaseReader):
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labelled object.  -> (H, W) bool."""
         entry = self._entries[i]
-        label = read_label(entry.record.files[2])
+        label = read_label(self._files(entry.record)[2])
         return (label != 0) & ~self._mask(entry, label)
 
     def _mask(self, entry: _Entry, label: np.ndarray) -> np.ndarray:
@@ -134,6 +137,8 @@ class YCBVideoReader(BaseReader):
         missing = 0
         for name in names:
             scene, stem = name.rsplit("/", 1)
+            if not stem.isdigit():
+                raise UserError(f"{folders.get(scene, self.root)}/{stem}: frames are named by numbers, such as 000001")
             if scene not in folders:
                 missing += 1
                 continue
@@ -148,7 +153,7 @@ class YCBVideoReader(BaseReader):
 
     def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
         path = stem.with_name(f"{stem.name}-meta.mat")
-        meta = _read_meta(path)
+        meta = _read_meta(check_inside(path, self.root))
         indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
         if (indices != np.round(indices)).any() or indices.min() < 1 or indices.max() > len(self._classes):
             raise BadData(
@@ -186,7 +191,11 @@ class YCBVideoReader(BaseReader):
 def _class_names(root: Path) -> tuple[str, ...]:
     for path in (root / "image_sets" / "classes.txt", root / "classes.txt", root.parent / "classes.txt"):
         if path.is_file():
-            return tuple(line.strip() for line in path.read_text().splitlines() if line.strip())
+            names = tuple(line.strip() for line in read_bytes(path, _LONGEST_LIST).decode().splitlines() if line.strip())
+            wrong = [name for name in names if not is_plain_name(name)]
+            if wrong:
+                raise UserError(f"{path}: class with an impossible name {wrong[0][:40]!r}")
+            return names
     return ycb.CLASSES
 
 
@@ -221,11 +230,10 @@ def _read_list(root: Path, listed: str | Path) -> list[str]:
 
 def _read_meta(path: Path) -> dict[str, Any]:
     """Return the few arrays that are needed of a -meta.mat file."""
-    if not path.is_file():
-        raise BadData(path, "missing file")
+    data = io.BytesIO(read_bytes(path, _LARGEST_META))
     try:
-        meta = scipy.io.loadmat(path, variable_names=_KEYS)
-    except (MatReadError, ValueError, TypeError, OSError, NotImplementedError, EOFError, zlib.error) as error:
+        meta = scipy.io.loadmat(data, variable_names=_KEYS)
+    except (MemoryError, MatReadError, ValueError, TypeError, OSError, NotImplementedError, EOFError, zlib.error) as error:
         raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error
     for key in _KEYS:
         if key not in meta:

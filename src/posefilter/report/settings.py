@@ -4,7 +4,15 @@ import json
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-PASSING = ("out", "folder", "console", "threads", "resume", "debug")  # where and how a run was made, not what it was
+PASSING = (
+    "out",
+    "folder",
+    "console",
+    "threads",
+    "resume",
+    "debug",
+    "plugins",
+)  # where and how a run was made, not what it was
 
 
 class Change(NamedTuple):

@@ -13,60 +13,84 @@ from typing import Any, Literal, Union, get_args, get_origin
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
+from posefilter.run.trust import Scope, check_name, is_component, is_listed, is_plugin, listed_in, trust
 
-ALLOWED = ("posefilter.", "torch.", "lightning.")
+__all__ = ["accepted", "check_arguments", "hint", "instantiate", "instantiate_recipe", "locate", "trust"]
+
 _PLAIN = (bool, int, float, str)
 
 
 def instantiate(node: Any, where: str, **given: Any) -> Any:
-    """Build what a node describes: `_target_` names a class or function, `_partial_: true` leaves it to be called later.
+    """Build what a node of the user's settings describes.
 
-    Lists and dictionaries are built element by element; a dictionary without a `_target_` stays one, an empty one (the
-    choice `none`) becomes None. `where`: the node's place in the configuration, for messages; given: arguments that no file
-    can hold. Raises UserError, naming the key, for a target outside the project, torch and lightning, and for arguments
-    that are unknown, missing or of the wrong type.
+    `_target_` names a class or function, `_partial_: true` leaves it to be called later. Lists and dictionaries are built
+    element by element; a dictionary without a `_target_` stays one, an empty one (the choice `none`) becomes None.
+
+    Args:
+        node: The settings.
+        where: The node's place in the configuration, for messages.
+        given: Arguments that no file can hold.
+
+    Raises:
+        UserError: The key, for a target that may not be built (see `trust`), or arguments that are unknown, missing or of
+            the wrong type.
     """
+    return _build(node, where, Scope.CONFIG, given)
+
+
+def instantiate_recipe(node: Any, where: str) -> Any:
+    """Build what a node of a checkpoint's recipe describes: as `instantiate`, but components alone."""
+    return _build(node, where, Scope.RECIPE, {})
+
+
+def _build(node: Any, where: str, scope: Scope, given: Mapping[str, Any]) -> Any:
     if isinstance(node, DictConfig | ListConfig):
         node = OmegaConf.to_container(node, resolve=True)
     if isinstance(node, list):
-        return [instantiate(item, f"{where}[{i}]") for i, item in enumerate(node)]
+        return [_build(item, f"{where}[{i}]", scope, {}) for i, item in enumerate(node)]
     if not isinstance(node, Mapping):
         return node
     if not node:
         return None
-    arguments = {str(k): instantiate(v, f"{where}.{k}") for k, v in node.items() if k not in ("_target_", "_partial_")}
-    if "_target_" not in node:
+    inner = {str(k): v for k, v in node.items() if k not in ("_target_", "_partial_")}
+    target = locate(str(node["_target_"]), where, scope) if "_target_" in node else None
+    arguments = {k: _build(v, f"{where}.{k}", scope, {}) for k, v in inner.items()}
+    if target is None:
         return arguments
-    target = locate(str(node["_target_"]), where)
     partial = bool(node.get("_partial_", False))
     check_arguments(target, arguments, given, where, partial)
     made = functools.partial(target, **arguments, **given)
     return made if partial else made()
 
 
-def locate(name: str, where: str) -> Callable[..., Any]:
-    """Import what a dotted name stands for.  Raises UserError where it may not, or cannot, be imported."""
-    if not name.startswith(ALLOWED):
-        raise UserError(f"{where}._target_={name}: only names within {', '.join(ALLOWED)} may be built")
-    parts = name.split(".")
-    for cut in range(len(parts) - 1, 0, -1):
-        module = ".".join(parts[:cut])
-        try:
-            thing: Any = importlib.import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name and not module.startswith(error.name):
-                raise UserError(
-                    f"{where}._target_={name}: needs the package '{error.name}', which is not installed"
-                ) from error
-            continue
-        for part in parts[cut:]:
-            if not hasattr(thing, part):
-                raise UserError(f"{where}._target_={name}: there is no '{part}' in {module}" + hint(part, dir(thing)))
-            thing = getattr(thing, part)
-        if not callable(thing):
-            raise UserError(f"{where}._target_={name}: is nothing that can be called")
-        return typing.cast(Callable[..., Any], thing)
-    raise UserError(f"{where}._target_={name}: there is no such module")
+def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., Any]:
+    """Import what a dotted name stands for: a class, or a listed or trusted function, defined in the module that it names.
+
+    Raises UserError where it may not, or cannot, be imported. Nothing is imported for a name that is not allowed.
+    """
+    check_name(name, where, scope)
+    module, _, attribute = name.rpartition(".")
+    try:
+        home = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name and not f"{module}.".startswith(f"{error.name}."):
+            raise UserError(f"{where}._target_={name}: needs the package '{error.name}', which is not installed") from error
+        raise UserError(f"{where}._target_={name}: there is no module {module}") from error
+    listed, plugin = is_listed(name, scope), is_plugin(name)
+    own = plugin or is_component(module, scope)
+    found = vars(home).get(attribute)
+    if found is None or not (listed or (own and _defined_in(found, module, attribute))):
+        known = listed_in(module, scope)
+        known += [key for key, value in vars(home).items() if own and _defined_in(value, module, key)]
+        raise UserError(f"{where}._target_={name}: there is no '{attribute}' defined in {module}{hint(attribute, known)}")
+    if not (listed or inspect.isclass(found) or (plugin and inspect.isfunction(found))):
+        raise UserError(f"{where}._target_={name}: is no class")
+    return typing.cast(Callable[..., Any], found)
+
+
+def _defined_in(thing: Any, module: str, name: str) -> bool:
+    """Tell whether a module defines a thing by this name, rather than importing it."""
+    return getattr(thing, "__module__", None) == module and getattr(thing, "__qualname__", None) == name
 
 
 def hint(name: str, known: Sequence[str] | Any) -> str:

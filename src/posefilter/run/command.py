@@ -14,7 +14,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.errors import UserError
@@ -22,6 +22,7 @@ from posefilter.run.build import hint
 from posefilter.run.job import Job, check_settings, first, plain_name, run_of
 from posefilter.run.pieces import loosen
 from posefilter.run.resume import with_resumed
+from posefilter.run.trust import trust
 from posefilter.run.voice import PLAIN, logging_for, settle_logging
 
 Work = Callable[[Job], Any]
@@ -86,6 +87,7 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
         work: Work = getattr(importlib.import_module(f"posefilter.run.{name}"), name)
         try:
             check_settings(cfg)
+            use_plugins(cfg)
             return work(job)
         except EXPECTED as error:
             if job.swept:  # the other jobs go on; Hydra raises it again at the end
@@ -94,6 +96,21 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
             raise _Stop(error) from error
 
     return task
+
+
+def use_plugins(cfg: DictConfig) -> None:
+    """Trust the packages that the user names in `plugins`, and import them.  Raises UserError where one is not there."""
+    named = cfg.get("plugins")
+    if named is None:
+        return
+    if not isinstance(named, ListConfig):
+        raise UserError(f"plugins={named}: must be a list of packages, such as plugins=[my_package]")
+    for package in named:
+        trust(package)
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise UserError(f"plugins={package}: there is no package '{error.name}' (is it installed?)") from error
 
 
 class _Stop(BaseException):

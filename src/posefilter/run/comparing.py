@@ -9,7 +9,17 @@ from posefilter.run.job import Job
 
 HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")  # by whose change nothing else comes out
 _PLACES = ("data.root", "data.cache_dir")
-_PASSING = ("callbacks", "console", "debug", "folder", "logger", "out", "resume", "threads")  # where and how, not what
+_PASSING = (
+    "callbacks",
+    "console",
+    "debug",
+    "folder",
+    "logger",
+    "out",
+    "plugins",
+    "resume",
+    "threads",
+)  # where and how, not what
 
 
 def comparable(job: Job) -> dict[str, bool | int | float | str]:

@@ -9,6 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
+from posefilter.data.confine import check_links
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
@@ -19,6 +20,7 @@ from posefilter.run.job import Job
 from posefilter.run.machine import settle
 from posefilter.run.method import method_of, read_checkpoint
 from posefilter.run.pieces import changed, changes, chosen
+from posefilter.run.recipe import check_data
 from posefilter.run.results import record, show, write_json
 from posefilter.run.train import build_data, make_trainer, quiet
 from posefilter.run.voice import typed
@@ -48,6 +50,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method = method_of(checkpoint, changes(job.cfg))
     if job.cfg.seed is not None:
         method.seed = job.cfg.seed
+    check_links(job.folder)
     data = build_data(data_settings(job, checkpoint["recipe"]["settings"], method.model.name), job.cfg.console)
     data.setup("test")
     method.adopt(object_to_judge(data, method.model))
@@ -103,16 +106,16 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
 def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictConfig:
     """Return the settings of the data to test on.
 
-    Without `data=` they are those that the checkpoint was trained with: its held-out test split. With it, object and image
+    Without `data=` they are those that the checkpoint was trained with: its held-out test split, and it must
+    lie where `check_data` lets it. With it, object and image
     size are the checkpoint's unless typed; the split is the checkpoint's where it was trained on the same folder, and else
     every frame is tested.
     """
     said = OmegaConf.to_container(job.cfg.data, resolve=False) if job.cfg.get("data") else {}
     assert isinstance(said, dict)
     own = trained.get("data") or {}
-    typed = {
-        o.split("=", 1)[0].lstrip("+~").removeprefix("data.") for o in job.overrides if o.lstrip("+~").startswith("data.")
-    }
+    pairs = [o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")]
+    typed = {key.removeprefix("data."): value.strip("'\"") for key, _, value in pairs}
     chosen = "_target_" in said
     if own and not chosen and "_target_" not in own:
         raise UserError("data: exported weights carry no dataset; give data=fat|ycb_video|bop|scenes and data.root=DIR")
@@ -138,6 +141,10 @@ def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictCo
         settings["split"] = {"test": 1.0}
     data = OmegaConf.create({**tree, "data": settings}).data
     OmegaConf.resolve(data)
+    if not chosen:
+        plain = OmegaConf.to_container(data)
+        assert isinstance(plain, dict)
+        check_data({str(key): value for key, value in plain.items()}, typed)
     return data
 
 

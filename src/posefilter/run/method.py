@@ -10,12 +10,14 @@ from omegaconf import DictConfig, OmegaConf
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.models.compact import unpack
-from posefilter.run.build import hint, instantiate, locate
+from posefilter.run.archive import Bounded, check_archive, check_content
+from posefilter.run.build import hint, instantiate_recipe, locate
 from posefilter.run.job import Job
 from posefilter.run.pieces import changed
+from posefilter.run.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.types import ObjectModel
 
-_NOT_KEPT = ("out", "folder", "trainer", "callbacks", "logger", "resume", "debug", "console")
+_SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
 
 
 def check_loss(job: Job) -> None:
@@ -28,12 +30,16 @@ def check_loss(job: Job) -> None:
 
 
 def recipe(job: Job) -> dict[str, Any]:
-    """Return what a checkpoint carries, so that the method can be built again: choices, and settings not yet resolved."""
+    """Return what a checkpoint carries, to build the method again: choices, and settings that refer to each other.
+
+    Any other interpolation is resolved here and now, since no reader of the checkpoint would.
+    """
     settings = OmegaConf.to_container(job.cfg, resolve=False)
     assert isinstance(settings, dict)
+    kept = {str(key): value for key, value in settings.items() if key not in NOT_KEPT}
     return {
         "choices": {group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")},
-        "settings": {key: value for key, value in settings.items() if key not in _NOT_KEPT},
+        "settings": resolve_foreign(kept),
     }
 
 
@@ -41,12 +47,13 @@ def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> Po
     """Build the method of a recipe, for an object if it is known."""
     settings = OmegaConf.create(recipe["settings"])
     try:
-        method = instantiate(settings.model, "model")
+        method = instantiate_recipe(settings.get("model"), "model")
     except UserError as error:
         where, found, rest = str(error).partition(":")
         key, equals, value = where.partition("=")
         raise UserError(typed_key(settings, key) + equals + value + found + rest) from error
-    assert isinstance(method, PoseEstimator)
+    if not isinstance(method, PoseEstimator):
+        raise UserError(f"model: is a {type(method).__name__}, not a method")
     method.recipe = recipe
     if model is not None:
         method.adopt(model)
@@ -54,7 +61,10 @@ def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> Po
 
 
 def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
-    """Read a checkpoint of ours.  Raises UserError where the path holds none."""
+    """Read a checkpoint of ours, as data that others may have written.
+
+    Raises UserError where the path holds none, and where what it holds could do harm (see `archive` and `recipe`).
+    """
     if not path:
         raise UserError("checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/")
     file = Path(path)
@@ -62,22 +72,26 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
         file = file / "checkpoints" / "best.ckpt"
     if not file.is_file():
         raise UserError(f"checkpoint={path}: no such file")
+    said = f"checkpoint={path}"
+    check_archive(file, said)
     try:
-        checkpoint = torch.load(file, map_location="cpu", weights_only=True)
+        loaded = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged archive fails in many ways, and pickle raises what it likes
-        raise UserError(f"checkpoint={path}: not readable as a checkpoint ({type(error).__name__})") from error
-    if not isinstance(checkpoint, dict) or not {"state_dict", "recipe", "object_model"} <= set(checkpoint):
-        raise UserError(f"checkpoint={path}: not made by this project's train.py (no recipe or object in it)")
-    return checkpoint
+        raise UserError(f"{said}: not readable as a checkpoint ({type(error).__name__})") from error
+    checkpoint = check_content(loaded, file, said)
+    return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
 
 
 def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> PoseEstimator:
     """Build the method that a checkpoint holds, with some of its pieces changed, and load its weights."""
     recipe = checkpoint["recipe"]
-    recipe = {**recipe, "settings": changed(recipe["settings"], wanted or {})}
-    method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
+    recipe = {**recipe, "settings": without_pretrained(changed(recipe["settings"], wanted or {}))}
+    state = unpack(checkpoint["state_dict"])
+    elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
+    with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
+        method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
     try:
-        missing, foreign = method.load_state_dict(unpack(checkpoint["state_dict"]), strict=False)
+        missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes
         raise UserError(
             "checkpoint: its weights do not fit the method; they were trained by another version of this code"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from omegaconf import ListConfig, OmegaConf
 
-from posefilter.data.decode import read_color, read_depth
+from posefilter.data.decode import MOST_SIDE, read_color, read_depth
 from posefilter.data.mesh import Mesh
 from posefilter.data.meshes import MeshStore
 from posefilter.data.resize import network_size, resize_depth
@@ -50,8 +50,8 @@ def predict(job: Job) -> None:
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = camera(cfg.intrinsics)
     shape = mesh_of(cfg.meshes, method.model.name) if cfg.meshes else method.model.hull
-    trained = OmegaConf.create(checkpoint["recipe"]["settings"]).data
-    size = network_size(depth.shape[0], depth.shape[1], trained.get("image_width"), trained.get("image_height"))
+    width, height = trained_size(checkpoint["recipe"]["settings"])
+    size = network_size(depth.shape[0], depth.shape[1], width, height)
     method = method.to("cuda" if torch.cuda.is_available() else "cpu")
     batch = Batch(*(x.to(method.device) for x in as_batch(rgb, depth, K, *size)))
     method.seed = cfg.seed
@@ -77,6 +77,19 @@ def predict(job: Job) -> None:
     files |= {"view": VIEW} if cfg.view else {}
     following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.view else []
     ended(cfg.console, "predicted", {name: folder / file for name, file in files.items()}, following, **answer)
+
+
+def trained_size(settings: dict[str, Any]) -> tuple[int | None, int | None]:
+    """Return the width and height of the images that a method was trained on [px], null where they follow the image's.
+
+    Raises UserError where a checkpoint's settings tell others than images have.
+    """
+    trained = OmegaConf.create(settings).get("data") or {}
+    width, height = trained.get("image_width"), trained.get("image_height")
+    for size in (width, height):
+        if size is not None and not (isinstance(size, int) and 0 < size <= MOST_SIDE):
+            raise UserError(f"checkpoint: was trained on images of {size} pixels, which there are not")
+    return width, height
 
 
 def check_view(view: Any) -> None:

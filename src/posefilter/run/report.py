@@ -1,5 +1,6 @@
 """Explain a run or a sweep on one HTML page."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.data.confine import check_links
 from posefilter.errors import UserError
 from posefilter.report.gather import Run, read_run
 from posefilter.report.run_page import make_run_page
@@ -38,6 +40,7 @@ def report(job: Job) -> None:
     if (run is None) == (sweep is None):
         raise UserError("give either run=RUN, a run's folder, or sweep=DIR, a sweep's")
     folder = Path(str(run if sweep is None else sweep))
+    check_links(folder)
     command = f"python report.py {'run' if sweep is None else 'sweep'}={folder}"
     if sweep is None:
         record = read_run(folder)
@@ -58,7 +61,7 @@ def report(job: Job) -> None:
 
 def compared(run: Run) -> list[Change] | None:
     """Return how a run's settings differ from its method's defaults; None where these can no longer be composed."""
-    said = [f"{key}={run.choices[key]}" for key in ("model", "variant") if key in run.choices]
+    said = [f"{key}={run.choices[key]}" for key in ("model", "variant") if re.fullmatch(r"\w+", run.choices.get(key, ""))]
     if not run.config:
         return None
     loader = GlobalHydra.instance().config_loader()

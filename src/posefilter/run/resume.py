@@ -1,12 +1,18 @@
 """Going on with a run that was cut short: the same settings, from its last checkpoint."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import yaml
 
+from posefilter.data.confine import check_links, stays_inside
 from posefilter.errors import UserError
 
-_DROPPED = ("resume=", "out=", "hydra.run.dir=")
+_DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
+_OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
+_PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")  # that a run writes to
+_LONGEST, _MOST = 1 << 16, 1000  # of a file of overrides [bytes], and of its lines
 
 
 def run_folder(resume: str | Path) -> Path:
@@ -34,8 +40,45 @@ def with_resumed(arguments: list[str]) -> list[str]:
         return arguments
     folder = run_folder(given[-1])
     last_checkpoint(given[-1])
-    before = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text()) or []
-    kept = [o for o in before if not o.startswith(_DROPPED)]
+    check_links(folder)
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
-    kept = [o for o in kept if o.split("=", 1)[0].lstrip("+~") not in named]
+    kept = [o for o in overrides_of(folder) if _key(o) not in named and _key(o) not in _DROPPED]
+    for override in kept:
+        check_override(override, folder)
     return [*kept, *arguments, f"out={folder}"]
+
+
+def overrides_of(folder: Path) -> list[str]:
+    """Return what was typed to start a run.  Raises UserError where its record is damaged."""
+    file = folder / ".hydra" / "overrides.yaml"
+    try:
+        before: Any = yaml.safe_load(file.read_text()) if file.stat().st_size <= _LONGEST else None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError):
+        before = None
+    before = [] if before == [] else before
+    if not (isinstance(before, list) and len(before) <= _MOST and all(isinstance(one, str) for one in before)):
+        raise UserError(f"{file}: should be a list of settings, as train.py writes it")
+    return before
+
+
+def check_override(override: str, folder: Path) -> None:
+    """Raise UserError where a setting that a run's folder brings is one that only the user may type.
+
+    Such are Hydra's own, interpolations that call something, and places outside of the working folder.
+    """
+    found = _OVERRIDE.fullmatch(override)
+    if found is None or not override.isprintable() or re.match(r"hydra\b", found[2]):
+        raise UserError(f"resume={folder}: {override[:80]!r} in its .hydra/overrides.yaml is no setting of a training")
+    key, value = found[2], (found[3] or "").strip("'\"")
+    if re.search(r"\$\{[^}]*:", value):
+        raise UserError(f"resume={folder}: its {key} calls a function; if that is right, type {key}=... yourself")
+    words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
+    place = key.rpartition(".")[2] in _PLACES and value not in ("", "null")
+    if place or not all(stays_inside(word, Path()) for word in words):
+        raise UserError(
+            f"resume={folder}: its {key}={value} lies outside of the working folder; if it is right, type it as well"
+        )
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0].lstrip("+~")

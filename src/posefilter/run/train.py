@@ -4,6 +4,7 @@ import json
 import logging
 import time
 import warnings
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import default_collate
 
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
+from posefilter.data.confine import stays_inside
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator, score_of
@@ -63,9 +65,19 @@ def train(job: Job) -> float:
     metrics = record(results, job, data.describe(), best) | {"training": training}
     write_json(job.folder / "metrics.json", metrics)
     files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
-    following = [] if job.swept else [typed("report", run=job.folder), typed("evaluate", checkpoint=best), "make board"]
+    following = (
+        []
+        if job.swept
+        else [typed("report", run=job.folder), typed("evaluate", checkpoint=best, **places(job)), "make board"]
+    )
     show(metrics, f"{job.choices['model']}, loss {job.choices['loss']}", job.cfg.console, "trained", files, following)
     return score_of(metrics)
+
+
+def places(job: Job) -> dict[str, Any]:
+    """Return the folders that an evaluation is to be told: outside of the working folder no checkpoint decides on any."""
+    named = {key: job.cfg.data.get(key) for key in ("root", "meshes", "cache_dir", "model_points")}
+    return {f"data__{key}": value for key, value in named.items() if value and not stays_inside(str(value), Path())}
 
 
 def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:
