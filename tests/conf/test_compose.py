@@ -148,7 +148,7 @@ class TestBuilding:
 
     @pytest.mark.parametrize("name", ["os.system", "builtins.eval", "subprocess.run", "posefilterx.y"])
     def test_only_names_of_ours_torch_and_lightning(self, name: str) -> None:
-        with pytest.raises(UserError, match="only names within"):
+        with pytest.raises(UserError, match="may not be built"):
             instantiate({"_target_": name}, "x")
 
     def test_misspelt_names_are_told(self) -> None:

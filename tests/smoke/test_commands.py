@@ -83,7 +83,12 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
 ) -> None:
     checkpoint = trained / "checkpoints" / "best.ckpt"
     common = ["console=plain", "threads=1"]
-    assert run_command("evaluate", HOME, [*common, f"checkpoint={checkpoint}", f"out={tmp_path / 'a'}"]) == 0
+    assert (
+        run_command(
+            "evaluate", HOME, [*common, f"checkpoint={checkpoint}", f"data.root={tiny_scenes}", f"out={tmp_path / 'a'}"]
+        )
+        == 0
+    )
     assert numbers(read(tmp_path / "a")) == numbers(read(trained))
     with (tmp_path / "a" / "poses.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -103,8 +108,14 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     assert again["iou"] == pytest.approx(before["iou"], abs=1e-3)
 
 
-def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tmp_path: Path) -> None:
-    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", "refine=none", "-m", "filter.particles=4,8"]
+def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tiny_scenes: Path, tmp_path: Path) -> None:
+    typed = [
+        f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}",
+        f"data.root={tiny_scenes}",
+        "refine=none",
+        "-m",
+        "filter.particles=4,8",
+    ]
     assert run_command("evaluate", HOME, [*typed, f"out={tmp_path}", "console=plain", "threads=1"]) == 0
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -188,7 +199,7 @@ def test_a_mesh_of_another_kind_is_refused(trained: Path, tmp_path: Path, tiny_s
     checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
     checkpoint["object_model"]["center"] = checkpoint["object_model"]["center"] + 0.05
     torch.save(checkpoint, tmp_path / "moved.ckpt")
-    typed = [f"checkpoint={tmp_path / 'moved.ckpt'}", "console=plain", "threads=1"]
+    typed = [f"checkpoint={tmp_path / 'moved.ckpt'}", f"++data.root={tiny_scenes}", "console=plain", "threads=1"]
     with pytest.raises(UserError, match="is not the mesh"):
         evaluate(compose_job("evaluate", HOME / "conf", typed, tmp_path))
 

@@ -1,0 +1,105 @@
+"""A watch over what the interpreter does, and a small checkpoint of a real method to make hostile ones of."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from posefilter.run.command import compose_job
+from posefilter.run.method import build_method, recipe
+from posefilter.types import ObjectModel
+
+HOME = Path(__file__).parents[2]
+_ALWAYS = (  # that no loading of a file has to do with
+    "os.system os.exec os.posix_spawn os.fork os.forkpty os.remove os.rename os.symlink os.link os.truncate os.chmod "
+    "subprocess.Popen pty.spawn socket.connect socket.getaddrinfo urllib.Request ftplib.connect ctypes.dlopen webbrowser.open"
+).split()
+
+
+class Watch:
+    """Writes down forbidden events while it is armed: processes, connections, writes, hostile imports, reads of secrets."""
+
+    def __init__(self, secret: Path) -> None:
+        self.armed, self.secret, self.seen = False, secret, list[str]()
+        self.own: Path | None = None  # a folder that may be written to
+        sys.addaudithook(self._hook)  # for good: Python removes none
+
+    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if not self.armed:
+            return
+        if event in _ALWAYS and "__pycache__" not in str(arguments[:1]) and arguments[:1] != (None,):
+            self.seen.append(f"{event} {arguments!r:.120}")
+        elif event == "import" and str(arguments[0]).startswith("hostile"):
+            self.seen.append(f"import {arguments[0]}")
+        elif event == "open" and isinstance(arguments[0], str | bytes | Path):
+            path, mode = str(arguments[0]), str(arguments[1] or "")
+            own = self.own is not None and Path(path).resolve().is_relative_to(self.own)
+            if (set(mode) & set("wax+") and "__pycache__" not in path and not own) or str(self.secret) in path:
+                self.seen.append(f"open {path} {mode}")
+
+    def __enter__(self) -> "Watch":
+        self.armed = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.armed = False
+
+
+@pytest.fixture
+def secret(tmp_path: Path) -> Path:
+    """Return a folder whose files nobody may read or write, with a file in it."""
+    folder = tmp_path / "secret"
+    folder.mkdir()
+    (folder / "file.txt").write_text("private")
+    return folder
+
+
+@pytest.fixture
+def watch(secret: Path) -> Iterator[Watch]:
+    """Return the watch; at the end of the test nothing may have been seen, and the secret be as it was."""
+    watching = Watch(secret)
+    yield watching
+    watching.armed = False
+    assert watching.seen == []
+    assert [path.name for path in secret.iterdir()] == ["file.txt"]
+    assert (secret / "file.txt").read_text() == "private"
+
+
+@pytest.fixture(scope="session")
+def _good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("good")
+    job = compose_job("train", HOME / "conf", ["model=cnn_patch", "debug=smoke", "filter.particles=8"], folder)
+    points = torch.rand(50, 3)
+    model = ObjectModel("carton", points, points.mean(0), 0.5, 1.0, torch.eye(4)[None], points[:8])
+    method = build_method(recipe(job), model)
+    content = {"state_dict": method.state_dict(), "global_step": 3, "epoch": 0}
+    method.on_save_checkpoint(content)
+    torch.save(content, folder / "good.ckpt")
+    return folder / "good.ckpt"
+
+
+@pytest.fixture
+def content(_good: Path) -> dict[str, Any]:
+    """Return what a good checkpoint holds, to be changed."""
+    loaded: dict[str, Any] = torch.load(_good, weights_only=True)
+    return loaded
+
+
+@pytest.fixture
+def good(_good: Path) -> Path:
+    """Return a good checkpoint's file."""
+    return _good
+
+
+@pytest.fixture
+def save(tmp_path: Path) -> Callable[[dict[str, Any]], Path]:
+    """Return a function that writes a checkpoint."""
+
+    def write(changed: dict[str, Any]) -> Path:
+        torch.save(changed, tmp_path / "hostile.ckpt")
+        return tmp_path / "hostile.ckpt"
+
+    return write

@@ -1,0 +1,91 @@
+"""Plug-ins: trusted by the user, and by nobody else."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.run import command, run_command, trust
+from posefilter.run.build import instantiate, instantiate_recipe, locate
+
+HOME = Path(__file__).parents[2]
+SOURCE = """
+import os
+from torch.nn import Linear
+class Own:
+    def __init__(self, size: int = 1) -> None:
+        self.size = size
+def make(size: int = 2) -> Own:
+    return Own(size)
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "my_plugin").mkdir()
+    (tmp_path / "my_plugin" / "__init__.py").write_text("")
+    (tmp_path / "my_plugin" / "pieces.py").write_text(SOURCE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(trust, "_trusted", set())
+    for name in ("my_plugin", "my_plugin.pieces"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return "my_plugin"
+
+
+def test_what_a_trusted_package_defines_is_built(package: str) -> None:
+    node = {"_target_": "my_plugin.pieces.Own", "size": 3}
+    for build in (instantiate, instantiate_recipe):
+        with pytest.raises(UserError, match="plugins="):
+            build(node, "loss")
+    assert package not in sys.modules
+    trust.trust(package)
+    assert instantiate(node, "loss").size == instantiate_recipe(node, "loss").size == 3
+    assert instantiate({"_target_": "my_plugin.pieces.make"}, "loss").size == 2
+    with pytest.raises(UserError, match=r"did you mean 'Own'"):
+        instantiate({"_target_": "my_plugin.pieces.Owm"}, "loss")
+
+
+@pytest.mark.parametrize("name", ["my_plugin.pieces.os.system", "my_plugin.pieces.Linear", "my_plugin_two.x.Own"])
+def test_what_it_imports_is_not(name: str, package: str) -> None:
+    trust.trust(package)
+    with pytest.raises(UserError):
+        locate(name, "loss")
+
+
+@pytest.mark.parametrize("name", ["os", "subprocess", "torch", "posefilter.run", "not a name", "", "../x"])
+def test_some_packages_cannot_be_plug_ins(name: str, package: str) -> None:
+    with pytest.raises(UserError, match="plugins="):
+        trust.trust(name)
+    assert trust.trusted() == trust._installed()
+
+
+def test_an_installed_entry_point_is_trusted(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Point:
+        value = "my_plugin"
+
+    trust._installed.cache_clear()
+    monkeypatch.setattr(trust, "entry_points", lambda group: [Point()] if group == "posefilter.plugins" else [])
+    assert trust.is_plugin("my_plugin.pieces.Own")
+    trust._installed.cache_clear()
+
+
+def test_the_command_line_names_them(package: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for wanted, told in (("[nowhere_at_all]", "there is no package"), ("[os]", "of your own"), ("7", "must be a list")):
+        assert run_command("train", HOME, [f"out={tmp_path}", f"plugins={wanted}", "loss=add", "console=plain"]) == 2
+        said = capfd.readouterr().err.strip().splitlines()
+        assert len(said) == 1
+        assert told in said[0]
+    assert run_command("train", HOME, [f"out={tmp_path}", "plugins=[my_plugin]", "loss=add", "console=plain"]) == 2
+    assert "loss=add does not fit" in capfd.readouterr().err
+    assert "my_plugin" in trust.trusted()
+
+
+def test_a_recipe_does_not_keep_them(package: str, tmp_path: Path) -> None:
+    from posefilter.run.method import recipe
+
+    job = command.compose_job("train", HOME / "conf", ["plugins=[my_plugin]"], tmp_path)
+    settings: dict[str, Any] = recipe(job)["settings"]
+    assert "plugins" not in settings
+    assert "my_plugin" not in str(settings)
