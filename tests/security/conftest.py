@@ -14,9 +14,26 @@ from posefilter.types import ObjectModel
 
 HOME = Path(__file__).parents[2]
 _ALWAYS = (  # that no loading of a file has to do with
-    "os.system os.exec os.posix_spawn os.fork os.forkpty os.remove os.rename os.symlink os.link os.truncate os.chmod "
-    "subprocess.Popen pty.spawn socket.connect socket.getaddrinfo urllib.Request ftplib.connect ctypes.dlopen webbrowser.open"
-).split()
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.fork",
+    "os.forkpty",
+    "os.remove",
+    "os.rename",
+    "os.symlink",
+    "os.link",
+    "os.truncate",
+    "os.chmod",
+    "subprocess.Popen",
+    "pty.spawn",
+    "socket.connect",
+    "socket.getaddrinfo",
+    "urllib.Request",
+    "ftplib.connect",
+    "ctypes.dlopen",
+    "webbrowser.open",
+)
 
 
 class Watch:

@@ -16,7 +16,19 @@ from posefilter.data.confine import stays_inside
 from posefilter.errors import UserError
 from posefilter.run.trust import DATA_NAMES, is_plugin
 
-NOT_KEPT = ("out", "folder", "trainer", "callbacks", "logger", "resume", "debug", "console", "plugins", "hydra")
+NOT_KEPT = (
+    "warm_start",
+    "out",
+    "folder",
+    "trainer",
+    "callbacks",
+    "logger",
+    "resume",
+    "debug",
+    "console",
+    "plugins",
+    "hydra",
+)
 PRETRAINED = ("weights",)  # settings that name files to start a training from: the checkpoint has what came of them
 _DEEPEST, _MOST_NODES, _LONGEST = 16, 20_000, 1000
 _MOST = 1_000_000  # a setting that is a whole number

@@ -1,0 +1,259 @@
+"""Datasets, meshes, caches and archives are data: none leads out of its folder, or promises more than can be held."""
+
+import io
+import json
+import stat
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from posefilter.data import decode
+from posefilter.data.cache import DiskCache
+from posefilter.data.decode import read_color, read_depth, read_json, read_label
+from posefilter.data.download import unpack
+from posefilter.data.generate import generate
+from posefilter.data.mesh_files import read_mesh
+from posefilter.data.points import model_points
+from posefilter.data.readers import open_reader
+from posefilter.errors import UserError
+
+
+def png(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+
+
+def jpeg(width: int, height: int) -> bytes:
+    data = bytearray(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    at = data.index(b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+def bmp(width: int, height: int) -> bytes:
+    data = bytearray(cv2.imencode(".bmp", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    data[18:26] = struct.pack("<ii", width, height)
+    return bytes(data)
+
+
+PICTURES = {
+    "png": png(100_000, 100_000),
+    "wide png": png(1 << 30, 1),
+    "png within the decoder's own bounds": png(30_000, 30_000),
+    "jpeg": jpeg(65_000, 65_000),
+    "bmp": bmp(100_000, 100_000),
+    "no image": b"hostile",
+}
+
+
+@pytest.mark.parametrize("kind", PICTURES)
+@pytest.mark.parametrize(
+    "read", [read_color, lambda path: read_depth(path, 1000), read_label], ids=["color", "depth", "label"]
+)
+def test_an_image_of_too_many_pixels_is_not_decoded(
+    kind: str, read: Callable[[Path], Any], tmp_path: Path, watch: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "image.png"
+    path.write_bytes(PICTURES[kind])
+    monkeypatch.setattr(decode.cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
+    with watch, pytest.raises(UserError, match=r"image\.png") as told:
+        read(path)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "\0", "[1"], ids=["lists", "mappings", "zero", "cut"])
+def test_hostile_json_is_refused(text: str, tmp_path: Path, watch: Any) -> None:
+    (tmp_path / "x.json").write_text(text)
+    with watch, pytest.raises(UserError, match=r"x\.json") as told:
+        read_json(tmp_path / "x.json")
+    assert "\n" not in str(told.value)
+
+
+def test_a_file_of_enormous_size_is_not_read(tmp_path: Path, watch: Any) -> None:
+    with (tmp_path / "x.json").open("wb") as file:
+        file.truncate(1 << 36)  # takes no space on disk
+    with watch, pytest.raises(UserError, match="too large"):
+        read_json(tmp_path / "x.json")
+    with watch, pytest.raises(UserError, match="too large"):
+        read_color(tmp_path / "x.json")
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("scenes") / "carton"
+    generate(out, 2, object="carton", workers=1, size=(64, 48), distractors=(0, 1), frames_per_scene=2, progress=False)
+    return out
+
+
+@pytest.fixture
+def scenes(rendered: Path, tmp_path: Path) -> Path:
+    """Return a folder of scenes to be spoilt."""
+    import shutil
+
+    return Path(shutil.copytree(rendered, tmp_path / "scenes"))
+
+
+def read_all(root: Path) -> None:
+    reader = open_reader("fat", root)
+    for i in range(len(reader.records())):
+        reader.read(i)
+
+
+@pytest.mark.parametrize("ending", ["left.jpg", "left.depth.png", "left.seg.png", "left.json", "_object_settings.json"])
+@pytest.mark.parametrize("way", ["absolute", "relative"])
+def test_a_datasets_link_that_leads_out_is_not_followed(
+    ending: str, way: str, scenes: Path, secret: Path, watch: Any
+) -> None:
+    victim = next(path for path in sorted(scenes.rglob("*")) if path.name.endswith(ending))
+    victim.unlink()
+    up = "../" * len(victim.parent.relative_to(scenes.parent).parts)
+    victim.symlink_to(secret / "file.txt" if way == "absolute" else f"{up}secret/file.txt")
+    with watch, pytest.raises(UserError, match="leads out of") as told:
+        read_all(scenes)
+    assert "\n" not in str(told.value)
+
+
+def test_a_linked_folder_ofrendered_is_not_followed(scenes: Path, rendered: Path, watch: Any) -> None:
+    (scenes / "hostile").symlink_to(next(path.parent for path in rendered.rglob("_object_settings.json")))
+    with watch, pytest.raises(UserError, match="leads out of"):
+        open_reader("fat", scenes)
+
+
+def test_the_users_own_link_to_a_dataset_is_followed(scenes: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").symlink_to(scenes)
+    reader = open_reader("fat", tmp_path / "mine")
+    assert reader.read(0).rgb.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("name", ["../../secret", "/etc", "a/b", "..", "a\nb", "~root"])
+def test_a_class_is_no_path(name: str, scenes: Path, secret: Path, watch: Any) -> None:
+    for path in scenes.rglob("*.json"):
+        content = json.loads(path.read_text())
+        for one in content.get("objects", []) + content.get("exported_objects", []):
+            one["class"] = name
+        path.write_text(json.dumps(content))
+    with watch, pytest.raises(UserError) as told:
+        open_reader("fat", scenes)
+    assert "\n" not in str(told.value)
+    with watch, pytest.raises(UserError):
+        model_points(None, secret.parent / "scenes", name, np.eye(4))
+
+
+def test_a_list_of_classes_is_no_list_of_paths(tmp_path: Path, watch: Any) -> None:
+    (tmp_path / "data" / "0001").mkdir(parents=True)
+    (tmp_path / "classes.txt").write_text("002_master_chef_can\n../../secret\n")
+    with watch, pytest.raises(UserError, match=r"classes\.txt"):
+        open_reader("ycb_video", tmp_path)
+
+
+@pytest.mark.parametrize("stem", ["../../x", "x", "-1"])
+def test_a_list_of_frames_names_frames(stem: str, tmp_path: Path, watch: Any) -> None:
+    (tmp_path / "data" / "0001").mkdir(parents=True)
+    (tmp_path / "list.txt").write_text(f"0001/{stem}\n")
+    with watch, pytest.raises(UserError) as told:
+        open_reader("ycb_video", tmp_path, frames="list.txt")
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("truth", [{"../../x": []}, {"-1": []}, [], {"١": 1, "x": 2}], ids=["path", "sign", "list", "word"])
+def test_bop_records_are_by_number(truth: Any, tmp_path: Path, watch: Any) -> None:
+    folder = tmp_path / "test" / "000001"
+    folder.mkdir(parents=True)
+    (folder / "scene_gt.json").write_text(json.dumps(truth))
+    (folder / "scene_camera.json").write_text("{}")
+    with watch, pytest.raises(UserError) as told:
+        open_reader("bop", tmp_path / "test")
+    assert "\n" not in str(told.value)
+
+
+def test_a_link_for_a_cache_is_not_written_through(secret: Path, tmp_path: Path, watch: Any) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / ".cache").symlink_to(secret)
+    with watch, pytest.raises(UserError, match="leads out of"):
+        DiskCache(tmp_path / "data" / ".cache", "x")
+
+
+OBJ = "mtllib {mtl}\nv 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nusemtl a\nf 1 2 3\n"
+MESHES = {
+    "material above": ("../secret/file.txt", ""),
+    "absolute material": ("{secret}/file.txt", ""),
+    "texture above": ("own.mtl", "newmtl a\nmap_Kd ../secret/file.txt\n"),
+    "absolute texture": ("own.mtl", "newmtl a\nmap_Kd {secret}/file.txt\n"),
+    "linked texture": ("own.mtl", "newmtl a\nmap_Kd link.png\n"),
+    "linked material": ("link.mtl", ""),
+}
+
+
+@pytest.mark.parametrize("what", MESHES)
+def test_a_mesh_names_files_beside_it(what: str, secret: Path, tmp_path: Path, watch: Any) -> None:
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    mtl, text = (part.format(secret=secret) for part in MESHES[what])
+    (folder / "own.mtl").write_text(text)
+    for link in ("link.png", "link.mtl"):
+        (folder / link).symlink_to(secret / "file.txt")
+    (folder / "x.obj").write_text(OBJ.format(mtl=mtl))
+    with watch, pytest.raises(UserError, match="leads out of"):
+        read_mesh(folder / "x.obj", "x")
+
+
+def test_a_texture_of_too_many_pixels_is_not_decoded(tmp_path: Path, watch: Any) -> None:
+    (tmp_path / "own.mtl").write_text("newmtl a\nmap_Kd large.png\n")
+    (tmp_path / "large.png").write_bytes(png(30_000, 30_000))
+    (tmp_path / "x.obj").write_text(OBJ.format(mtl="own.mtl"))
+    with watch, pytest.raises(UserError, match="too large"):
+        read_mesh(tmp_path / "x.obj", "x")
+
+
+def tarred(path: Path, **how: Any) -> Path:
+    data = how.pop("data", b"")
+    with tarfile.open(path.with_suffix(".tar.gz"), "w:gz") as archive:
+        info = tarfile.TarInfo(how.pop("name", "x"))
+        info.size = len(data)
+        for key, value in how.items():
+            setattr(info, key, value)
+        archive.addfile(info, io.BytesIO(data))
+    return path.with_suffix(".tar.gz")
+
+
+def zipped(path: Path, name: str, data: bytes = b"x", mode: int = 0o100644) -> Path:
+    with zipfile.ZipFile(path.with_suffix(".zip"), "w", zipfile.ZIP_DEFLATED) as archive:
+        info = zipfile.ZipInfo(name)
+        info.external_attr = mode << 16
+        archive.writestr(info, data, zipfile.ZIP_DEFLATED)
+    return path.with_suffix(".zip")
+
+
+ARCHIVES: dict[str, Callable[[Path, Path], Path]] = {
+    "zip above": lambda path, secret: zipped(path, "../secret/x"),
+    "zip absolute": lambda path, secret: zipped(path, f"{secret}/x"),
+    "zip link": lambda path, secret: zipped(path, "x", str(secret).encode(), stat.S_IFLNK | 0o777),
+    "zip bomb": lambda path, secret: zipped(path, "x", bytes(50 << 20)),
+    "zip drive": lambda path, secret: zipped(path, "C:\\x"),
+    "tar above": lambda path, secret: tarred(path, name="../secret/x"),
+    "tar absolute": lambda path, secret: tarred(path, name=f"{secret}/x"),
+    "tar link": lambda path, secret: tarred(path, type=tarfile.SYMTYPE, linkname=str(secret)),
+    "tar hard link": lambda path, secret: tarred(path, type=tarfile.LNKTYPE, linkname="../secret/file.txt"),
+    "tar device": lambda path, secret: tarred(path, type=tarfile.CHRTYPE),
+    "tar bomb": lambda path, secret: tarred(path, data=bytes(50 << 20)),
+}
+
+
+@pytest.mark.parametrize("what", ARCHIVES)
+def test_a_hostile_archive_is_not_unpacked(what: str, secret: Path, tmp_path: Path, watch: Any) -> None:
+    archive = ARCHIVES[what](tmp_path / "hostile", secret)
+    with watch, pytest.raises(UserError) as told:
+        unpack(archive, tmp_path / "out")
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "out").exists()
