@@ -106,7 +106,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Figures, Filter
 
 
 def test_best_and_worst_are_the_best_and_the_worst(run: tuple[Path, Figures, FilterHealth]) -> None:
-    kept = run[1]._kept
+    kept = run[1]._selection.kept
     assert [one.frame_id for one in kept["first"]] == [0, 1, 2, 3, 4]
     assert [one.frame_id for one in kept["best"]] == [0, 1]
     assert [one.frame_id for one in kept["worst"]] == [7, 6]
@@ -117,16 +117,21 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     folder = run[0]
     board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
     board.Reload()
-    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "animation", "filter_health"}
-    assert set(board.Tags()["images"]) == {f"figures/{name}" for name in names}
-    for tag, file in (("figures/overlays", "validation_overlays"), ("figures/filter_health", "filter_health")):
+    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "animation", "health"}
+    assert {file.stem for file in (folder / "figures").iterdir()} == {f"validation_{name}" for name in names}
+    tags = sorted(board.Tags()["images"])  # as TensorBoard orders them
+    assert tags == [
+        "1_poses/overlays", "1_poses/worst", "2_filter/animation", "2_filter/health", "2_filter/particles",
+        "3_belief/belief",
+    ]  # fmt: skip
+    for tag, file in (("1_poses/overlays", "validation_overlays"), ("2_filter/health", "validation_health")):
         written = (folder / "figures" / f"{file}.jpg").read_bytes()
         assert board.Images(tag)[0].encoded_image_string == written
     with Image.open(folder / "figures" / "validation_overlays.jpg") as overlays:
         picture = np.asarray(overlays.convert("RGB"))
     assert picture.shape[1] == WIDTH
     assert (np.abs(picture.astype(int) - 128) < 4).all(-1).mean() > 0.3  # the gray photographs
-    animation = board.Images("figures/animation")[0]
+    animation = board.Images("2_filter/animation")[0]
     assert animation.encoded_image_string == (folder / "figures" / "validation_animation.gif").read_bytes()
     with Image.open(folder / "figures" / "validation_animation.gif") as moving:
         assert moving.n_frames == 7  # four clouds, two frames from one to the next
@@ -253,7 +258,7 @@ def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:
 
 
 def test_overlays_outline_lies_on_the_mask_of_a_worst_image(run: tuple[Path, Figures, FilterHealth]) -> None:
-    worst = run[1]._kept["worst"][0]
+    worst = run[1]._selection.kept["worst"][0]
     width = tile_width(3)
     view = view_poses([worst.estimate, worst.truth], model().hull, worst.intrinsics, H, W, width)
     tile = draw_tile(worst, model().hull, True)[-view.height :]

@@ -20,29 +20,24 @@ from tensorboard.util.tensor_util import make_ndarray
 from posefilter.callbacks.tensorboard_layout import LAYOUT, TensorBoardLayout
 
 
-def run(folder: Path, particles: int, auc: float, refine: str = "none") -> None:
+def run(folder: Path, particles: int, refine: str = "none", more: Any = None, swept: Any = ()) -> None:
     """Go through a run's hooks, with the numbers that a training and a test would have left."""
     logger = TensorBoardLogger(folder, name="", version="")
     trainer: Any = SimpleNamespace(loggers=[logger], global_step=10, is_global_zero=True, sanity_checking=False)
     layout, method = TensorBoardLayout(), torch.nn.Module()
-    layout.settings = {"refine": refine, "filter.particles": particles, "data.settle": False, "seed": 0}
+    layout.settings = {"refine": refine, "filter.particles": particles, "data.settle": False, "seed": 0, **(more or {})}
+    layout.swept = swept
     trainer.callback_metrics = {}
     layout.on_fit_start(trainer, method)  # type: ignore[arg-type]
     for step, score in ((10, 40.0), (20, 35.0)):
         trainer.global_step, trainer.callback_metrics = step, {"val/score": torch.tensor(score)}
         layout.on_validation_end(trainer, method)  # type: ignore[arg-type]
-    trainer.callback_metrics = {
-        "test/add/auc": torch.tensor(auc),
-        "test/iou": torch.tensor(0.5),
-        "test/else": torch.tensor(1),
-    }
-    layout.on_test_end(trainer, method)  # type: ignore[arg-type]
     logger.finalize("success")
 
 
 def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
-    run(tmp_path, 50, 61.5, "gradient")
-    board = EventAccumulator(str(tmp_path / "hparams"))
+    run(tmp_path, 50, "gradient")
+    board = EventAccumulator(str(tmp_path))
     board.Reload()
     plugin = board.SummaryMetadata("_hparams_/session_start_info").plugin_data
     start = HParamsPluginData.FromString(plugin.content).session_start_info.hparams
@@ -50,32 +45,55 @@ def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
     assert start["filter.particles"].number_value == 50
     assert start["refine"].string_value == "gradient"
     assert start["data.settle"].string_value == "false"
-    assert [e.value for e in board.Scalars("validation/score")] == [40.0, 35.0]
-    assert [e.value for e in board.Scalars("validation/best_score")] == [40.0, 40.0]
-    assert board.Scalars("test/add/auc")[0].value == 61.5
-    assert set(board.Tags()["scalars"]) == {"validation/score", "validation/best_score", "test/add/auc", "test/iou"}
+    assert [e.value for e in board.Scalars("val/best_score")] == [40.0, 40.0]
+    assert set(board.Tags()["scalars"]) - {"hp_metric"} == {"val/best_score"}
 
 
-def test_runs_of_a_sweep_are_compared_by_what_differs(tmp_path: Path) -> None:
-    run(tmp_path / "a", 50, 61.5)
-    run(tmp_path / "b", 100, 65.0)
-    runs = EventMultiplexer().AddRunsFromDirectory(str(tmp_path))
+def read_experiment(folder: Path) -> tuple[list[str], Any, list[str]]:
+    """Return TensorBoard's runs below a folder, the table of the tab HParams, and the names of its lines."""
+    runs = EventMultiplexer().AddRunsFromDirectory(str(folder))
     runs.Reload()
-    context = Context(TBContext(data_provider=MultiplexerDataProvider(runs, str(tmp_path))))
+    context = Context(TBContext(data_provider=MultiplexerDataProvider(runs, str(folder))))
     found = context.hparams_metadata(RequestContext(), "")
     data = context.hparams_from_data_provider(RequestContext(), "", 100)
     experiment = context.experiment_from_metadata(RequestContext(), "", True, found, data)
-    first = experiment.hparam_infos[0]
-    assert first.name == "filter.particles"
-    assert first.differs
-    assert not any(info.differs for info in experiment.hparam_infos[1:])
-    assert {metric.name.tag for metric in experiment.metric_infos} == {
-        "validation/score", "validation/best_score", "test/add/auc", "test/iou",
-    }  # fmt: skip
+    lines = [name for name, tags in found.items() if "_hparams_/session_start_info" in tags]
+    return list(runs.Runs()), experiment, lines
+
+
+def test_each_run_is_listed_once(tmp_path: Path) -> None:
+    """The settings are in the run's own event file: a folder of their own would be another run."""
+    run(tmp_path / "a", 50)
+    run(tmp_path / "b", 50)  # with the same settings, and still a line of its own
+    runs, _, lines = read_experiment(tmp_path)
+    assert sorted(runs) == sorted(lines) == ["a", "b"]
+    assert not [path for path in tmp_path.rglob("hparams*") if path.is_dir()]
+
+
+def test_what_matters_is_shown_first(tmp_path: Path) -> None:
+    """TensorBoard shows five settings unless asked: model, loss, particles and seed are always among them."""
+    many = {
+        "augment": "none",
+        "budget": "short",
+        "data.batch_size": 4,
+        "model": "patch_pf",
+        "loss": "bce",
+        "variant": "paper",
+    }
+    run(tmp_path / "a", 50, more=many)
+    _, experiment, _ = read_experiment(tmp_path)
+    names = [info.name for info in experiment.hparam_infos]
+    assert names[:5] == ["filter.particles", "loss", "model", "seed", "variant"]
+    assert set(names) == {*many, "filter.particles", "seed", "refine", "data.settle"}
+    assert [metric.name.tag for metric in experiment.metric_infos[:3]] == ["val/score", "val/best_score", "test/add/auc"]
+    assert experiment.metric_infos[2].display_name == "test: ADD AUC"
+    run(tmp_path / "b" / "a", 50, more=many, swept=("augment",))
+    _, experiment, _ = read_experiment(tmp_path / "b")
+    assert [info.name for info in experiment.hparam_infos][:6] == ["augment", *names[:5]]
 
 
 def test_layout_is_read_back_in_the_storys_order(tmp_path: Path) -> None:
-    run(tmp_path, 50, 61.5)
+    run(tmp_path, 50)
     board = EventAccumulator(str(tmp_path))
     board.Reload()
     layout = Layout.FromString(make_ndarray(board.Tensors("custom_scalars__config__")[0].tensor_proto).item())

@@ -55,8 +55,8 @@ def run(tmp_path: Path) -> Path:
             log.add_scalar("val/add/auc", score, step, walltime=1000.0 + step / 2)
         for iteration, ess in enumerate((0.9, 0.5, 0.25)):
             log.add_scalar(f"filter/ess/step_{iteration:02d}", ess, 99)
-        log.add_image("figures/belief", np.zeros((8, 8, 3), np.uint8), 99, dataformats="HWC")
-        log.add_image("figures/overlays", np.zeros((8, 8, 3), np.uint8), 99, dataformats="HWC")
+        log.add_image("3_belief/belief", np.zeros((8, 8, 3), np.uint8), 99, dataformats="HWC")
+        log.add_image("1_poses/overlays", np.zeros((8, 8, 3), np.uint8), 99, dataformats="HWC")
     (folder / "figures").mkdir()
     for name in ("worst_2", "worst_10", "best_0", "validation_overlays"):
         Image.fromarray(np.full((240, 320, 3), MARK, np.uint8)).save(folder / "figures" / f"{name}.png")

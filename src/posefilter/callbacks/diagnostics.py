@@ -7,7 +7,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from posefilter.callbacks.drawings import AnimatedScene, animate
-from posefilter.callbacks.gallery import select_image
+from posefilter.callbacks.gallery import name_frame, select_image
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
@@ -58,12 +58,12 @@ class Diagnostics(Callback):
         if self.budget.allows():
             with self.budget.spend():
                 title = f"Signs of failure\nafter {trainer.global_step} steps of training"
-                self._post(trainer, "figures/diagnostics", "validation_diagnostics", draw_diagnostics(found, title))
+                post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        """Draw and animation the first batch's trajectories."""
+        """Draw and animate the first batch's trajectories."""
         if batch_idx == 0 and has_pixel_particles(outputs):
             self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
 
@@ -72,27 +72,21 @@ class Diagnostics(Callback):
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" in scores and trainer.is_global_zero:
             found = cast(SignsOfFailure, scores["signs"]).compute()
-            self._post(
-                trainer,
-                "figures/diagnostics_test",
-                "test_diagnostics",
-                draw_diagnostics(found, "Signs of failure\nof the test"),
-            )
+            figure = draw_diagnostics(found, "Signs of failure\nof the test")
+            post_image(trainer, "diagnostics", figure, self.folder, "test")
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
-        """Draw and animation the trajectories of a batch's first images."""
+        """Draw and animate the trajectories of a batch's first images."""
         states = trace_lineage(trace.clouds)
         for i in range(min(self.images, len(states))):
-            rgb, mask, number = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy(), int(batch.frame_id[i])
-            picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), f"Trajectories\nimage {number} of the test")
-            self._post(trainer, f"trajectories/test_{i}", f"test_trajectories_{i}", picture)
+            rgb, mask = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy()
+            name = name_frame(trainer, "test", int(batch.frame_id[i]))
+            picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), f"Trajectories\n{name} of the test")
+            post_image(trainer, f"trajectories_{i}", picture, self.folder, "test")
             K, truth = (x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object))
             scene = AnimatedScene(rgb, K, truth, mask)
-            animation = animate(method, select_image(trace, i), scene, f"The filter at work\nimage {number} of the test")
-            self._post(trainer, f"trajectories/animation_{i}", f"test_animation_{i}", animation)
-
-    def _post(self, trainer: Trainer, tag: str, file: str, picture: Any) -> None:
-        post_image(trainer, tag, picture, self.folder and self.folder / file)
+            animation = animate(method, select_image(trace, i), scene, f"The filter at work\n{name} of the test")
+            post_image(trainer, f"animation_{i}", animation, self.folder, "test")
 
 
 def has_pixel_particles(outputs: Any) -> bool:

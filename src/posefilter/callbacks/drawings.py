@@ -52,7 +52,7 @@ class Occasion(NamedTuple):
 
     def title(self, what: str) -> str:
         """Return a figure's title, and below it what it is of."""
-        return f"{what}\nimage {self.one.frame_id}, {self.when}"
+        return f"{what}\n{self.one.name}, {self.when}"
 
     def mask(self) -> np.ndarray:
         """Return the object's visible part, (H, W) bool."""

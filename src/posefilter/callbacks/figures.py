@@ -1,6 +1,6 @@
 """Figures of each validation, into TensorBoard and the run's folder: callbacks/drawings.py says which there are."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,15 @@ from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from posefilter.callbacks.drawings import DRAWINGS, Occasion
-from posefilter.callbacks.gallery import KeptImage, compute_errors, find_shape, keep_image, select_image
+from posefilter.callbacks.gallery import (
+    ImageSelection,
+    KeptImage,
+    compute_errors,
+    find_shape,
+    keep_image,
+    name_frame,
+    select_image,
+)
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.errors import UserError
 from posefilter.geometry.deviation import thin
@@ -48,14 +56,14 @@ class Figures(Callback):
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in without}
         self.budget = Budget(share)
         self._validations = 0
-        self._kept: dict[str, list[KeptImage]] = {}
+        self._selection = ImageSelection(**self.counts)
         self._example: tuple[KeptImage, Trace, Batch] | None = None
         self._put_off = False
         self._points: Tensor | None = None
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Forget the last validation."""
-        self._kept, self._example, self._points = {name: [] for name in self.counts}, None, None
+        self._selection, self._example, self._points = ImageSelection(**self.counts), None, None
         self.budget.start()
 
     def on_validation_batch_end(
@@ -69,10 +77,11 @@ class Figures(Callback):
             self._points = thin(method.model.points, 256).to(batch.rgb.device)
         errors = compute_errors(outputs, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
-            self._offer(error, partial(keep_image, outputs, batch, method, i, error))
-        if self._example is None:
-            one = (self._kept["first"] or [keep_image(outputs, batch, method, 0, errors[0])])[0]
-            self._example = one, select_image(outputs, 0), Batch(*(x[:1].clone() for x in batch))
+            name = name_frame(trainer, "val", int(batch.frame_id[i]))
+            self._selection.offer(error, partial(keep_image, outputs, batch, method, i, error, name))
+            if self._example is None:
+                one = keep_image(outputs, batch, method, i, error, name)
+                self._example = one, select_image(outputs, 0), Batch(*(x[:1].clone() for x in batch))
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""
@@ -101,26 +110,11 @@ class Figures(Callback):
             batch = Batch(*(x.to(method.device) for x in batch))
             shape, scene = find_shape(trainer, method), method.observe(batch)
             when = f"after {trainer.global_step} steps of training"
-            occasion = Occasion(method, shape, self._kept, one, trace, batch, scene, when)
+            occasion = Occasion(method, shape, self._selection.kept, one, trace, batch, scene, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)
                 if drawn is not None:
-                    post_image(trainer, f"figures/{name}", drawn, self.folder and self.folder / f"validation_{name}")
-
-    def _offer(self, error: float, make: Callable[[], KeptImage]) -> None:
-        """Keep an image where it is among the first, the best or the worst so far; it is only copied if so."""
-        kept, counts = self._kept, self.counts
-        made: KeptImage | None = None
-        if len(kept["first"]) < counts["first"]:
-            made = make()
-            kept["first"].append(made)
-        for name, sign in (("best", 1), ("worst", -1)):
-            ranked = kept[name]
-            if counts[name] and (len(ranked) < counts[name] or sign * error < sign * ranked[-1].error):
-                made = made or make()
-                ranked.append(made)
-                ranked.sort(key=lambda one: sign * one.error)
-                del ranked[counts[name] :]
+                    post_image(trainer, name, drawn, self.folder)
 
 
 @contextmanager

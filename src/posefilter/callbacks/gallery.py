@@ -1,6 +1,6 @@
-"""What is kept of a validation's images, and figures of them: the first, the best and the worst."""
+"""What is kept of the images of a validation or test, and figures of them: the first, the best and the worst."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from posefilter.data.meshes import MeshStore
 from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, full_view, to_image
-from posefilter.figures.layout import DETAIL, add_caption, compose_figure, draw_legend, tile_width
+from posefilter.figures.layout import DETAIL, add_caption, compose_figure, cut_text, draw_legend, format_length, tile_width
 from posefilter.figures.overlay import Shape, draw_poses, list_axes, view_poses
 from posefilter.figures.particles import draw_particles, draw_weight_scale
 from posefilter.metrics.beliefs import on_object
@@ -26,6 +26,7 @@ class KeptImage(NamedTuple):
     """What is kept of an image that may be drawn."""
 
     frame_id: int
+    name: str  # of the frame
     error: float  # ADD [m]; for methods that tell no pose, the share of the particles that miss the object
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]
@@ -44,13 +45,43 @@ def compute_errors(trace: Trace, batch: Batch, method: PoseEstimator, points: Te
     return torch.nan_to_num(error.double(), nan=torch.inf)
 
 
-def keep_image(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float) -> KeptImage:
+class ImageSelection:
+    """Keeps the first, the best and the worst images of a stage; an image is only copied where it is one of them."""
+
+    def __init__(self, first: int, best: int, worst: int) -> None:
+        self.counts = {"first": first, "best": best, "worst": worst}
+        self.kept: dict[str, list[KeptImage]] = {name: [] for name in self.counts}
+
+    def offer(self, error: float, make: Callable[[], KeptImage]) -> None:
+        """Keep an image where it is among the first, the best or the worst so far."""
+        kept, counts = self.kept, self.counts
+        made: KeptImage | None = None
+        if len(kept["first"]) < counts["first"]:
+            made = make()
+            kept["first"].append(made)
+        for name, sign in (("best", 1), ("worst", -1)):
+            ranked = kept[name]
+            if counts[name] and (len(ranked) < counts[name] or sign * error < sign * ranked[-1].error):
+                made = made or make()
+                ranked.append(made)
+                ranked.sort(key=lambda one: sign * one.error)
+                del ranked[counts[name] :]
+
+
+def name_frame(trainer: Trainer, split: str, frame_id: int) -> str:
+    """Return a frame's name in its dataset, or its number where no dataset is at hand."""
+    data = getattr(trainer, "datamodule", None)
+    return str(data.records(split)[frame_id].name) if data is not None else f"image {frame_id}"
+
+
+def keep_image(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float, name: str) -> KeptImage:
     """Copy what a drawing needs of one image."""
     numpy = lambda x: x[i].detach().cpu().double().numpy()  # noqa: E731
     cloud = trace.clouds[-1]
     pixels = method.particle_pixels(cloud, batch)
     return KeptImage(
         int(batch.frame_id[i]),
+        name,
         error,
         to_image(batch.rgb[i]),
         numpy(batch.intrinsics),
@@ -94,8 +125,8 @@ def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
     if tells_pose:
         view = view_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
         picture = draw_poses(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
-        caption = f"ADD {1000 * one.error:.3g} mm"
+        caption = f"ADD {format_length(one.error)}"
     else:
         picture = draw_particles(one.rgb, one.pixels, one.weights, full_view(height, width, _TILE))
         caption = f"{1 - one.error:.0%} on the object"
-    return add_caption(add_caption(picture, f"image {one.frame_id}", DETAIL), caption)
+    return add_caption(add_caption(picture, cut_text(one.name, DETAIL, picture.shape[1]), DETAIL), caption)

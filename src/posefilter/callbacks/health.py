@@ -56,7 +56,7 @@ class FilterHealth(Callback):
         if self.budget.allows():
             with self.budget.spend():
                 picture = draw_health(curves, self._images, f"Filter health\nafter {trainer.global_step} steps of training")
-                post_image(trainer, "figures/filter_health", picture, self.folder and self.folder / "filter_health")
+                post_image(trainer, "health", picture, self.folder)
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""

@@ -1,4 +1,4 @@
-"""Hand pictures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
+"""Hand figures to TensorBoard and to the run's folder, and keep count of what drawing costs."""
 
 import struct
 import time
@@ -14,22 +14,51 @@ from torch.utils.tensorboard.writer import FileWriter
 
 from posefilter.figures.canvas import to_jpeg
 
+# The order of the tab Images: what answers "does it work" comes first.
+# What is in no group is only written to the run's folder.
+GROUPS = {
+    "overlays": "1_poses", "worst": "1_poses",
+    "particles": "2_filter", "animation": "2_filter", "trajectories": "2_filter", "health": "2_filter",
+    "belief": "3_belief",
+    "field": "4_network", "proposals": "4_network", "relevance": "4_network", "glimpses": "4_network",
+    "diagnostics": "5_diagnostics",
+}  # fmt: skip
+TEST = "6_test"
 
-def post_image(trainer: Trainer, tag: str, drawn: np.ndarray | bytes, file: Path | None) -> None:
-    """Show a picture (H, W, 3) uint8, or a animation as the bytes of a GIF, under a tag at the trainer's step.
 
-    file: where it is written too, its suffix aside (None: nowhere). It is packed once for all: `add_image` would pack it
-    again for each logger, slowly, and knows no animations. As a JPEG: TensorBoard reckons a checksum byte by byte in Python,
-    which for a PNG takes longer than most figures take to draw.
+def name_tag(name: str, stage: str) -> str | None:
+    """Return the tag of a figure, None where TensorBoard does not show it."""
+    if stage == "test":
+        return f"{TEST}/{name}"
+    return f"{GROUPS[name]}/{name}" if name in GROUPS else None
+
+
+def post_image(
+    trainer: Trainer, name: str, drawn: np.ndarray | bytes, folder: Path | None, stage: str = "validation"
+) -> None:
+    """Show a figure in TensorBoard at the trainer's step, and write it to a file.
+
+    It is packed once for all: `add_image` would pack it again for each logger, slowly, and knows no
+    animations.  As a JPEG: TensorBoard computes a checksum byte by byte in Python, which for a PNG
+    takes longer than most figures take to draw.
+
+    Args:
+        trainer: Its TensorBoards are written to.
+        name: Of the figure; `GROUPS` says where TensorBoard shows it.
+        drawn: An image (H, W, 3) uint8, or an animation as the bytes of a GIF.
+        folder: Where it is written as `<stage>_<name>`, nowhere if None.
+        stage: "validation" or "test".
     """
     packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_jpeg(drawn), ".jpg")
-    width, height = measure_size(drawn)
-    image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
-    for writer in get_writers(trainer):
-        writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
-    if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.with_name(file.name + suffix).write_bytes(packed)
+    tag = name_tag(name, stage)
+    if tag is not None:
+        width, height = measure_size(drawn)
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
+        for writer in get_writers(trainer):
+            writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{stage}_{name}{suffix}").write_bytes(packed)
 
 
 def measure_size(drawn: np.ndarray | bytes) -> tuple[int, int]:

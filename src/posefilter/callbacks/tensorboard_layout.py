@@ -1,14 +1,24 @@
 """Tell TensorBoard how to show a run: a layout of charts that tells its layout, and settings by which runs are compared."""
 
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.loggers import TensorBoardLogger
-from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import custom_scalars, hparams
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.plugins.hparams.api_pb2 import (
+    DATA_TYPE_FLOAT64,
+    DATA_TYPE_STRING,
+    Experiment,
+    HParamInfo,
+    MetricName,
+)
+from tensorboard.plugins.hparams.api_pb2 import MetricInfo as MetricColumn
+from tensorboard.plugins.hparams.metadata import EXPERIMENT_TAG, NULL_TENSOR, PLUGIN_DATA_VERSION, create_summary_metadata
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
+from tensorboard.plugins.hparams.summary_v2 import hparams_pb
+from torch.utils.tensorboard.summary import custom_scalars
 
 from posefilter.callbacks.tensorboard import get_writers
+from posefilter.metrics.registry import find_metric
 
 Setting = bool | int | float | str
 
@@ -50,24 +60,30 @@ LAYOUT: dict[str, dict[str, Chart]] = {
     },
 }
 
-
-FINAL = (
-    "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
-    "iou", "particles_on_object", "seconds_per_image", "belief/mass_2cm", "belief/coverage_90",
+# What the tab HParams shows of a run, in this order: the validation's score so far and its best, and what the test found.
+METRICS = (
+    "val/score", "val/best_score",
+    "test/add/auc", "test/add/recall_01d", "test/add/median_mm", "test/add_s/auc", "test/iou", "test/particles_on_object",
+    "test/seconds_per_image", "test/belief/mass_2cm", "test/belief/coverage_90",
 )  # fmt: skip
+# TensorBoard shows the settings that differ first, five of them unless asked for more; these always count as such.
+FIRST = ("filter.particles", "loss", "model", "seed", "variant")
+BEST = "val/best_score"
 
 
 class TensorBoardLayout(Callback):
     """Write the layout of the tab Custom Scalars, and the run's line in the tab HParams.
 
-    settings: by name, what runs are told apart by; the command that trains fills them in. The line is a board of its own, in
-    the folder `hparams` beside the run's: its columns are the settings, those that differ between runs first, and a few
-    metrics: the validation's score so far, its best, and what the test found (as in metrics.json), rather than every scalar
-    there is.
+    The line goes into the run's own event file, so that each run is listed once.
+
+    Attributes:
+        settings: By name, what runs are told apart by; the command that trains fills them in.
+        swept: Those of them in which the runs of its sweep differ; they are shown first too.
     """
 
     def __init__(self) -> None:
         self.settings: dict[str, Setting] = {}
+        self.swept: tuple[str, ...] = ()
         self._best = float("-inf")
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -76,40 +92,51 @@ class TensorBoardLayout(Callback):
             return
         for writer in get_writers(trainer):
             writer.add_summary(custom_scalars(LAYOUT))
-        _, start, _ = hparams({key: shown(value) for key, value in self.settings.items()}, {})
-        for line in lines(trainer):
-            line._get_file_writer().add_summary(start)
-            line.close()
+            for summary in describe_run(self.settings, self.swept, str(writer.get_logdir())):
+                writer.add_summary(summary)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Tell how the run stands."""
+        """Log the best score so far."""
         score = trainer.callback_metrics.get("val/score")
         if trainer.sanity_checking or score is None or not trainer.is_global_zero:
             return
         self._best = max(self._best, float(score))
-        write(trainer, {"validation/score": float(score), "validation/best_score": self._best})
-
-    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Tell how the run ended."""
-        found = {name: trainer.callback_metrics.get(f"test/{name}") for name in FINAL}
-        if trainer.is_global_zero:
-            write(trainer, {f"test/{name}": float(value) for name, value in found.items() if value is not None})
+        for logger in trainer.loggers:
+            logger.log_metrics({BEST: self._best}, trainer.global_step)
 
 
-def shown(value: Setting) -> float | str:
-    """Return a setting as the board can show it: numbers as such, the rest in words."""
+def describe_run(settings: Mapping[str, Setting], swept: Sequence[str], name: str) -> tuple[Summary, Summary]:
+    """Return what the tab HParams shows, and the settings of one run.
+
+    Args:
+        settings: Of the run, by name.
+        swept: Those in which it differs from its sweep's other runs.
+        name: Of the run; runs of one name would become one line.
+
+    Returns:
+        The columns of the table, and the run's line.
+    """
+    values = {name: convert_setting(value) for name, value in settings.items()}
+    first = {*FIRST, *swept}
+    columns = [describe_column(name, value, name in first) for name, value in values.items()]
+    metrics = [
+        MetricColumn(name=MetricName(tag=tag), display_name=f"{tag.split('/')[0]}: {find_metric(tag).title}")
+        for tag in METRICS
+    ]
+    experiment = Experiment(hparam_infos=columns, metric_infos=metrics)
+    start = hparams_pb(values, trial_id=name)
+    content = HParamsPluginData(experiment=experiment, version=PLUGIN_DATA_VERSION)
+    metadata = create_summary_metadata(content)
+    value = Summary.Value(tag=EXPERIMENT_TAG, metadata=metadata, tensor=NULL_TENSOR)
+    return Summary(value=[value]), start
+
+
+def describe_column(name: str, value: float | str, first: bool) -> HParamInfo:
+    """Return a setting's column; `first`: whether it is among those that are shown without being asked for."""
+    kind = DATA_TYPE_STRING if isinstance(value, str) else DATA_TYPE_FLOAT64
+    return HParamInfo(name=name, type=kind, differs=first)
+
+
+def convert_setting(value: Setting) -> float | str:
+    """Return a setting as TensorBoard can show it: numbers as such, the rest in words."""
     return str(value).lower() if isinstance(value, bool) else value
-
-
-def lines(trainer: Trainer) -> list[SummaryWriter]:
-    """Open the boards that hold the run's line, one for each of its TensorBoards."""
-    folders = [logger.log_dir for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-    return [SummaryWriter(Path(folder) / "hparams") for folder in folders]
-
-
-def write(trainer: Trainer, metrics: Mapping[str, float]) -> None:
-    """Add metrics to the run's line."""
-    for line in lines(trainer):
-        for name, value in metrics.items():
-            line.add_scalar(name, value, trainer.global_step)
-        line.close()

@@ -4,6 +4,7 @@ TensorBoard's cards show a figure at half its width, and take every second pixel
 and a legend are read, captions nearly so; detail is for the whole size.
 """
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -66,6 +67,23 @@ def wrap_text(text: str, letters: ImageFont.FreeTypeFont, width: float) -> list[
         else:
             lines[-1] = longer
     return lines
+
+
+def cut_text(text: str, size: int, width: int) -> str:
+    """Return the end of a name, as much of it as fits on one line: what tells frames apart stands at their names' end."""
+    letters = load_font(size)
+    for start in range(len(text)):
+        cut = text if start == 0 else "…" + text[start:]
+        if letters.getlength(cut) <= width - 2 * GAP:
+            return cut
+    return ""
+
+
+def format_length(length: float) -> str:
+    """Return a length [m] in words: in millimeters, or in meters where these get long."""
+    if length < 0.9995:
+        return f"{1000 * length:.3g} mm"
+    return "missed" if math.isinf(length) else f"{length:.2f} m" if length < 100 else f"{length:.0f} m"
 
 
 def draw_legend(entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: int = TITLE) -> np.ndarray:

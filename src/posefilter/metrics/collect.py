@@ -38,7 +38,7 @@ class PoseErrors(Metric):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, poses: Tensor, truth: Tensor, object_id: Tensor | None = None, found: Tensor | None = None) -> None:
-        """Collect (B, 4, 4) estimates and truths, camera_from_object [m].
+        """Collect (B, 4, 4) estimates and truths, camera_from_object [m]; errors are kept in their order.
 
         object_id (B,): index into `models` (the only one if None); found (B,) bool: False where there is no estimate.
         """
@@ -46,14 +46,16 @@ class PoseErrors(Metric):
         good = poses.isfinite().flatten(1).all(1)
         if found is not None:
             good = good & found
+        errors = torch.full((3, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
         for index in sorted(set(ids)):
             here = torch.tensor([i == index for i in ids], device=truth.device)
             model, tree = self.models[index], self.trees[index]
             a, b = poses[here & good].double(), truth[here & good].double()
-            missed = torch.full([int((here & ~good).sum())], torch.inf, dtype=torch.float64, device=a.device)
-            self.add.append(torch.cat([add(a, b, model.points), missed]))
-            self.add_s.append(torch.cat([add_s(a, b, tree), missed]))
-            self.diameter.append(torch.full_like(self.add[-1], model.diameter))
+            errors[0, here & good] = add(a, b, model.points)
+            errors[1, here & good] = add_s(a, b, tree)
+            errors[2, here] = model.diameter
+        for state, values in zip((self.add, self.add_s, self.diameter), errors, strict=True):
+            state.append(values)
 
     def compute(self) -> dict[str, Any]:
         """Return {"instances", "missed", "add": {...}, "add_s": {...}} as metrics.json has them."""

@@ -7,9 +7,7 @@ from typing import NamedTuple
 
 from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALARS, EventAccumulator
 
-from posefilter.report.images import StoredImage, split_words
-
-PLACES = {"figures", "validation"}  # words of a picture's name that tell where it is, not what it shows
+from posefilter.report.images import StoredImage
 
 
 class Curve(NamedTuple):
@@ -61,6 +59,14 @@ def find_event_files(folder: Path) -> Iterator[Path]:
 
 
 def select_unsaved(pictures: list[StoredImage], files: list[StoredImage]) -> list[StoredImage]:
-    """Return the logged pictures that no file shows: `figures/belief` is what `validation_belief.jpg` is."""
-    known = {split_words(picture.name) - PLACES for picture in files}
-    return [picture for picture in pictures if split_words(picture.name) - PLACES not in known]
+    """Return the logged pictures that no file shows: `3_belief/belief` is what `validation_belief.jpg` is."""
+    known = {name_figure(picture.name) for picture in files}
+    return [picture for picture in pictures if name_figure(picture.name) not in known]
+
+
+def name_figure(name: str) -> str:
+    """Return what a file or tag shows: `belief` of `3_belief/belief`, `test_worst` of `6_test/worst`."""
+    if "/" in name:
+        group, _, name = name.rpartition("/")
+        return f"test_{name}" if group.endswith("_test") else name
+    return name.removeprefix("validation_")

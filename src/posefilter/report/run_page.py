@@ -25,6 +25,7 @@ from posefilter.report.diagnostics import (
     diagnose,
     read_last_validation,
 )
+from posefilter.report.events import name_figure
 from posefilter.report.gather import Run
 from posefilter.report.images import StoredImage, group_by_section
 from posefilter.report.page import Page
@@ -51,7 +52,7 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
         changed: Settings that differ from the defaults; None where there is nothing to compare with.
         command: What made the page.
     """
-    images = group_by_section([p for p in run.pictures if p.name not in ("filter_health", "filter/health")])
+    images = group_by_section([p for p in run.pictures if name_figure(p.name) != "health"])
     curves = [
         *panels.choose_panels(run.curves, panels.VALIDATION),
         *panels.make_training_panels(run.curves),

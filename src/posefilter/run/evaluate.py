@@ -1,6 +1,7 @@
 """Test a checkpoint, or poses from anywhere, on a dataset."""
 
 import shutil
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from posefilter.callbacks.errors import FILE as ERRORS
+from posefilter.callbacks.errors import ErrorTable, ImageError, make_rows, write_errors
 from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
 from posefilter.data.confine import check_links
 from posefilter.data.module import PoseDataModule
@@ -55,9 +58,9 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data.setup("test")
     method.adopt(object_to_judge(data, method.model))
     records = Records(beliefs=True)
-    callbacks = [records, progress(job.cfg.console)]
+    callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
-    files = {"beliefs": job.folder / "beliefs.npz"}
+    files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
     native = data.reader.native_from_mesh
     if method.tells_pose:
         files["poses"] = job.folder / "poses.csv"
@@ -78,7 +81,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     for row in sorted(rows, key=lambda row: row.score):
         best[row.scene_id, row.im_id, row.obj_id] = row
     errors, iou = PoseErrors([data.object_model(i) for i in range(len(data.objects))]), BoxIoU()
-    used = 0
+    used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
         told = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
@@ -89,6 +92,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
                 pose = to_mesh(found.camera_from_native, data.reader.native_from_mesh(own[i].object))
                 poses[i] = torch.from_numpy(pose.astype(np.float32))
         errors.update(poses, batch.camera_from_object, batch.object_id)
+        pairs = [(nan, nan) if row is None else (row.score, row.seconds if row.seconds >= 0 else nan) for row in told]
+        scores, times = zip(*pairs, strict=True)
+        own_errors = [(1000 * state[-1]).tolist() for state in (errors.add, errors.add_s, errors.diameter)]
+        table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
         height, width = batch.rgb.shape[-2:]
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
@@ -98,9 +105,11 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     if not used:
         raise UserError(f"estimates={job.cfg.estimates}: none of its {len(rows)} rows is of an instance of this data")
     results = {**errors.compute(), "iou": float(iou.compute()), "particles_on_object": None}
-    times = [row.seconds for row in best.values() if row.seconds >= 0]
-    results |= {"seconds_per_image": sum(times) / len(times) if times else None, "belief": None}
-    return {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}, {}
+    seconds = [row.seconds for row in best.values() if row.seconds >= 0]
+    results |= {"seconds_per_image": sum(seconds) / len(seconds) if seconds else None, "belief": None}
+    write_errors(job.folder / ERRORS, table)
+    metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
+    return metrics, {"errors": job.folder / ERRORS}
 
 
 def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictConfig:

@@ -135,9 +135,10 @@ def build_trainer(job: Job) -> Trainer:
         log.info("trainer.val_check_interval=%d is more than max_steps=%d: validated at the end", interval, steps)
         cfg.trainer.val_check_interval = steps
     callbacks: list[Callback] = [made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made]
-    for story in callbacks:
-        if isinstance(story, TensorBoardLayout):
-            story.settings = comparable(job)
+    for layout in callbacks:
+        if isinstance(layout, TensorBoardLayout):
+            layout.settings = comparable(job)
+            layout.swept = tuple(o.split("=", 1)[0].lstrip("+~") for o in job.overrides) if job.swept else ()
     callbacks.append(progress(cfg.console))
     loggers: list[Logger] = [made for made in (instantiate(cfg.logger, "logger") or {}).values() if made]
     return make_trainer(cfg.trainer, callbacks, loggers)

@@ -1,0 +1,154 @@
+"""What a test found in each image, written down, and the worst and the best of them drawn."""
+
+import csv
+import math
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lightning import Callback, LightningModule, Trainer
+
+from posefilter.callbacks.gallery import ImageSelection, draw_gallery, find_shape, keep_image
+from posefilter.callbacks.tensorboard import post_image
+from posefilter.data.frames import FrameRecord
+from posefilter.metrics.beliefs import on_object
+from posefilter.metrics.collect import PoseErrors
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Trace
+
+FILE = "errors.csv"
+
+
+class ImageError(NamedTuple):
+    """One row of errors.csv; NaN where something is not known, infinite errors where the object was missed."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    object: str
+    image: str  # the frame's name in its dataset
+    visibility: float  # share of the object's pixels that is visible
+    add_mm: float
+    add_s_mm: float
+    diameter_mm: float
+    particles_on_object: float  # share of the last particles
+    score: float
+    seconds: float
+
+
+class ErrorTable(Callback):
+    """Write `errors.csv`, a row an image of the test, and draw its worst and best images.
+
+    Args:
+        folder: The run's folder; figures go to `figures` in it. Nothing is written if None.
+        best: How many images are drawn.
+        worst: How many images are drawn.
+    """
+
+    def __init__(self, folder: str | Path | None = None, best: int = 6, worst: int = 9) -> None:
+        self.folder = None if folder is None else Path(folder)
+        self.counts = {"first": 0, "best": best, "worst": worst}
+        self.rows: list[ImageError] = []
+        self._selection = ImageSelection(**self.counts)
+
+    def on_test_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Forget an earlier test."""
+        self.rows, self._selection = [], ImageSelection(**self.counts)
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Take in one batch."""
+        assert isinstance(pl_module, PoseEstimator)
+        records: Sequence[FrameRecord] = trainer.datamodule.records("test")  # type: ignore[attr-defined]
+        rows = measure_batch(pl_module, outputs, batch, [records[i] for i in batch.frame_id.tolist()])
+        self.rows += rows
+        for i, row in enumerate(rows):
+            error = row.add_mm / 1000 if math.isfinite(row.diameter_mm) else 1 - row.particles_on_object
+            keep = partial(keep_image, outputs, batch, pl_module, i, error, row.image)
+            self._selection.offer(error, keep)
+
+    def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the table and the figures."""
+        assert isinstance(pl_module, PoseEstimator)
+        if self.folder is None or not trainer.is_global_zero:
+            return
+        write_errors(self.folder / FILE, self.rows)
+        shape = find_shape(trainer, pl_module)
+        for name in ("worst", "best"):
+            kept = self._selection.kept[name]
+            if kept:
+                title = f"The {len(kept)} {name} images\nof {len(self.rows)} of the test"
+                figure = draw_gallery(kept, shape, pl_module.tells_pose, title)
+                post_image(trainer, name, figure, self.folder / "figures", "test")
+
+
+def measure_batch(method: PoseEstimator, trace: Trace, batch: Batch, records: Sequence[FrameRecord]) -> list[ImageError]:
+    """Return a row an image of a batch that a method has just been tested on.
+
+    Args:
+        method: Its metrics have taken in the batch.
+        trace: What its filter did.
+        batch: B images.
+        records: The B frames.
+    """
+    count = len(records)
+    errors = [[math.nan] * count] * 3
+    if method.tells_pose:
+        poses = method.scores["poses"]
+        assert isinstance(poses, PoseErrors)
+        errors = [(1000 * state[-1]).tolist() for state in (poses.add, poses.add_s, poses.diameter)]
+    shares = on_object(batch.mask, method.particle_pixels(trace.clouds[-1], batch)).tolist()
+    seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
+    return make_rows(records, batch, errors, shares, trace.belief.score.tolist(), [seconds] * count)
+
+
+def make_rows(
+    records: Sequence[FrameRecord],
+    batch: Batch,
+    errors: Sequence[Sequence[float]],
+    shares: Sequence[float],
+    scores: Sequence[float],
+    seconds: Sequence[float],
+) -> list[ImageError]:
+    """Return a row an image; errors: ADD, ADD-S and the diameters, B numbers each [mm]."""
+    seen = batch.visibility.tolist()
+    return [
+        ImageError(r.scene_id, r.im_id, r.obj_id, r.object, r.name, *numbers)
+        for r, *numbers in zip(records, seen, *errors, shares, scores, seconds, strict=True)
+    ]
+
+
+def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
+    """Write errors.csv: every digit kept, so that metrics come out of it as they are in metrics.json."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(ImageError._fields)
+        writer.writerows(rows)
+
+
+def read_errors(path: Path) -> list[ImageError]:
+    """Return the rows of errors.csv.
+
+    Raises:
+        ValueError: Where a row is malformed.
+    """
+    with path.open(newline="") as file:
+        return [parse_row(row) for row in csv.DictReader(file)]
+
+
+def parse_row(row: dict[str, str]) -> ImageError:
+    """Return one row; columns that it has beyond ours are not looked at."""
+    missing = [name for name in ImageError._fields if row.get(name) is None]
+    if missing:
+        raise ValueError(f"column {missing[0]} is missing")
+    kinds = ImageError.__annotations__
+    return ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
