@@ -10,12 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
-from posefilter.callbacks.errors import FILE, ErrorTable, ImageError, read_errors, write_errors
+from posefilter.callbacks.errors import ErrorTable
 from posefilter.callbacks.gallery import ImageSelection, KeptImage
 from posefilter.data.frames import FrameRecord
 from posefilter.figures.layout import CAPTION, cut_text, format_length
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import PoseErrors
+from posefilter.metrics.image_errors import FILE, ImageError, read_errors, write_errors
 from posefilter.metrics.scores import summary
 from posefilter.types import ObjectModel
 

@@ -1,11 +1,10 @@
 """What a test found in each image, written down, and the worst and the best of them drawn."""
 
-import csv
 import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
@@ -14,27 +13,9 @@ from posefilter.callbacks.tensorboard import post_image
 from posefilter.data.frames import FrameRecord
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.collect import PoseErrors
+from posefilter.metrics.image_errors import FILE, ImageError, write_errors
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
-
-FILE = "errors.csv"
-
-
-class ImageError(NamedTuple):
-    """One row of errors.csv; NaN where something is not known, infinite errors where the object was missed."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    object: str
-    image: str  # the frame's name in its dataset
-    visibility: float  # share of the object's pixels that is visible
-    add_mm: float
-    add_s_mm: float
-    diameter_mm: float
-    particles_on_object: float  # share of the last particles
-    score: float
-    seconds: float
 
 
 class ErrorTable(Callback):
@@ -124,31 +105,3 @@ def make_rows(
         ImageError(r.scene_id, r.im_id, r.obj_id, r.object, r.name, *numbers)
         for r, *numbers in zip(records, seen, *errors, shares, scores, seconds, strict=True)
     ]
-
-
-def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
-    """Write errors.csv: every digit kept, so that metrics come out of it as they are in metrics.json."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(ImageError._fields)
-        writer.writerows(rows)
-
-
-def read_errors(path: Path) -> list[ImageError]:
-    """Return the rows of errors.csv.
-
-    Raises:
-        ValueError: Where a row is malformed.
-    """
-    with path.open(newline="") as file:
-        return [parse_row(row) for row in csv.DictReader(file)]
-
-
-def parse_row(row: dict[str, str]) -> ImageError:
-    """Return one row; columns that it has beyond ours are not looked at."""
-    missing = [name for name in ImageError._fields if row.get(name) is None]
-    if missing:
-        raise ValueError(f"column {missing[0]} is missing")
-    kinds = ImageError.__annotations__
-    return ImageError(*(kinds[name](row[name]) for name in ImageError._fields))

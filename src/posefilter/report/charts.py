@@ -59,6 +59,7 @@ class Panel:
     joined: bool = True  # whether a line is one, or only its dots
     ticks: Sequence[float] = ()  # of x, where it is not free: the values that were tried
     log_y: bool = False
+    diagonal: tuple[float, float] | None = None  # ends of a line along which both axes are equal
 
 
 def draw_chart(panel: Panel, theme: Theme) -> bytes:
@@ -102,17 +103,22 @@ def measure_height(panel: Panel) -> int:
 
 def draw_line(axes: Axes, line: Line, color: str, joined: bool) -> None:
     """Draw one line over numbers."""
-    if len(line.x) > NOISY:
+    if len(line.x) > NOISY and joined and not is_step(line):
         axes.plot(line.x, line.y, color=color, linewidth=0.7, alpha=0.3)
         axes.plot(line.x, smooth(line.y), color=color, linewidth=1.7, label=line.label)
         return
     if len(line.low):
         axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.16, linewidth=0)
-    style = "o-" if joined else "o"
     few = len(line.x) <= 20
-    axes.plot(line.x, line.y, style if few else "-", color=color, linewidth=1.7, markersize=4.5, label=line.label)
+    style = ("o-" if few else "-") if joined else "o"
+    axes.plot(line.x, line.y, style, color=color, linewidth=1.7, markersize=4.5, label=line.label)
     if line.dots:
         axes.plot(*zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0)
+
+
+def is_step(line: Line) -> bool:
+    """Tell whether a line goes by steps, as a distribution does: it is no noise to be smoothed."""
+    return bool(np.any(np.diff(np.asarray(line.x, float)) == 0))
 
 
 def draw_across(axes: Axes, line: Line, color: str) -> None:
@@ -155,6 +161,8 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
             )
         if panel.limits:
             axes.set_ylim(*panel.limits)
+        if panel.diagonal:
+            axes.plot(panel.diagonal, panel.diagonal, "-", color=theme.soft, linewidth=1, zorder=1)
 
 
 def smooth(values: Sequence[float]) -> np.ndarray:

@@ -8,7 +8,9 @@ from typing import Any
 import yaml
 
 from posefilter.errors import UserError
+from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
+from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
@@ -28,6 +30,7 @@ class Run:
     data: dict[str, Any]  # data.json
     curves: dict[str, Curve]
     pictures: list[StoredImage]
+    errors: list[ImageError]  # of each image of its test
     missing: list[str] = field(default_factory=list)  # a sentence each
 
     def named(self, key: str) -> str:
@@ -55,6 +58,7 @@ def read_run(folder: Path) -> Run:
         data=read_json(folder / "data.json"),
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],
+        errors=read_image_errors(folder),
         missing=list_missing(folder, bool(files or logged)),
     )
 
@@ -79,6 +83,10 @@ def list_missing(folder: Path, pictures: bool) -> list[str]:
     """Return what a run's folder lacks, and what that means."""
     lacks = (
         ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
+        (
+            "No errors.csv: what the test found in single images is not known.",
+            (folder / "metrics.json").is_file() and not (folder / FILE).is_file(),
+        ),
         ("No TensorBoard events, so no curves and no timings of the training.", not any(find_event_files(folder))),
         ("No pictures in figures/ or in the events, so no gallery.", not pictures),
         ("No .hydra folder: what was configured is not known.", not (folder / ".hydra" / "config.yaml").is_file()),

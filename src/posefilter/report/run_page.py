@@ -27,6 +27,7 @@ from posefilter.report.diagnostics import (
 )
 from posefilter.report.events import name_figure
 from posefilter.report.gather import Run
+from posefilter.report.image_errors import show_errors
 from posefilter.report.images import StoredImage, group_by_section
 from posefilter.report.page import Page
 from posefilter.report.settings import Change
@@ -64,7 +65,7 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
             [*list_diagnostics(run), *draw_charts(panels.choose_panels(run.curves, panels.SIGNS))],
         ),
         Section("Worst and best", show_worst_and_best(images)),
-        Section("Results", list_results(run)),
+        Section("Results", [*list_results(run), *show_errors(run.errors)]),
         Section("Curves", draw_charts(curves)),
         Section("Belief", [*list_belief(run), *beliefs, *show_images(images["belief"], wide=True)]),
         Section(

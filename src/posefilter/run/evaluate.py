@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from posefilter.callbacks.errors import FILE as ERRORS
-from posefilter.callbacks.errors import ErrorTable, ImageError, make_rows, write_errors
+from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, read_poses_csv, to_mesh, to_rows, write_beliefs, write_poses_csv
 from posefilter.data.confine import check_links
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.metrics.image_errors import FILE as ERRORS
+from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.models.base import score_of
 from posefilter.run.console import progress
 from posefilter.run.job import Job

@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.data.confine import check_links
 from posefilter.errors import UserError
+from posefilter.report.comparison_page import make_comparison_page, read_two_runs
 from posefilter.report.gather import Run, read_run
 from posefilter.report.run_page import make_run_page
 from posefilter.report.settings import Change, compare_settings
@@ -20,7 +21,8 @@ from posefilter.report.sweeps import find_best_job, read_sweep
 from posefilter.run.job import Job
 from posefilter.run.voice import ended
 
-FOLDERS = ("run", "sweep", "out")
+FOLDERS = ("run", "runs", "sweep", "out")
+KEYS = {"run": "run", "runs": "runs", "sweep": "sweep_folder"}  # on the command line -> in the configuration
 
 
 def spelled(arguments: Sequence[str]) -> list[str]:
@@ -35,22 +37,28 @@ def spelled(arguments: Sequence[str]) -> list[str]:
 
 
 def report(job: Job) -> None:
-    """Write report.html and its charts as PNGs into `out`, or into a folder `report` of the run or sweep."""
-    run, sweep = job.cfg.run, job.cfg.sweep_folder
-    if (run is None) == (sweep is None):
-        raise UserError("give either run=RUN, a run's folder, or sweep=DIR, a sweep's")
-    folder = Path(str(run if sweep is None else sweep))
-    check_links(folder)
-    command = f"python report.py {'run' if sweep is None else 'sweep'}={folder}"
-    if sweep is None:
+    """Write report.html and its charts as PNGs into `out`; else into the run or sweep, or the second of two runs."""
+    given = {key: getattr(job.cfg, name) for key, name in KEYS.items() if getattr(job.cfg, name) is not None}
+    if len(given) != 1:
+        raise UserError("give one of run=RUN, a run's folder, sweep=DIR, a sweep's, and runs=A,B, two runs' folders")
+    ((kind, value),) = given.items()
+    folder, command = Path(str(value)), f"python report.py {kind}={value}"
+    if kind != "runs":
+        check_links(folder)
+    if kind == "run":
         record = read_run(folder)
         page = make_run_page(record, compared(record), command)
+    elif kind == "runs":
+        first, second = read_two_runs(str(value))
+        check_links(first.folder)
+        check_links(second.folder)
+        page, folder = make_comparison_page(first, second, command), second.folder
     else:
         found = read_sweep(folder)
         winner = folder / find_best_job(found).folder
         best = read_run(winner) if (winner / "metrics.json").is_file() else None
         page = make_sweep_page(found, best, compared(best) if best else None, command)
-    out = Path(job.cfg.out) if job.cfg.out else folder / "report"
+    out = Path(job.cfg.out) if job.cfg.out else folder / ("comparison" if kind == "runs" else "report")
     out.mkdir(parents=True, exist_ok=True)
     (out / "report.html").write_text(page.render())
     files = page.files()

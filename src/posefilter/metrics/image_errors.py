@@ -1,0 +1,67 @@
+"""The error of each image of a test, as a table in a file."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from posefilter.metrics.scores import summary
+
+FILE = "errors.csv"
+
+
+class ImageError(NamedTuple):
+    """One row of errors.csv; NaN where something is not known, infinite errors where the object was missed."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    object: str
+    image: str  # the frame's name in its dataset
+    visibility: float  # share of the object's pixels that is visible
+    add_mm: float
+    add_s_mm: float
+    diameter_mm: float
+    particles_on_object: float  # share of the last particles
+    score: float
+    seconds: float
+
+
+def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
+    """Write errors.csv: every digit kept, so that metrics come out of it as they are in metrics.json."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(ImageError._fields)
+        writer.writerows(rows)
+
+
+def read_errors(path: Path) -> list[ImageError]:
+    """Return the rows of errors.csv.
+
+    Raises:
+        ValueError: Where a row is malformed.
+    """
+    with path.open(newline="") as file:
+        return [parse_row(row) for row in csv.DictReader(file)]
+
+
+def parse_row(row: dict[str, str]) -> ImageError:
+    """Return one row; columns that it has beyond ours are not looked at."""
+    missing = [name for name in ImageError._fields if row.get(name) is None]
+    if missing:
+        raise ValueError(f"column {missing[0]} is missing")
+    kinds = ImageError.__annotations__
+    return ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
+
+
+def summarize_errors(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
+    """Return the blocks `add` and `add_s` of metrics.json for some images."""
+    diameter = torch.tensor([row.diameter_mm for row in rows], dtype=torch.float64) / 1000
+    errors = {
+        "add": torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000,
+        "add_s": torch.tensor([row.add_s_mm for row in rows], dtype=torch.float64) / 1000,
+    }
+    return {name: summary(own, diameter) for name, own in errors.items()}

@@ -1,0 +1,207 @@
+"""Compare two runs on the images that both were tested on."""
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from posefilter.errors import UserError
+from posefilter.figures.layout import format_length
+from posefilter.metrics.image_errors import FILE, ImageError, summarize_errors
+from posefilter.metrics.registry import find_metric
+from posefilter.report.blocks import Block, Cell, Heading, Paragraph, Section, Table, Text, Tile, draw_charts
+from posefilter.report.charts import Line, Panel
+from posefilter.report.gather import Run, read_run
+from posefilter.report.image_errors import chart_errors
+from posefilter.report.page import Page
+from posefilter.report.run_page import compare_numbers, list_changes
+from posefilter.report.settings import compare_settings
+
+LISTED = 10  # images in a table of the greatest changes
+EQUAL_MM = 0.05  # errors that differ by less are written alike
+
+
+class Pair(NamedTuple):
+    """One image in two tests."""
+
+    a: ImageError
+    b: ImageError
+
+    @property
+    def change(self) -> float:
+        """Return how much greater the second error is [mm]; 0 where both missed the object."""
+        return 0.0 if self.a.add_mm == self.b.add_mm else self.b.add_mm - self.a.add_mm
+
+
+class Verdict(NamedTuple):
+    """How often each of two runs is nearer to the truth."""
+
+    a: int  # images in which the first is
+    b: int
+    equal: int
+    chance: float  # that runs which are equally good would differ as much in either direction (sign test)
+
+
+def read_two_runs(text: str) -> tuple[Run, Run]:
+    """Read `runs=A,B`: the folders may have commas in their names themselves.
+
+    Raises:
+        UserError: Where these are not two runs' folders, or one has no errors.csv.
+    """
+    parts = text.split(",")
+    splits = [(",".join(parts[:i]).strip(), ",".join(parts[i:]).strip()) for i in range(1, len(parts))]
+    found = [(Path(a), Path(b)) for a, b in splits if Path(a).is_dir() and Path(b).is_dir()]
+    if len(found) != 1:
+        raise UserError(f"runs={text}: should be the folders of two runs, separated by a comma")
+    a, b = (read_run(folder) for folder in found[0])
+    for run in (a, b):
+        if not run.errors:
+            raise UserError(f"runs: {run.folder} has no {FILE}; test its checkpoint again with evaluate.py")
+    return a, b
+
+
+def match_images(a: Sequence[ImageError], b: Sequence[ImageError]) -> list[Pair]:
+    """Return the images that two tests share, by dataset name and ids, in the first one's order."""
+
+    def identify(row: ImageError) -> tuple[str, int, int, int, str]:
+        return row.image, row.scene_id, row.im_id, row.obj_id, row.object
+
+    others = {identify(row): row for row in b}
+    return [Pair(row, others[identify(row)]) for row in a if identify(row) in others]
+
+
+def judge(pairs: Sequence[Pair]) -> Verdict:
+    """Count in which images each of two runs is better, and tell whether that may be chance.
+
+    The chance is that of the two-sided sign test: images that are alike do not count.
+    """
+    a, b = (sum(sign * pair.change > EQUAL_MM for pair in pairs) for sign in (1, -1))
+    n, least = a + b, min(a, b)
+    tail = sum(math.comb(n, k) for k in range(least + 1)) / 2**n if n else 1.0
+    return Verdict(a, b, len(pairs) - a - b, min(1.0, 2 * tail))
+
+
+def make_comparison_page(a: Run, b: Run, command: str) -> Page:
+    """Return what the page about two runs says.
+
+    Raises:
+        UserError: Where their tests share no image, or one of them tells no pose.
+    """
+    pairs = match_images(a.errors, b.errors)
+    if not pairs:
+        raise UserError(f"runs: {a.folder} and {b.folder} were tested on no common image")
+    if any(math.isnan(row.add_mm) for pair in pairs for row in pair):
+        raise UserError("runs: one of the two only detects; errors of poses can be compared of two that tell poses")
+    names = name_runs(a, b)
+    rows = dict(zip(names, ([pair.a for pair in pairs], [pair.b for pair in pairs]), strict=True))
+    charts = [*chart_errors(rows), *chart_pairs(pairs, names)]
+    sections = [
+        Section("Verdict", list_verdict(pairs, names)),
+        Section("On the common images", [tabulate_common(rows), *draw_charts(charts)]),
+        Section("Greatest changes", list_changes_of_images(pairs, names)),
+        Section("Whole tests", [compare_numbers(dict(zip(names, (a.metrics, b.metrics), strict=True)))]),
+        Section("Settings that differ", list_settings(a, b, names)),
+    ]
+    lines = [
+        Paragraph([Text(name, "badge"), Text(str(run.folder), "code"), f"{run.named('model')}, {run.named('variant')}"])
+        for name, run in zip(names, (a, b), strict=True)
+    ]
+    notes = [
+        f"{len(run.errors) - len(pairs)} images of {name} are not in the other test; they are left out."
+        for name, run in zip(names, (a, b), strict=True)
+        if len(run.errors) > len(pairs)
+    ]
+    title = f"{names[0]} against {names[1]}"
+    foot = Paragraph(["Made with", Text(command, "code")])
+    return Page(title, title, lines, make_tiles(pairs, names), notes, sections, foot)
+
+
+def name_runs(a: Run, b: Run) -> tuple[str, str]:
+    """Return short names that tell two runs apart: the last parts of their folders' names."""
+    parts = a.folder.resolve().parts, b.folder.resolve().parts
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = tuple("/".join(own[-depth:]) for own in parts)
+        if names[0] != names[1]:
+            return names[0], names[1]
+    return "A", "B"
+
+
+def make_tiles(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Tile]:
+    """Return the main numbers."""
+    verdict = judge(pairs)
+    return [
+        Tile(str(len(pairs)), "", "common images"),
+        *(Tile(str(count), "", f"{name} is nearer") for count, name in zip(verdict[:2], names, strict=True)),
+        Tile(str(verdict.equal), "", "alike"),
+    ]
+
+
+def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
+    """Return in words which run is better, and how sure that is."""
+    verdict = judge(pairs)
+    chance = f"{verdict.chance:.2g}" if verdict.chance >= 1e-4 else "below 0.0001"
+    if verdict.chance < 0.05:
+        better = names[0] if verdict.a > verdict.b else names[1]
+        words: list[Cell] = [
+            Text(better, "good"),
+            f"is nearer to the truth in more images than chance would have it (p = {chance}).",
+        ]
+    else:
+        words = [Text("No difference that chance would not explain", "soft"), f"(p = {chance})."]
+    finite = [pair.change for pair in pairs if math.isfinite(pair.change)]
+    middle = f"The median change of the error from the first to the second is {median(finite):+.2g} mm." if finite else ""
+    how = "Sign test over images: those whose errors differ by less than 0.05 mm do not count."
+    return [Paragraph([*words, middle]), Paragraph([Text(how, "soft")])]
+
+
+def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
+    """Return the metrics of both runs on the common images, and their difference."""
+    found = [summarize_errors(own) for own in rows.values()]
+    cells: list[list[Cell]] = []
+    for kind, name in product(("add", "add_s"), found[0]["add"]):
+        info = find_metric(f"{kind}/{name}")
+        first, second = (one[kind][name] for one in found)
+        change = second - first if math.isfinite(first) and math.isfinite(second) else 0.0
+        difference: Cell = "alike"
+        if f"{abs(change):.1f}" != "0.0":
+            difference = Text(f"{change:+.1f} {info.unit}".strip(), "good" if change * info.direction > 0 else "bad")
+        cells.append([info.label, info.describe(first), info.describe(second), difference])
+    return Table(("", *rows, "change"), cells, numeric=(1, 2, 3), form="narrow")
+
+
+def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
+    """Return a chart with a dot an image: one run's error against the other's."""
+    both = [pair for pair in pairs if all(0 < row.add_mm < math.inf for row in pair)]
+    if not both:
+        return []
+    ends = [f(row.add_mm for pair in both for row in pair) for f in (min, max)]
+    dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
+    xlabel = f"ADD of {names[0]} [mm]"
+    diagonal = (ends[0], ends[1])
+    return [Panel(f"ADD of {names[1]}", xlabel, "mm", [dots], joined=False, log_x=True, log_y=True, diagonal=diagonal)]
+
+
+def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
+    """Return the images in which one run is most ahead of the other, by name."""
+    out: list[Block] = []
+    for sign, name in ((1, names[0]), (-1, names[1])):
+        ahead = sorted((pair for pair in pairs if sign * pair.change > EQUAL_MM), key=lambda pair: -sign * pair.change)
+        rows: list[list[Cell]] = [
+            [
+                Text(pair.a.image, "code"),
+                "–" if math.isnan(pair.a.visibility) else f"{pair.a.visibility:.2f}",
+                *(format_length(row.add_mm / 1000) for row in pair),
+            ]
+            for pair in ahead[:LISTED]
+        ]
+        table = Table(("image", "visible share", *(f"ADD of {own}" for own in names)), rows, numeric=(1, 2, 3))
+        out += [Heading(f"Where {name} is most ahead"), table] if rows else []
+    return out
+
+
+def list_settings(a: Run, b: Run, names: tuple[str, str]) -> list[Block]:
+    """Return the settings in which two runs differ."""
+    changed = compare_settings(a.config, b.config)
+    return [list_changes(changed, names)] if changed else [Paragraph([Text("None that is known.", "soft")])]

@@ -1,0 +1,122 @@
+"""Charts and tables of the errors of single images: how many are below a threshold, and how they grow with occlusion."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from posefilter.errors import UserError
+from posefilter.figures.layout import format_length
+from posefilter.metrics.image_errors import FILE, ImageError, read_errors
+from posefilter.metrics.registry import PERCENT, find_metric
+from posefilter.metrics.scores import auc
+from posefilter.report.blocks import Block, Cell, Fold, Heading, Paragraph, Table, Text, draw_charts
+from posefilter.report.charts import Line, Panel
+
+LIMIT_MM = 100.0  # of thresholds: the AUC's own
+FEWEST = 8  # images in a range of visibility
+MOST = 8  # ranges of visibility
+LISTED = 12  # images in a table of the worst
+
+
+def read_image_errors(folder: Path) -> list[ImageError]:
+    """Return the rows of a run's errors.csv, none where it has no such file.
+
+    Raises:
+        UserError: Where the file is malformed.
+    """
+    path = folder / FILE
+    if not path.is_file():
+        return []
+    try:
+        return read_errors(path)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: is no table of errors ({error})") from error
+
+
+def compute_cdf(errors_mm: Sequence[float], limit_mm: float = LIMIT_MM) -> tuple[list[float], list[float]]:
+    """Return the share of the images whose error is at most a threshold.
+
+    Args:
+        errors_mm: An error an image; infinite where it was missed.
+        limit_mm: The greatest threshold.
+
+    Returns:
+        Thresholds [mm], from 0 to the limit, and the shares there [%]; a step is two points.
+    """
+    within = sorted(error for error in errors_mm if error < limit_mm)
+    x, y = [0.0], [0.0]
+    for number, error in enumerate(within, start=1):
+        x += [error, error]
+        y += [y[-1], 100 * number / len(errors_mm)]
+    return [*x, limit_mm], [*y, y[-1]]
+
+
+def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
+    """Return the images in ranges of their visible share, about as many in each; unknown shares are left out."""
+    known = sorted((row for row in rows if math.isfinite(row.visibility)), key=lambda row: row.visibility)
+    count = min(MOST, len(known) // FEWEST)
+    if count < 2:
+        return []
+    return [[known[i] for i in part] for part in np.array_split(np.arange(len(known)), count)]
+
+
+def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
+    """Return the charts of one run's errors, or of several, a line each; the name of a single one is not shown."""
+    runs = {name: rows for name, rows in runs.items() if any(math.isfinite(row.diameter_mm) for row in rows)}
+    cdf, by_share, by_auc = [], [], []
+    for name, rows in runs.items():
+        for label, key in (("ADD", "add_mm"), ("ADD-S", "add_s_mm")) if len(runs) == 1 else ((name, "add_mm"),):
+            cdf.append(Line(label, *compute_cdf([getattr(row, key) for row in rows])))
+        parts = group_by_visibility(rows)
+        seen = [float(np.mean([row.visibility for row in part])) for part in parts]
+        if parts:
+            by_share.append(Line(name, seen, [100 * float(np.mean([is_found(row) for row in part])) for part in parts]))
+            by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
+    out = [Panel("Images with an ADD below a threshold", "threshold [mm]", "%", cdf, PERCENT)] if cdf else []
+    for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
+        info = find_metric(key)
+        out += [Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT)] if lines else []
+    return out
+
+
+def is_found(row: ImageError) -> bool:
+    """Tell whether an object was found: its ADD is below a tenth of its diameter."""
+    return row.add_mm < 0.1 * row.diameter_mm
+
+
+def measure_auc(rows: Sequence[ImageError]) -> float:
+    """Return the ADD AUC of some images."""
+    return auc(torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000)
+
+
+def show_errors(rows: Sequence[ImageError]) -> list[Block]:
+    """Return the charts of one run's errors, and its worst images by name; nothing where there are none."""
+    if not rows:
+        return []
+    return [*draw_charts(chart_errors({"": rows})), *list_worst(rows)]
+
+
+def list_worst(rows: Sequence[ImageError]) -> list[Block]:
+    """Return the images with the greatest errors, by name."""
+    posed = [row for row in rows if not math.isnan(row.add_mm)]
+    if posed:
+        worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
+    else:
+        worst = sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
+    cells: list[list[Cell]] = [
+        [
+            Text(row.image, "code"),
+            "–" if math.isnan(row.visibility) else f"{row.visibility:.2f}",
+            "–" if math.isnan(row.add_mm) else format_length(row.add_mm / 1000),
+            "–" if math.isnan(row.add_s_mm) else format_length(row.add_s_mm / 1000),
+            f"{row.particles_on_object:.0%}" if math.isfinite(row.particles_on_object) else "–",
+        ]
+        for row in worst
+    ]
+    head = ("image", "visible share", "ADD", "ADD-S", "particles on the object")
+    where = Paragraph(["Every image is in", Text(FILE, "code"), "in the run's folder."])
+    table = Table(head, cells, numeric=range(1, len(head)))
+    return [Heading("Images"), Fold(f"The {len(worst)} worst of {len(rows)} images", [table]), where]

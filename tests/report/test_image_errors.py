@@ -1,0 +1,160 @@
+"""Errors image by image: their distribution, how they grow with occlusion, and two runs on the same images."""
+
+import json
+import math
+import shutil
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.metrics.image_errors import FILE, ImageError, write_errors
+from posefilter.report.comparison_page import judge, make_comparison_page, match_images, read_two_runs
+from posefilter.report.gather import read_run
+from posefilter.report.image_errors import chart_errors, compute_cdf, group_by_visibility, is_found, measure_auc
+from posefilter.report.run_page import make_run_page
+
+
+def make_row(number: int, error: float, visibility: float = 1.0) -> ImageError:
+    """Return an image of an object of 200 mm."""
+    name = f"scene/{number:06d}"
+    return ImageError(0, number, 1, "box", name, visibility, error, error / 2, 200.0, 1.0, 0.0, 0.1)
+
+
+def make_rows(seed: int, count: int = 64, offset: float = 0.0) -> list[ImageError]:
+    g = np.random.default_rng(seed)
+    errors = g.exponential(10.0, count) + offset
+    return [make_row(i, float(e), float(v)) for i, (e, v) in enumerate(zip(errors, g.uniform(0.2, 1, count), strict=True))]
+
+
+def test_a_cdf_never_falls_and_ends_at_the_share_within_the_limit() -> None:
+    g = np.random.default_rng(0)
+    for count in (1, 2, 77):
+        errors = [*g.exponential(60.0, count).tolist(), math.inf]
+        x, y = compute_cdf(errors)
+        assert (np.diff(x) >= 0).all()
+        assert (np.diff(y) >= 0).all()
+        assert (x[0], y[0], x[-1]) == (0.0, 0.0, 100.0)
+        assert y[-1] == pytest.approx(100 * np.mean(np.array(errors) < 100))
+        for threshold in (5.0, 20.0, 99.0):  # at any threshold it is what one counts
+            at = max(i for i in range(len(x)) if x[i] <= threshold)
+            assert y[at] == pytest.approx(100 * np.mean(np.array(errors) <= threshold))
+
+
+def test_the_area_under_the_cdf_is_about_the_auc() -> None:
+    """The published AUC is a sum of steps of the right end: with many images it is the area."""
+    rows = make_rows(1, 2000)
+    x, y = compute_cdf([row.add_mm for row in rows])
+    assert np.trapezoid(y, x) / 100 == pytest.approx(measure_auc(rows), abs=0.1)
+
+
+def test_ranges_of_visibility_hold_each_image_once_and_in_order() -> None:
+    rows = [*make_rows(2, 50), make_row(99, 1.0, math.nan)]
+    parts = group_by_visibility(rows)
+    assert sorted(row.im_id for part in parts for row in part) == list(range(50))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+    for before, after in pairwise(parts):
+        assert max(row.visibility for row in before) <= min(row.visibility for row in after)
+    assert group_by_visibility(rows[:10]) == []  # too few to tell apart
+    (curve,) = (panel for panel in chart_errors({"": rows}) if panel.title.startswith("ADD < 0.1 diameter"))
+    means = np.array(curve.lines[0].y)
+    assert np.average(means, weights=[len(part) for part in parts]) == pytest.approx(
+        100 * np.mean([is_found(row) for row in rows[:50]])
+    )
+
+
+def test_the_run_page_shows_them(run: Path) -> None:
+    write_errors(run / FILE, [*make_rows(3, 20), make_row(20, 1234.0), make_row(21, math.inf)])
+    page = make_run_page(read_run(run), None, "x")
+    text, files = page.render(), page.files()
+    assert "images-with-an-add-below-a-threshold-threshold-mm.png" in files
+    assert "add-auc-by-visibility-visible-share.png" in files
+    assert text.index("scene/000021") < text.index("scene/000020") < text.index("1.23 m")
+    assert ">missed<" in text
+    assert "No errors.csv" not in text
+    (run / FILE).write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match=r"errors\.csv: is no table of errors \(column scene_id is missing\)"):
+        read_run(run)
+
+
+def test_ranges_that_share_images_are_apart(run: Path) -> None:
+    """Rows of one table add up to the images in it; those from a share upwards have a table of their own."""
+    metrics = json.loads((run / "metrics.json").read_text())
+    own = metrics["by_visibility"].pop("0.3-0.5")
+    counts = {"0-0.3": 1, "0.3-0.5": 2, "0.5-0.8": 3, "0.8-1": 4, "0.5-1": 7, "0.6-1": 5}
+    metrics["by_visibility"] = {name: own | {"instances": count} for name, count in counts.items()}
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    page = make_run_page(read_run(run), None, "x")
+    (blocks,) = [section.blocks for section in page.sections if section.title == "Results"]
+    apart, above = [b for b in blocks if b.kind == "table"][1:3]
+    assert [row[:2] for row in apart.rows] == [
+        ["0 to 0.3", "1"],
+        ["0.3 to 0.5", "2"],
+        ["0.5 to 0.8", "3"],
+        ["0.8 to 1", "4"],
+    ]
+    assert [row[:2] for row in above.rows] == [["at least 0.5", "7"], ["at least 0.6", "5"]]
+
+
+@pytest.fixture
+def pair(run: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """Return two runs: the second is 1 mm worse in every image, and was tested on fewer."""
+    other = tmp_path / "other,with=a comma"
+    shutil.copytree(run, other)
+    rows = make_rows(4, 40)
+    write_errors(run / FILE, rows)
+    write_errors(other / FILE, [row._replace(add_mm=row.add_mm + 1) for row in rows[5:]][::-1])
+    return run, other
+
+
+def test_images_are_matched_by_name_not_by_place(pair: tuple[Path, Path]) -> None:
+    a, b = read_two_runs(f"{pair[0]},{pair[1]}")
+    assert (a.folder, b.folder) == pair
+    pairs = match_images(a.errors, b.errors)
+    assert len(pairs) == 35
+    assert [one.change for one in pairs] == pytest.approx([1.0] * 35)
+    verdict = judge(pairs)
+    assert (verdict.a, verdict.b, verdict.equal) == (35, 0, 0)
+    assert verdict.chance == pytest.approx(2 / 2**35)
+
+
+def test_a_comparison_turned_round_is_the_same(pair: tuple[Path, Path]) -> None:
+    a, b = read_two_runs(f"{pair[0]},{pair[1]}")
+    forth, back = judge(match_images(a.errors, b.errors)), judge(match_images(b.errors, a.errors))
+    assert (forth.a, forth.b, forth.equal, forth.chance) == (back.b, back.a, back.equal, back.chance)
+    alike = judge(match_images(a.errors, a.errors))
+    assert (alike.a, alike.b, alike.chance) == (0, 0, 1.0)
+
+
+def test_a_run_against_itself_differs_in_nothing_and_noise_by_chance() -> None:
+    both = match_images(make_rows(5), make_rows(6))
+    assert judge(both).chance > 0.05
+    missed = match_images([make_row(0, math.inf)], [make_row(0, math.inf)])
+    assert judge(missed)[:3] == (0, 0, 1)
+
+
+def test_the_comparison_page(pair: tuple[Path, Path]) -> None:
+    a, b = read_two_runs(f"{pair[0]},{pair[1]}")
+    page = make_comparison_page(a, b, "x")
+    text = page.render()
+    assert "35" in text
+    assert "+1.0 mm" in text  # of the median
+    assert "5 images of run &lt;1&gt; are not in the other test" in text
+    assert "Where run &lt;1&gt; is most ahead" in text
+    assert "Where other" not in text
+    assert {"images-with-an-add-below-a-threshold-threshold-mm.png"} <= set(page.files())
+
+
+def test_what_cannot_be_compared_is_told(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    a, b = read_two_runs(f"{pair[0]},{pair[1]}")
+    with pytest.raises(UserError, match="should be the folders of two runs"):
+        read_two_runs(str(pair[0]))
+    write_errors(pair[1] / FILE, [make_row(1000, 1.0)])
+    with pytest.raises(UserError, match="no common image"):
+        make_comparison_page(a, read_run(pair[1]), "x")
+    (pair[1] / FILE).unlink()
+    with pytest.raises(UserError, match=r"has no errors\.csv"):
+        read_two_runs(f"{pair[0]},{pair[1]}")
+    assert b.errors
