@@ -1,5 +1,6 @@
 """Plug-ins: trusted by the user, and by nobody else."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,15 @@ def test_the_command_line_names_them(package: str, tmp_path: Path, capfd: pytest
     assert run_command("train", HOME, [f"out={tmp_path}", "plugins=[my_plugin]", "loss=add", "console=plain"]) == 2
     assert "loss=add does not fit" in capfd.readouterr().err
     assert "my_plugin" in trust.trusted()
+
+
+def test_every_target_of_the_configuration_is_allowed_and_located() -> None:
+    files = (HOME / "conf").rglob("*.yaml")
+    names = {name for file in files for name in re.findall(r"_target_: *[\"']?([\w.]+)", file.read_text())}
+    names -= {"posefilter.run.sweeps.SweepSummary"}  # that Hydra builds itself
+    assert len(names) > 80
+    for name in names:
+        assert callable(locate(name, "x"))
 
 
 def test_a_recipe_does_not_keep_them(package: str, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ _RECIPE_NAMES = frozenset(
     }
 )
 DATA_NAMES = frozenset({"posefilter.data.module.PoseDataModule", "posefilter.data.generate.generate"})
-_AUGMENTATIONS = "posefilter.data.augment"
+_AUGMENTATIONS = ("posefilter.data.augment", "posefilter.data.photometric")
 _CALLBACKS = ("DeviceStatsMonitor", "EarlyStopping", "LearningRateMonitor", "ModelCheckpoint", "ModelSummary", "Timer")
 _LOGGERS = ("CSVLogger", "MLFlowLogger", "TensorBoardLogger", "WandbLogger")
 _PROFILERS = ("AdvancedProfiler", "PyTorchProfiler", "SimpleProfiler")
@@ -95,7 +95,7 @@ def is_component(module: str, scope: Scope) -> bool:
     top, _, rest = module.partition(".")
     packages = COMPONENTS if scope is Scope.RECIPE else (*COMPONENTS, *_LOOKING)
     own = top == "posefilter" and rest.split(".")[0] in packages and "." in rest
-    return own or (scope is Scope.CONFIG and module == _AUGMENTATIONS)
+    return own or (scope is Scope.CONFIG and module in _AUGMENTATIONS)
 
 
 def check_name(name: str, where: str, scope: Scope) -> None:
