@@ -1,9 +1,11 @@
-"""Test a checkpoint, or poses from anywhere: python evaluate.py checkpoint=... data=... data.root=...."""
+"""Test a checkpoint, or poses from anywhere: python evaluate.py checkpoint=... data=...
+data.root=....
+"""
 
 import sys
 from pathlib import Path
 
-from posefilter.run import run_command
+from posefilter.cli import run_command
 
 if __name__ == "__main__":
     sys.exit(run_command("evaluate", Path(__file__).parent))

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from posefilter.run import run_command
+from posefilter.cli import run_command
 
 if __name__ == "__main__":
     sys.exit(run_command("generate", Path(__file__).parent))

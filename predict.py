@@ -1,9 +1,11 @@
-"""Find the object in one photograph: python predict.py checkpoint=... rgb=... depth=... intrinsics=...."""
+"""Find the object in one photograph: python predict.py checkpoint=... rgb=... depth=...
+intrinsics=....
+"""
 
 import sys
 from pathlib import Path
 
-from posefilter.run import run_command
+from posefilter.cli import run_command
 
 if __name__ == "__main__":
     sys.exit(run_command("predict", Path(__file__).parent))

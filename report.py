@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-from posefilter.run import run_command
-from posefilter.run.report import spelled
+from posefilter.cli import run_command
+from posefilter.cli.report import spelled
 
 if __name__ == "__main__":
     sys.exit(run_command("report", Path(__file__).parent, spelled(sys.argv[1:])))

@@ -1,9 +1,11 @@
-"""Train a method and test it: python train.py [model=...] [loss=...] [data=...]; see conf/train.yaml."""
+"""Train a method and test it: python train.py [model=...] [loss=...] [data=...]; see
+conf/train.yaml.
+"""
 
 import sys
 from pathlib import Path
 
-from posefilter.run import run_command
+from posefilter.cli import run_command
 
 if __name__ == "__main__":
     sys.exit(run_command("train", Path(__file__).parent))

@@ -1,9 +1,10 @@
-"""Measure what a validation's figures cost: `python bench/figures_cost.py [--checkpoint FILE] [train.py's settings ...]`.
+"""Measure what a validation's figures cost: `python bench/figures_cost.py [--checkpoint FILE]
+[train.py's settings ...]`.
 
-Validations of the same method on the same images run by turns without and with every callback that only looks, each figure
-drawn at each validation however long it takes (in a training, drawing is put off where it would take more than its share).
-Computing time tells the same where other programs keep the machine busy.
-Without a checkpoint the method is new, which takes as long.
+Validations of the same method on the same images run by turns without and with every callback that
+only looks, each figure drawn at each validation however long it takes (in a training, drawing is
+put off where it would take more than its share). Computing time tells the same where other programs
+keep the machine busy. Without a checkpoint the method is new, which takes as long.
 """
 
 import argparse
@@ -17,10 +18,10 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from posefilter.callbacks.tensorboard import Budget
-from posefilter.run.build import instantiate
-from posefilter.run.command import compose_job
-from posefilter.run.machine import settle
-from posefilter.run.method import build_method, method_of, read_checkpoint, recipe
+from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
+from posefilter.cli.command import compose_job
+from posefilter.cli.instantiate import instantiate
+from posefilter.cli.machine import settle
 
 HOME = Path(__file__).parents[1]
 LOOKING = ("layout", "speed", "signs", "health", "figures")
@@ -41,7 +42,9 @@ class Clock(Callback):
         self.ended = time.perf_counter(), time.process_time()
 
 
-def validate(method: LightningModule, data: Any, callbacks: list[Callback], folder: str) -> tuple[float, float]:
+def validate(
+    method: LightningModule, data: Any, callbacks: list[Callback], folder: str
+) -> tuple[float, float]:
     """Return what one validation takes: time, and computing time of all threads [s]."""
     first, last = Clock(), Clock()
     trainer = Trainer(
@@ -65,7 +68,9 @@ def looking(job: Any, folder: str) -> list[Callback]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--checkpoint", default=None)
     parser.add_argument("--repeats", type=int, default=5)
     known, settings = parser.parse_known_args()
@@ -76,15 +81,19 @@ def main() -> None:
         data.prepare_data()
         data.setup("fit")
         checkpoint = read_checkpoint(known.checkpoint) if known.checkpoint else None
-        method = method_of(checkpoint) if checkpoint else build_method(recipe(job), data.object_model(0))
-        validate(method, data, looking(job, folder), folder)  # caches, fonts and compiled kernels: neither's to pay
+        method = (
+            method_of(checkpoint) if checkpoint else build_method(recipe(job), data.object_model(0))
+        )
+        # caches, fonts and compiled kernels: neither's to pay
+        validate(method, data, looking(job, folder), folder)
         plain, drawn = [], []
         for number in range(known.repeats):
             for with_figures in (True, False) if number % 2 else (False, True):
                 took = validate(method, data, looking(job, folder) if with_figures else [], folder)
                 (drawn if with_figures else plain).append(took)
                 print(
-                    f"{'with' if with_figures else 'without'} figures: {took[0]:.2f} s, computing {took[1]:.2f} s",
+                    f"{'with' if with_figures else 'without'} figures: {took[0]:.2f} s, computing "
+                    f"{took[1]:.2f} s",
                     flush=True,
                 )
     print(f"{known.repeats} validations each, by turns, {torch.get_num_threads()} threads")
@@ -93,7 +102,8 @@ def main() -> None:
     ):
         ratios = [a / b for a, b in zip(with_all, without, strict=True)]
         print(
-            f"{kind}: {sum(without):.2f} s without and {sum(with_all):.2f} s with all figures; ratio "
+            f"{kind}: {sum(without):.2f} s without and {sum(with_all):.2f} s with all figures; "
+            f"ratio "
             f"{sum(with_all) / sum(without):.3f}, of pairs {min(ratios):.3f} to {max(ratios):.3f}"
         )
 

@@ -1,11 +1,13 @@
-"""Run every run behind docs/methods.md, the most telling first, and bring its tables up to date after each line of the plan.
+"""Run every run behind docs/methods.md, the most telling first, and bring its tables up to date
+after each line of the plan.
 
     python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]   # --only may be repeated
     python bench/methods.py --meshes DIR --frames DIR    # and the real cracker box: YCB's meshes, YCB-Video's frames
 
-Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines, and is printed as it could
-be typed. Started again, it goes on: train.py skips the jobs that are done and resumes the one that was cut short. What is
-typed beyond the options, such as threads=1, is handed to every command.
+Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines,
+and is printed as it could be typed. Started again, it goes on: train.py skips the jobs that are
+done and resumes the one that was cut short. What is typed beyond the options, such as threads=1, is
+handed to every command.
 """
 
 import argparse
@@ -21,17 +23,21 @@ HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 MODELS = (*DETECTORS, *WITH_POSE)
-UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"  # but for the normalisations' statistics
-# rungs of more than one seed; the detectors' paper and working are in the table of memorisation, with all seeds
+# but for the normalizations' statistics
+UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"
+# ablations of more than one seed; the detectors' paper and working are in the table of
+# memorization, with all seeds
 TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,pose_c12_loss,working"
-TELLING_BOX = "s2_bounded,c1_normalisation,c6_place"
+TELLING_BOX = "s2_bounded,c1_normalization,c6_place"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
-MEMORISED = "memorise/experiment=memorise,model={},seed=0,variant=working"
+MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
 
 
 class Line(NamedTuple):
-    """A sweep: the table (and folder) that it belongs to, its words, and the run or checkpoint that it evaluates, if any."""
+    """A sweep: the table (and folder) that it belongs to, its words, and the run or checkpoint that
+    it evaluates, if any.
+    """
 
     table: str
     words: str
@@ -40,47 +46,78 @@ class Line(NamedTuple):
 
 
 def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
-    """Return all lines, in order of what they tell; those on the real cracker box where its meshes and frames are given."""
-    memorise = f"{FOUR} experiment=memorise"
+    """Return all lines, in order of what they tell; those on the real cracker box where its meshes
+    and frames are given.
+    """
+    memorize = f"{FOUR} experiment=memorize"
     lines = [
-        Line("memorise", f"{memorise} variant=working seed=0"),
-        Line("memorise", f"{memorise} variant=working seed=1,2,3,4"),
-        Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=0"),
-        Line("memorise", f"{memorise} variant=paper seed=0"),
-        Line("roll_out", "model=cnn_patch,downsized experiment=memorise variant=paper filter.steps=3,10 seed=0,1,2"),
+        Line("memorize", f"{memorize} variant=working seed=0"),
+        Line("memorize", f"{memorize} variant=working seed=1,2,3,4"),
+        Line("untrained", f"{memorize} variant=paper {UNTRAINED} seed=0"),
+        Line("memorize", f"{memorize} variant=paper seed=0"),
+        Line(
+            "roll_out",
+            "model=cnn_patch,downsized experiment=memorize variant=paper "
+            "filter.steps=3,10 seed=0,1,2",
+        ),
     ]
-    lines += [ablation("resampling", "resample=never,systematic,guided", MEMORISED, model) for model in MODELS]
-    lines += [Line("ladder_detect", f"model={m} experiment=memorise sweep=ladder_detect seed=0", into=m) for m in DETECTORS]
+    lines += [
+        ablation("resampling", "resample=none,systematic,guided", MEMORISED, model)
+        for model in MODELS
+    ]
+    lines += [
+        Line("ladder_detect", f"model={m} experiment=memorize sweep=ablation_detect seed=0", into=m)
+        for m in DETECTORS
+    ]
     lines += [Line("held_out", f"{FOUR},pose_pf seed=0")]  # pose_pf beside them
-    lines += [ablation("particles", "filter.particles=10,20,50,100,300,1000", HELD_OUT, model) for model in MODELS]
-    lines += [ablation("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT, model) for model in MODELS]
-    noise = "propose=learned,learned_and_gaussian filter.steps=10,100"
+    lines += [
+        ablation("particles", "filter.particles=10,20,50,100,300,1000", HELD_OUT, model)
+        for model in MODELS
+    ]
+    lines += [
+        ablation("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT, model)
+        for model in MODELS
+    ]
+    noise = "propagate=learned,learned_and_gaussian filter.steps=10,100"
     lines += [ablation("noise", noise, HELD_OUT, model) for model in WITH_POSE]
-    lines += [Line("ladder", f"model={m} experiment=memorise sweep=ladder seed=0", into=m) for m in WITH_POSE]
+    lines += [
+        Line("ablation", f"model={m} experiment=memorize sweep=ablation seed=0", into=m)
+        for m in WITH_POSE
+    ]
     # does the gradient through the place harm where nothing multiplies it, and whose?
-    short = "model=patch_pf experiment=memorise sweep=ladder rung=c5_lesson,c6_place train_filter=short"
-    lines += [Line("place_gradient", f"{short} stages=none,only_motion,only_likelihood seed=0,1,2")]
-    for models, sweep, rungs in (
-        (WITH_POSE, "ladder", TELLING),
+    short = "model=patch_pf experiment=memorize sweep=ablation ablation=c5_lesson,c6_place train_filter=short"
+    lines += [
+        Line("place_gradient", f"{short} loss_schedule=none,only_motion,only_likelihood seed=0,1,2")
+    ]
+    for models, sweep, ablations in (
+        (WITH_POSE, "ablation", TELLING),
         (DETECTORS, "ladder_detect", TELLING_BOX),
     ):
-        seeds = f"experiment=memorise sweep={sweep} rung={rungs} seed=1,2"
+        seeds = f"experiment=memorize sweep={sweep} ablation={ablations} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
-        long = f"experiment=memorise sweep={sweep} rung=paper trainer.max_steps=2000 trainer.val_check_interval=2000 seed=0"
+        long = f"experiment=memorize sweep={sweep} ablation=paper trainer.max_steps=2000 trainer.val_check_interval=2000 seed=0"
         lines += [Line("paper_longer", f"model={','.join(models)} {long}", into=sweep)]
     lines += [
-        Line("untrained", f"{memorise} variant=paper {UNTRAINED} seed=1,2,3,4"),
-        Line("memorise", f"{memorise} variant=paper seed=1,2,3,4"),
+        Line("untrained", f"{memorize} variant=paper {UNTRAINED} seed=1,2,3,4"),
+        Line("memorize", f"{memorize} variant=paper seed=1,2,3,4"),
         Line("held_out", f"{FOUR} seed=1,2"),
-        Line("held_out_less", "model=patch_pf rung=m9_context,pose_m17_fragments,m11_muon,m5_lesson seed=0"),
-        ablation("held_out_less", "resample=never", HELD_OUT, "patch_pf"),
-        Line("patch", "model=patch_pf experiment=memorise sweep=patch seed=0"),
+        Line(
+            "held_out_less",
+            "model=patch_pf ablation=m9_context,pose_m17_fragments,m11_muon,m5_lesson seed=0",
+        ),
+        ablation("held_out_less", "resample=none", HELD_OUT, "patch_pf"),
+        Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     if meshes:
-        lines += [Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")]
+        lines += [
+            Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")
+        ]
     if meshes and frames:
         real = f"data=ycb_video data.root={frames} data.meshes={meshes}"
-        runs = {model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0" for model in MODELS}
+        runs = {
+            model: f"cracker_box/experiment=cracker_box_pixels,model={model},seed=0"
+            for model in MODELS
+        }
         runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
     return lines
@@ -95,9 +132,18 @@ def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
     """Return what to run, from the project's folder."""
     out = root / line.table / line.into
     if line.of is None:
-        return ["train.py", "-m", *line.words.split(), f"out={out}", "console=plain", *more]
-    quoted = str(evaluated(line.of, root)).replace("=", r"\=").replace(",", r"\,")  # Hydra's grammar
-    return ["evaluate.py", "-m", f"checkpoint={quoted}", *line.words.split(), f"out={out}", "console=plain", *more]
+        return ["train.py", "-m", *line.words.split(), f"out={out}", "console=json", *more]
+    # Hydra's grammar
+    quoted = str(evaluated(line.of, root)).replace("=", r"\=").replace(",", r"\,")
+    return [
+        "evaluate.py",
+        "-m",
+        f"checkpoint={quoted}",
+        *line.words.split(),
+        f"out={out}",
+        "console=json",
+        *more,
+    ]
 
 
 def evaluated(of: str, root: Path) -> Path:
@@ -106,23 +152,37 @@ def evaluated(of: str, root: Path) -> Path:
 
 
 def waits(line: Line, root: Path) -> bool:
-    """Tell whether an evaluation has no checkpoint yet, or all its points were evaluated after that was made."""
+    """Tell whether an evaluation has no checkpoint yet, or all its points were evaluated after that
+    was made.
+    """
     if line.of is None:
         return False
     checkpoint = evaluated(line.of, root)
     if line.of != str(checkpoint) and not (root / line.of / "metrics.json").is_file():
         return True
     made = checkpoint.stat().st_mtime
-    done = [path for path in (root / line.table / line.into).glob("*/metrics.json") if path.stat().st_mtime > made]
-    return len(done) >= math.prod(len(word.split("=", 1)[1].split(",")) for word in line.words.split())
+    done = [
+        path
+        for path in (root / line.table / line.into).glob("*/metrics.json")
+        if path.stat().st_mtime > made
+    ]
+    return len(done) >= math.prod(
+        len(word.split("=", 1)[1].split(",")) for word in line.words.split()
+    )
 
 
 def main() -> int:
     """Run the plan; the status is that of the worst line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("more", nargs="*")
-    parser.add_argument("--only", action="append", choices=sorted({line.table for line in plan("DIR", "DIR")}))
-    parser.add_argument("--meshes", help="a folder of YCB's meshes: learn the real cracker box from renders as well")
+    parser.add_argument(
+        "--only", action="append", choices=sorted({line.table for line in plan("DIR", "DIR")})
+    )
+    parser.add_argument(
+        "--meshes", help="a folder of YCB's meshes: learn the real cracker box from renders as well"
+    )
     parser.add_argument("--frames", help="a folder of YCB-Video: and test on its photographs")
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
     parser.add_argument("--root", type=Path, default=Path("outputs/methods"))
@@ -135,8 +195,12 @@ def main() -> int:
         print(f"$ python {shlex.join(words)}", flush=True)
         if options.list or waits(line, options.root):
             continue
-        worst = max(worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode)
-        subprocess.run([sys.executable, "bench/methods_table.py", str(options.root)], cwd=HOME, check=False)
+        worst = max(
+            worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
+        )
+        subprocess.run(
+            [sys.executable, "bench/methods_table.py", str(options.root)], cwd=HOME, check=False
+        )
     return worst
 
 

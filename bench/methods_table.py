@@ -2,13 +2,14 @@
 
     python bench/methods_table.py [FOLDER] [--into docs/methods.md]
 
-FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table, searched for metrics.json. Runs
-that differ only in their seed become one row: mean, and half the range between the best and the worst seed. Tables replace
-what stands between `<!-- table: NAME -->` and `<!-- end -->`, NAME being the table's folder; one without runs stays.
-`<!-- table: NAME (on object %, AUROC) -->` has these figures only. What is the same in every row is left out.
-`relative time` is an image's, in units of the fastest row's: for tables whose runs were made one after another. `loss jumps`
-is the largest training loss over the median, of those logged in a training's second half.
-Every run by itself, with all its figures, goes to a CSV file beside the page.
+FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table,
+searched for metrics.json. Runs that differ only in their seed become one row: mean, and half the
+range between the best and the worst seed. Tables replace what stands between `<!-- table: NAME -->`
+and `<!-- end -->`, NAME being the table's folder; one without runs stays. `<!-- table: NAME (on
+object %, AUROC) -->` has these figures only. What is the same in every row is left out. `relative
+time` is an image's, in units of the fastest row's: for tables whose runs were made one after
+another. `loss jumps` is the largest training loss over the median, of those logged in a training's
+second half. Every run by itself, with all its figures, goes to a CSV file beside the page.
 """
 
 import argparse
@@ -36,7 +37,9 @@ KEYS = (
 
 def column(key: str) -> Callable[[dict[str, Any]], float | None]:
     """Return what reads a number out of a run, in the unit of its column."""
-    return lambda run: None if (value := read_number(run, key)) is None else find_metric(key).convert(value)
+    return lambda run: (
+        None if (value := read_number(run, key)) is None else find_metric(key).convert(value)
+    )
 
 
 COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
@@ -44,22 +47,38 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "CPU min": lambda m: m["training"]["steps"] * m["training"]["cpu_seconds_per_step"] / 60,
 }
 RELATIVE = "relative time"
-ASKED = {"loss jumps": lambda m: loss_jumps(Path(m["path"]).parent)}  # only where a mark asks for it, since it takes a while
+# only where a mark asks for it, since it takes a while
+ASKED = {"loss jumps": lambda m: loss_jumps(Path(m["path"]).parent)}
 NAMES = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")
 # these change no result
-SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads", "data.root", "data.meshes", "data.workers")
-RUNGS = Path(__file__).parents[1] / "conf" / "rung"
-# of rungs, by what their names begin with
+SILENT = (
+    "logger",
+    "callbacks",
+    "hydra",
+    "out",
+    "resume",
+    "console",
+    "threads",
+    "data.root",
+    "data.meshes",
+    "data.workers",
+)
+RUNGS = Path(__file__).parents[1] / "conf" / "ablation"
+# of ablations, by what their names begin with
 ORDER = ("paper", "s", "box_s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")
 
 
 def read_runs(folders: Iterable[Path]) -> list[dict[str, Any]]:
-    """Return the metrics of every run found, each with its overrides as a dictionary under `choices`."""
+    """Return the metrics of every run found, each with its overrides as a dictionary under
+    `choices`.
+    """
     runs = []
     for folder in folders:
         for path in sorted(folder.rglob("metrics.json")):
             metrics = json.loads(path.read_text())
-            pairs = [o.lstrip("+~").split("=", 1) for o in metrics.get("overrides") or [] if "=" in o]
+            pairs = [
+                o.lstrip("+~").split("=", 1) for o in metrics.get("overrides") or [] if "=" in o
+            ]
             metrics["choices"] = dict(pairs)
             metrics["path"] = str(path)
             runs.append(metrics)
@@ -69,27 +88,42 @@ def read_runs(folders: Iterable[Path]) -> list[dict[str, Any]]:
 def key_of(run: dict[str, Any]) -> tuple[str, str, str]:
     """Return method, variant, and whatever else was chosen, but for the seed."""
     choices = run["choices"]
-    rest = [f"{k}={v}" for k, v in choices.items() if k not in NAMES and k.split(".")[0] not in SILENT and k not in SILENT]
+    rest = [
+        f"{k}={v}"
+        for k, v in choices.items()
+        if k not in NAMES and k.split(".")[0] not in SILENT and k not in SILENT
+    ]
     name, variant = (run.get(key) or choices.get(key) or "?" for key in ("model", "variant"))
     return name, variant, " ".join(sorted(rest))
 
 
 def place(key: tuple[str, str, str]) -> tuple[Any, ...]:
-    """Return what rows are sorted by: methods and numbers as one counts them, rungs as the ladder climbs."""
+    """Return what rows are sorted by: methods and numbers as one counts them, ablations as the
+    ablation climbs.
+    """
     model, variant, rest = key
-    rung = re.search(rf"\brung=({'|'.join(ORDER)})(\d*)(?:_|\b)", rest)
-    climbed = (ORDER.index(rung[1]), int(rung[2] or 0)) if rung else (-1, 0)
-    return model, climbed, variant, [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", rest)]
+    ablation = re.search(rf"\brung=({'|'.join(ORDER)})(\d*)(?:_|\b)", rest)
+    climbed = (ORDER.index(ablation[1]), int(ablation[2] or 0)) if ablation else (-1, 0)
+    return (
+        model,
+        climbed,
+        variant,
+        [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", rest)],
+    )
 
 
 def told(rest: str) -> str:
-    """Return what was chosen, as it is typed; a rung also in its file's own words."""
+    """Return what was chosen, as it is typed; a ablation also in its file's own words."""
     if not rest:
         return ""
-    rung = re.search(r"\brung=(\w+)", rest)
-    file = RUNGS / f"{rung[1]}.yaml" if rung else None
+    ablation = re.search(r"\brung=(\w+)", rest)
+    file = RUNGS / f"{ablation[1]}.yaml" if ablation else None
     lines = file.read_text().splitlines() if file and file.is_file() else []
-    words = lines[1].removeprefix("# ").rstrip(".") if len(lines) > 1 and lines[1].startswith("# ") else ""
+    words = (
+        lines[1].removeprefix("# ").rstrip(".")
+        if len(lines) > 1 and lines[1].startswith("# ")
+        else ""
+    )
     return f"`{rest}`" + (f" {words}" if words else "")
 
 
@@ -117,8 +151,14 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
     rows = defaultdict(list)
     for run in runs:
         rows[key_of(run)].append(run)
-    known = COLUMNS | ASKED | ({RELATIVE: relative_time(rows.values())} if RELATIVE in figures else {})
-    shown = {name: known[name] for name in figures if any(cell([run], known[name]) != "–" for run in runs)}
+    known = (
+        COLUMNS | ASKED | ({RELATIVE: relative_time(rows.values())} if RELATIVE in figures else {})
+    )
+    shown = {
+        name: known[name]
+        for name in figures
+        if any(cell([run], known[name]) != "–" for run in runs)
+    }
     typed = [set(rest.split()) for _, _, rest in rows]
     common = set.intersection(*typed) if len(rows) > 1 else set()  # is said once, above the table
     columns: dict[str, list[str]] = defaultdict(list)
@@ -126,8 +166,12 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
         same = rows[model, variant, rest]
         columns["method"].append(model)
         columns["variant"].append(variant)
-        columns["changed"].append(told(" ".join(part for part in rest.split() if part not in common)))
-        columns["seeds"].append(str(len({str(run.get("seed", run["choices"].get("seed"))) for run in same})))
+        columns["changed"].append(
+            told(" ".join(part for part in rest.split() if part not in common))
+        )
+        columns["seeds"].append(
+            str(len({str(run.get("seed", run["choices"].get("seed"))) for run in same}))
+        )
         for name, read in shown.items():
             columns[name].append(cell(same, read))
     if len(set(columns["variant"])) == 1:
@@ -140,17 +184,25 @@ def table(runs: list[dict[str, Any]], figures: Sequence[str] = tuple(COLUMNS)) -
 
 def relative_time(rows: Iterable[list[dict[str, Any]]]) -> Callable[[dict[str, Any]], float]:
     """Return the figure of a run that is its time for an image, in units of the fastest row's."""
-    times = [[run["seconds_per_image"] for run in row if "seconds_per_image" in run] for row in rows]
+    times = [
+        [run["seconds_per_image"] for run in row if "seconds_per_image" in run] for row in rows
+    ]
     least = min((sum(row) / len(row) for row in times if row), default=1.0)
     return lambda run: run["seconds_per_image"] / least
 
 
 @cache
 def loss_jumps(run: Path) -> float | None:
-    """Return the largest training loss over the median, of those logged in the second half; None where none was logged."""
+    """Return the largest training loss over the median, of those logged in the second half; None
+    where none was logged.
+    """
     curve = read_events(run)[0].get("train/total")
     late = (
-        [value for step, value in zip(curve.steps, curve.values, strict=True) if 2 * step >= curve.steps[-1]]
+        [
+            value
+            for step, value in zip(curve.steps, curve.values, strict=True)
+            if 2 * step >= curve.steps[-1]
+        ]
         if curve
         else []
     )
@@ -158,7 +210,9 @@ def loss_jumps(run: Path) -> float | None:
 
 
 def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
-    """Return all tables' runs as CSV: a row a run, all figures to six digits, empty where a run has none."""
+    """Return all tables' runs as CSV: a row a run, all figures to six digits, empty where a run has
+    none.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     columns = {
@@ -170,23 +224,39 @@ def sheet(found: dict[str, list[dict[str, Any]]]) -> str:
     }
     writer.writerow(["table", "method", "variant", "changed", *columns, "device", "torch"])
     for name, runs in found.items():
-        for run in sorted(runs, key=lambda run: (place(key_of(run)), figure(run, columns["seed"]) or 0)):
+        for run in sorted(
+            runs, key=lambda run: (place(key_of(run)), figure(run, columns["seed"]) or 0)
+        ):
             figures = [figure(run, read) for read in columns.values()]
             texts = ["" if value is None else f"{value:.6g}" for value in figures]
-            writer.writerow([name, *key_of(run), *texts, run.get("device"), (run.get("versions") or {}).get("torch")])
+            writer.writerow(
+                [
+                    name,
+                    *key_of(run),
+                    *texts,
+                    run.get("device"),
+                    (run.get("versions") or {}).get("torch"),
+                ]
+            )
     return out.getvalue()
 
 
 def insert(page: str, name: str, runs: list[dict[str, Any]]) -> str:
-    """Return the page with the table called `name` made anew, of the figures that its mark asks for."""
+    """Return the page with the table called `name` made anew, of the figures that its mark asks
+    for.
+    """
     return fill(page, name, lambda figures: table(runs, figures or tuple(COLUMNS)))
 
 
 def fill(page: str, name: str, make: Callable[[Sequence[str]], str]) -> str:
-    """Return the page with another table called `name`: made from the figures that its mark asks for, if any."""
+    """Return the page with another table called `name`: made from the figures that its mark asks
+    for, if any.
+    """
 
     def filled(found: re.Match[str]) -> str:
-        asked = [figure.strip() for figure in found["figures"].split(",")] if found["figures"] else []
+        asked = (
+            [figure.strip() for figure in found["figures"].split(",")] if found["figures"] else []
+        )
         return f"{found['mark']}\n{make(asked)}\n<!-- end -->"
 
     return re.sub(mark(name) + r"\n.*?<!-- end -->", filled, page, flags=re.DOTALL)
@@ -199,12 +269,18 @@ def mark(name: str) -> str:
 
 def main() -> int:
     """Read the runs, write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/methods"))
     parser.add_argument("--into", type=Path, default=Path("docs/methods.md"))
     options = parser.parse_args()
     page = options.into.read_text()
-    found = {folder.name: read_runs([folder]) for folder in sorted(options.folder.glob("*")) if folder.is_dir()}
+    found = {
+        folder.name: read_runs([folder])
+        for folder in sorted(options.folder.glob("*"))
+        if folder.is_dir()
+    }
     found = {name: runs for name, runs in found.items() if runs}
     for name, runs in found.items():
         missing = "" if re.search(mark(name), page) else f" (no such table in {options.into})"

@@ -1,4 +1,6 @@
-"""Write a toy duck for docs/tour.md, 19 cm long, to a mesh file: python docs/duck.py outputs/tour/meshes/duck.ply."""
+"""Write a toy duck for docs/tour.md, 19 cm long, to a mesh file: python docs/duck.py
+outputs/tour/meshes/duck.ply.
+"""
 
 import sys
 from pathlib import Path
@@ -6,8 +8,16 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-YELLOW, ORANGE, BLACK, BLUE, RED = (242, 196, 40), (228, 92, 28), (20, 20, 24), (48, 110, 200), (196, 44, 70)
-BALLS = (  # half axes and centre [m], the duck's beak towards x and its feet at z = 0; its wings tell left from right
+YELLOW, ORANGE, BLACK, BLUE, RED = (
+    (242, 196, 40),
+    (228, 92, 28),
+    (20, 20, 24),
+    (48, 110, 200),
+    (196, 44, 70),
+)
+# half axes and center [m], the duck's beak towards x and its feet at z = 0; its wings tell left
+# from right
+BALLS = (
     ((0.080, 0.055, 0.050), (0.000, 0.000, 0.050), YELLOW),
     ((0.040, 0.038, 0.038), (0.052, 0.000, 0.116), YELLOW),
     ((0.024, 0.020, 0.008), (0.096, 0.000, 0.110), ORANGE),
@@ -20,13 +30,13 @@ BALLS = (  # half axes and centre [m], the duck's beak towards x and its feet at
 
 
 def duck() -> trimesh.Trimesh:
-    """Return the duck, in metres, coloured by vertex."""
+    """Return the duck, in meters, colored by vertex."""
     parts = []
-    for half_axes, centre, colour in BALLS:
+    for half_axes, center, color in BALLS:
         ball = trimesh.creation.icosphere(subdivisions=3)
         ball.apply_transform(np.diag([*half_axes, 1.0]))
-        ball.apply_translation(centre)
-        ball.visual.vertex_colors = np.tile([*colour, 255], (len(ball.vertices), 1)).astype(np.uint8)
+        ball.apply_translation(center)
+        ball.visual.vertex_colors = np.tile([*color, 255], (len(ball.vertices), 1)).astype(np.uint8)
         parts.append(ball)
     return trimesh.util.concatenate(parts)
 

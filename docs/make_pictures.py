@@ -3,8 +3,9 @@
     python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
                                  [--methods outputs/methods]
 
-Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and its particles'
-way there.  Of docs/tour.md's commands, and of docs/methods.md's runs, where they were made: what they left.
+Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and
+its particles' way there.  Of docs/tour.md's commands, and of docs/methods.md's runs, where they
+were made: what they left.
 """
 
 import argparse
@@ -21,28 +22,29 @@ import numpy as np
 import torch
 from PIL import Image
 
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.machine import settle
+from posefilter.cli.predict import as_batch
+from posefilter.cli.train import quiet
 from posefilter.data.frames import Sample
-from posefilter.data.generate import generate
-from posefilter.data.meshes import MeshStore
-from posefilter.data.readers import open_reader
+from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, draw_row, full_view
 from posefilter.figures.layout import TITLE, draw_text
 from posefilter.figures.overlay import Shape, draw_poses, list_axes
 from posefilter.figures.particles import draw_iterations
+from posefilter.meshes.store import MeshStore
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.report.charts import LIGHT, Line, Panel, draw_chart
 from posefilter.report.sweeps import read_sweep
-from posefilter.run.machine import settle
-from posefilter.run.method import method_of, read_checkpoint
-from posefilter.run.predict import as_batch
-from posefilter.run.train import quiet
+from posefilter.synthetic.generate import generate
 from posefilter.types import Batch, Trace
 
 HOME = Path(__file__).parents[1]
-SEED, FRAMES = 20_000_101, 6  # of the rendered scenes: a seed that no training uses, and a scene a frame
+# of the rendered scenes: a seed that no training uses, and a scene a frame
+SEED, FRAMES = 20_000_101, 6
 EXAMPLE = 3  # which of them belief and particles are drawn of
 WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
 TOUR = {  # what docs/tour.md shows -> what its commands leave
@@ -51,20 +53,30 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_train": "run/figures/validation_overlays.jpg",
     "tour_predict": "prediction/belief.png",
 }
-RUNGS = {  # the rungs of docs/methods.md's ladder that its picture shows, and what to say of each
+# the ablations of docs/methods.md's ablation that its picture shows, and what to say of each
+RUNGS = {
     "paper": "The paper's",
     "c5_lesson": "Told the way, and few arrive",
     "c6_place": "No gradient through the place",
     "c9_context": "And global context",
 }
-METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")  # those with a pose first: each has one color in all charts
-SIZES = {"filter.particles": "particles", "filter.steps": "iterations"}  # of a filter, swept when it is tested; its table
+# those with a pose first: each has one color in all charts
+METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")
+# of a filter, swept when it is tested; its table
+SIZES = {"filter.particles": "particles", "filter.steps": "iterations"}
 FIGURES = {  # of these sweeps: title, unit, and by what to multiply; None: of one over the least
     "particles_on_object": ("Particles on the object", "%", 100),
     "add/auc": ("ADD AUC", "", 1),
     "seconds_per_image": ("Time of an image", "the least is 1", None),
 }
-BROWSER = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+BROWSER = next(
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (found := shutil.which(name))
+    ),
+    None,
+)
 
 
 class Found(NamedTuple):
@@ -78,17 +90,32 @@ class Found(NamedTuple):
 def main() -> int:
     """Make all that can be made; say what was left as it is, and why."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--checkpoint", type=Path, default=HOME / "weights" / "003_cracker_box.ckpt")
-    parser.add_argument("--scenes", type=Path, help="rendered frames in the FAT format (default: docs/scenes/<object>)")
-    parser.add_argument("--meshes", default="builtin", help="to render scenes from, where there are none yet")
-    parser.add_argument("--tour", type=Path, default=Path("outputs/tour"), help="where docs/tour.md's commands wrote")
-    parser.add_argument("--methods", type=Path, default=Path("outputs/methods"), help="where bench/methods.py wrote")
+    parser.add_argument(
+        "--checkpoint", type=Path, default=HOME / "weights" / "003_cracker_box.ckpt"
+    )
+    parser.add_argument(
+        "--scenes",
+        type=Path,
+        help="rendered frames in the FAT format (default: docs/scenes/<object>)",
+    )
+    parser.add_argument(
+        "--meshes", default="builtin", help="to render scenes from, where there are none yet"
+    )
+    parser.add_argument(
+        "--tour",
+        type=Path,
+        default=Path("outputs/tour"),
+        help="where docs/tour.md's commands wrote",
+    )
+    parser.add_argument(
+        "--methods", type=Path, default=Path("outputs/methods"), help="where bench/methods.py wrote"
+    )
     parser.add_argument("--out", type=Path, default=HOME / "docs" / "pictures")
     said = parser.parse_args()
     try:
         of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
         of_tour(said.tour, said.out)
-        of_ladder(said.methods / "ladder" / "patch_pf", said.out)
+        of_ladder(said.methods / "ablation" / "patch_pf", said.out)
         of_filters(said.methods, said.out)
     except UserError as error:
         print(f"make_pictures: {error}", file=sys.stderr)
@@ -105,25 +132,42 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     name = method.model.name
     scenes = scenes or HOME / "docs" / "scenes" / name
     if not scenes.is_dir():
-        generate(scenes, FRAMES, meshes=meshes, object=name, seed=SEED, size=(320, 240), frames_per_scene=1, workers=1)
+        generate(
+            scenes,
+            FRAMES,
+            meshes=meshes,
+            object=name,
+            seed=SEED,
+            size=(320, 240),
+            frames_per_scene=1,
+            workers=1,
+        )
     store = MeshStore(meshes)
     shape: Shape = store.load(name) if name in store.names() else method.model.hull
     found = list(run(method, kept["recipe"]["settings"]["data"], scenes, name))
     write(out / "predictions.jpg", predictions(found, method, shape))
     one = found[min(EXAMPLE, len(found) - 1)]
     sample, K = one.sample, one.sample.intrinsics
-    write(out / "belief.jpg", draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object))
+    write(
+        out / "belief.jpg",
+        draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object),
+    )
     write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
 
 
 def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:
-    """Yield what the filter makes of each frame of a folder of scenes; the frames are of the size that it was trained on."""
+    """Yield what the filter makes of each frame of a folder of scenes; the frames are of the size
+    that it was trained on.
+    """
     reader = open_reader("scenes", scenes, name)
     for i in range(len(reader.records())):
         sample = reader.read(i)
         width = data.get("image_width") or sample.rgb.shape[1]
         if sample.rgb.shape[1] != width:
-            raise UserError(f"{scenes}: frames are {sample.rgb.shape[1]} pixels wide, but the filter takes {width}")
+            raise UserError(
+                f"{scenes}: frames are {sample.rgb.shape[1]} pixels wide, but the "
+                f"filter takes {width}"
+            )
         K = torch.from_numpy(sample.intrinsics).double()
         batch = as_batch(sample.rgb, sample.depth, K, *sample.depth.shape)
         method.seed = 0
@@ -140,12 +184,21 @@ def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.n
         error = 1000 * float(add(trace.belief.best, truth, method.model.points)[0])
         view = full_view(height, width, 460)
         pose = trace.belief.best[0].double().numpy()
-        drawn = draw_poses(sample.rgb, sample.intrinsics, pose, shape, view, truth=sample.camera_from_object)
+        drawn = draw_poses(
+            sample.rgb, sample.intrinsics, pose, shape, view, truth=sample.camera_from_object
+        )
         tiles.append(np.concatenate([drawn, draw_row(460, f"ADD {error:.1f} mm")]))
     figure = arrange_grid(tiles, 3)
     legend = [("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()]
     return np.concatenate(
-        [draw_row(figure.shape[1], f"{method.model.name}: {len(found)} scenes that no training saw", legend), figure]
+        [
+            draw_row(
+                figure.shape[1],
+                f"{method.model.name}: {len(found)} scenes that no training saw",
+                legend,
+            ),
+            figure,
+        ]
     )
 
 
@@ -155,22 +208,31 @@ def of_tour(tour: Path, out: Path) -> None:
         if (tour / source).is_file():
             write(out / f"{name}.jpg", np.asarray(Image.open(tour / source).convert("RGB")))
         else:
-            print(f"left as it is: {name}.jpg (no {tour / source}: run the commands of docs/tour.md, or make tour)")
+            print(
+                f"left as it is: {name}.jpg (no {tour / source}: run the commands of "
+                f"docs/tour.md, or make tour)"
+            )
     page = tour / "run" / "report" / "report.html"
     if BROWSER is None or not page.is_file():
         reason = f"no {page}" if BROWSER else "no Chromium is installed"
         print(f"left as it is: tour_report.jpg ({reason})")
     else:
-        write(out / "tour_report.jpg", np.concatenate([screen(page, dark=False), screen(page, dark=True)], axis=1))
+        write(
+            out / "tour_report.jpg",
+            np.concatenate([screen(page, dark=False), screen(page, dark=True)], axis=1),
+        )
 
 
-def of_ladder(ladder: Path, out: Path) -> None:
-    """Write trajectories.jpg: where particles go on one image, at the rungs that explain it."""
+def of_ladder(ablation: Path, out: Path) -> None:
+    """Write trajectories.jpg: where particles go on one image, at the ablations that explain it."""
     tiles = []
-    for rung, words in RUNGS.items():
-        found = sorted(ladder.glob(f"*rung={rung},*/figures/test_trajectories_0.jpg"))
+    for ablation, words in RUNGS.items():
+        found = sorted(ablation.glob(f"*ablation={ablation},*/figures/test_trajectories_0.jpg"))
         if len(found) != 1:
-            print(f"left as it is: trajectories.jpg ({len(found)} runs of rung={rung} in {ladder}, not one)")
+            print(
+                f"left as it is: trajectories.jpg ({len(found)} runs of ablation={ablation} in "
+                f"{ablation}, not one)"
+            )
             return
         picture = np.asarray(Image.open(found[0]).convert("RGB"))
         tiles.append(np.concatenate([draw_text(words, TITLE - 4, bold=True), picture]))
@@ -181,15 +243,25 @@ def of_filters(methods: Path, out: Path) -> None:
     """Write filters.jpg: quality and cost over the filter's size, a row a setting, a line a method."""
     tiles = []
     for axis, table in SIZES.items():
-        found = {name: read_sweep(methods / table / name).jobs for name in METHODS if (methods / table / name).is_dir()}
+        found = {
+            name: read_sweep(methods / table / name).jobs
+            for name in METHODS
+            if (methods / table / name).is_dir()
+        }
         if not found:
             print(f"left as it is: filters.jpg (no {methods / table})")
             return
         for name, (title, unit, factor) in FIGURES.items():
-            have = {model: [job for job in jobs if name in job.numbers] for model, jobs in found.items()}
+            have = {
+                model: [job for job in jobs if name in job.numbers] for model, jobs in found.items()
+            }
             by = factor or 1 / min(job.numbers[name] for jobs in have.values() for job in jobs)
             lines = [
-                Line(model, [float(job.place[axis]) for job in jobs], [by * job.numbers[name] for job in jobs])
+                Line(
+                    model,
+                    [float(job.place[axis]) for job in jobs],
+                    [by * job.numbers[name] for job in jobs],
+                )
                 for model, jobs in have.items()
                 if jobs
             ]

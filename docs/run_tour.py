@@ -1,4 +1,7 @@
-"""Run the commands of docs/tour.md as they stand, one after the other: `make tour`.  The tests run them at toy size."""
+"""Run the commands of docs/tour.md as they stand, one after the other: `make tour`.
+
+The tests run them at toy size.
+"""
 
 import re
 import runpy
@@ -26,7 +29,9 @@ def settings(words: Sequence[str]) -> dict[str, str]:
 
 
 def call(words: Sequence[str], more: Mapping[str, Sequence[str]]) -> int:
-    """Run `python SCRIPT ...` in this process, with more settings by the script's name; return its exit status."""
+    """Run `python SCRIPT ...` in this process, with more settings by the script's name; return its
+    exit status.
+    """
     assert words[0] == "python", words
     script = HOME / words[1]
     with patch.object(sys, "argv", [str(script), *words[2:], *more.get(script.stem, ())]):
@@ -38,7 +43,9 @@ def call(words: Sequence[str], more: Mapping[str, Sequence[str]]) -> int:
 
 
 def main() -> int:
-    """Run the whole tour in processes of their own, each command shown before it runs; stop at the first that fails."""
+    """Run the whole tour in processes of their own, each command shown before it runs; stop at the
+    first that fails.
+    """
     for words in commands(PAGE.read_text()):
         print(f"\n$ {shlex.join(words)}", flush=True)
         if status := subprocess.run([sys.executable, *words[1:]], cwd=HOME, check=False).returncode:

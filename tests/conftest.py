@@ -37,5 +37,7 @@ def real_data() -> Path:
     """Return the folder of real frames and meshes, or skip: users of the project do not have it."""
     root = Path(os.environ.get("POSEFILTER_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not root.is_dir():
-        pytest.skip(f"no real data at {root}: set POSEFILTER_DATA to a folder with ycb/, ycbv/ and fat/")
+        pytest.skip(
+            f"no real data at {root}: set POSEFILTER_DATA to a folder with ycb/, ycbv/ and fat/"
+        )
     return root

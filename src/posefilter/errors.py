@@ -1,5 +1,22 @@
-"""The one exception that stands for a user's mistake: the commands print its single line and exit with status 2."""
+"""What stands for a user's mistake: the commands print its single line and exit with status 2."""
+
+from pathlib import Path
 
 
 class UserError(Exception):
-    """A mistake in data, configuration or arguments.  The message is one line: which file or key, and the likely cause."""
+    """A mistake in data, configuration or arguments.
+
+    The message is one line: which file or key, and the likely cause.
+    """
+
+
+class BadData(UserError):  # noqa: N818
+    """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
+
+    def __init__(self, path: Path, cause: str, detail: str = "") -> None:
+        super().__init__(f"{path}: {cause}" + (f" ({detail})" if detail else ""))
+        self.path, self.cause, self.detail = path, cause, detail
+
+    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
+        """Survive the way from one process to another."""
+        return BadData, (self.path, self.cause, self.detail)

@@ -1,7 +1,9 @@
-"""What flows through posefilter.  Plain NamedTuples of tensors: they collate, move and unpack as they are.
+"""What flows through posefilter.  Plain NamedTuples of tensors: they collate, move and unpack as
+they are.
 
-Letters: B images, N particles, T steps, L memory width, P points, *S the shape of one state: (2,) a pixel, (4, 4) a pose.
-Units: metres, radians, pixels.  `a_from_b` maps b into a, so neighbours cancel: camera_from_world @ world_from_object.
+Letters: B images, N particles, T steps, L latent width, P points, *S the shape of one state: (2,) a
+pixel, (4, 4) a pose. Units: meters, radians, pixels.  `a_from_b` maps b into a, so neighbors
+cancel: camera_from_world @ world_from_object.
 """
 
 from typing import NamedTuple
@@ -23,51 +25,64 @@ class Batch(NamedTuple):
 
 
 class ObjectModel(NamedTuple):
-    """What a method may know of the object: a few plain tensors, so that a checkpoint can carry them."""
+    """What a method may know of the object: a few plain tensors, so that a checkpoint can carry
+    them.
+    """
 
     name: str
     points: Tensor  # (P, 3) surface points that ADD is defined on [m], mesh frame
-    center: Tensor  # (3,) centre of the bounding box [m]
+    center: Tensor  # (3,) center of the bounding box [m]
     radius: float  # half the bounding box's diagonal [m]
     diameter: float  # largest distance between two points [m]
-    symmetries: Tensor  # (S, 4, 4) object_from_object transforms that change nothing, the identity first
+    # (S, 4, 4) object_from_object transforms that change nothing, the identity first
+    symmetries: Tensor
     hull: Tensor  # (V, 3) vertices of a convex hull [m], for outlines
 
 
-class Cloud(NamedTuple):
+class Particles(NamedTuple):
     """All that a filter remembers from one step to the next."""
 
     state: Tensor  # (B, N, *S)
-    memory: Tensor  # (B, N, L), the latent; L = 0 where a method has none
-    log_weights: Tensor  # (B, N), normalised: logsumexp over N is 0
+    latent: Tensor  # (B, N, L), the latent; L = 0 where a method has none
+    log_weights: Tensor  # (B, N), normalized: logsumexp over N is 0
     ancestors: Tensor  # (B, N) int64, each particle's parent in the previous cloud
 
 
-class Children(NamedTuple):
-    """What a resampling made of a weighted cloud of M: N children, each of one parent, or a mix of several."""
+class Resampled(NamedTuple):
+    """What a resampling made of a weighted cloud of M: N children, each of one parent, or a mix of
+    several.
+    """
 
-    parents: Tensor  # (B, N) int64, each child's (main) parent
-    log_weights: Tensor  # (B, N) that the children start with, normalised
-    shares: Tensor | None = None  # (B, N, M) how much of each parent a child is, rows sum to 1; None: all of its one parent
+    ancestors: Tensor  # (B, N) int64, each child's (main) parent
+    log_weights: Tensor  # (B, N) that the children start with, normalized
+    # (B, N, M) how much of each parent a child is, rows sum to 1; None: all of its one parent
+    shares: Tensor | None = None
 
 
 class Fragments(NamedTuple):
-    """Which point of the object each particle's own measured point may be: a fragment of the surface, and where in it."""
+    """Which point of the object each particle's own measured point may be: a fragment of the
+    surface, and where in it.
+    """
 
-    log_share: Tensor  # (B, N, K) log-probability of each fragment, given that the point is the object's
-    place: Tensor  # (B, N, K, 3) the object's point if it is that fragment, over the radius, from the object's centre
+    # (B, N, K) log-probability of each fragment, given that the point is the object's
+    log_share: Tensor
+    # (B, N, K, 3) the object's point if it is that fragment, over the radius, from the object's
+    # center
+    place: Tensor
     centers: Tensor  # (B, K, 3) the fragments' middles, likewise
     reach: Tensor  # () the fragments' mean reach, over the radius
 
 
-class Reading(NamedTuple):
+class ParticleOutput(NamedTuple):
     """What a method makes of each particle at one step."""
 
     log_likelihood: Tensor  # (B, N), up to a constant an image
-    motion: Tensor  # (B, N, D) learned displacement in the space's tangent; zeros where the filter only diffuses
+    # (B, N, D) learned displacement in the space's tangent; zeros where the filter only diffuses
+    displacement: Tensor
     pose: Tensor  # (B, N, 4, 4) camera_from_object that the particle stands for
-    memory: Tensor  # (B, N, L)
-    fragments: Fragments | None = None  # of the particles' own points; None where a method tells no more than `pose`
+    latent: Tensor  # (B, N, L)
+    # of the particles' own points; None where a method tells no more than `pose`
+    fragments: Fragments | None = None
 
 
 class Step(NamedTuple):
@@ -75,14 +90,15 @@ class Step(NamedTuple):
 
     number: int  # 0 for the first cloud
     steps: int  # how many clouds there will be
-    sigma: Tensor  # () or (B,) noise level, in the space's unit ([m] or [px]); falls where the filter anneals
+    # () or (B,) noise level, in the space's unit ([m] or [px]); falls where the filter anneals
+    sigma: Tensor
 
 
 class Belief(NamedTuple):
     """The filter's last word: weighted poses, and the one pose that it would bet on."""
 
     poses: Tensor  # (B, N, 4, 4) camera_from_object
-    log_weights: Tensor  # (B, N), normalised
+    log_weights: Tensor  # (B, N), normalized
     best: Tensor  # (B, 4, 4) the estimate
     score: Tensor  # (B,) confidence in the estimate, comparable between images of one method
 
@@ -90,8 +106,9 @@ class Belief(NamedTuple):
 class Trace(NamedTuple):
     """Every step of one run: the clouds, what was read of them, and the belief at the end."""
 
-    clouds: tuple[Cloud, ...]
-    readings: tuple[Reading, ...]
+    particles: tuple[Particles, ...]
+    outputs: tuple[ParticleOutput, ...]
     steps: tuple[Step, ...]
     belief: Belief
-    log_evidence: Tensor | None = None  # (B, T) log of the mean weight at each step; None where no filter made the trace
+    # (B, T) log of the mean weight at each step; None where no filter made the trace
+    log_evidence: Tensor | None = None

@@ -12,8 +12,10 @@ HOME = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def gradients(load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Return bench/gradients.py, which imports its neighbour."""
+def gradients(
+    load_script: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> ModuleType:
+    """Return bench/gradients.py, which imports its neighbor."""
     monkeypatch.syspath_prepend(str(HOME / "bench"))
     return load_script("bench/gradients.py")
 
@@ -35,10 +37,14 @@ def test_a_page_without_the_mark_is_refused_before_anything_is_measured(
     assert "no mark" in capsys.readouterr().err
 
 
-def test_the_page_gets_a_row_a_rung(gradients, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_gets_a_row_a_rung(
+    gradients, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- table: gradients -->\nold\n<!-- end -->\nb\n")
-    monkeypatch.setattr(gradients, "gradient", lambda model, sweep, rung, steps, more: 3.0 * steps)
+    monkeypatch.setattr(
+        gradients, "gradient", lambda model, sweep, ablation, steps, more: 3.0 * steps
+    )
     monkeypatch.setattr(sys, "argv", ["gradients.py", "--into", str(page)])
     assert gradients.main() == 0
     lines = page.read_text().splitlines()
@@ -52,17 +58,28 @@ def test_the_page_gets_a_row_a_rung(gradients, tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_a_place_that_is_taken_as_given_ends_the_growth(gradients, tmp_path: Path) -> None:
-    """With smooth glimpses and bounded motion each step multiplies the gradient; stopped at the place, it only adds up."""
+    """With smooth glimpses and bounded displacement each step multiplies the gradient; stopped at
+    the place, it only adds up.
+    """
     small = [
         f"data.root={tmp_path / 'scenes'}",
         "data.generate.frames=4",
         "data.generate.frames_per_scene=2",
         "data.limit_train=2",
     ]
-    small += ["data.limit_val=2", "data.limit_test=2", "data.batch_size=2", "filter.particles=8", "threads=1"]
+    small += [
+        "data.limit_val=2",
+        "data.limit_test=2",
+        "data.batch_size=2",
+        "filter.particles=8",
+        "threads=1",
+    ]
     growth = {}
-    for rung in ("c3_bounded", "c6_place"):
-        first, last = (gradients.gradient("cnn_patch", "ladder_detect", rung, steps, small) for steps in (1, 8))
-        growth[rung] = last / first
+    for ablation in ("c3_bounded", "c6_place"):
+        first, last = (
+            gradients.gradient("cnn_patch", "ladder_detect", ablation, steps, small)
+            for steps in (1, 8)
+        )
+        growth[ablation] = last / first
     assert growth["c3_bounded"] > 1000
     assert growth["c6_place"] < 10

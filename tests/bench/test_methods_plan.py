@@ -1,4 +1,6 @@
-"""The plan of runs behind the docs' tables: every job of it composes, and an evaluation waits for its checkpoint."""
+"""The plan of runs behind the docs' tables: every job of it composes, and an evaluation waits for
+its checkpoint.
+"""
 
 import importlib.util
 import itertools
@@ -7,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from posefilter.run.command import compose_job
+from posefilter.cli.command import compose_job
 
 HOME = Path(__file__).parents[2]
 spec = importlib.util.spec_from_file_location("methods", HOME / "bench" / "methods.py")
@@ -19,11 +21,17 @@ spec.loader.exec_module(methods)
 
 def jobs(words: str) -> list[tuple[str, ...]]:
     pairs = [word.split("=", 1) for word in words.split()]
-    return list(itertools.product(*([f"{key}={value}" for value in values.split(",")] for key, values in pairs)))
+    return list(
+        itertools.product(
+            *([f"{key}={value}" for value in values.split(",")] for key, values in pairs)
+        )
+    )
 
 
 @pytest.mark.parametrize(
-    "line", [line for line in methods.plan("DIR", "DIR") if line.of is None], ids=lambda line: line.words
+    "line",
+    [line for line in methods.plan("DIR", "DIR") if line.of is None],
+    ids=lambda line: line.words,
 )
 def test_every_line_composes(line, tmp_path: Path) -> None:
     for overrides in (jobs(line.words)[0], jobs(line.words)[-1]):
@@ -50,8 +58,12 @@ def test_an_evaluation_waits_for_its_checkpoint_and_is_not_done_twice(tmp_path: 
     checkpoint.touch()
     assert not methods.waits(line, tmp_path)
     os.utime(checkpoint, (1, 1))
-    points = [tmp_path / line.table / line.into / f"filter.particles={n}" / "metrics.json" for n in (50, 100)]
-    for point, waits in zip(points, (False, True), strict=True):  # cut short after the first, it goes on
+    points = [
+        tmp_path / line.table / line.into / f"filter.particles={n}" / "metrics.json"
+        for n in (50, 100)
+    ]
+    # cut short after the first, it goes on
+    for point, waits in zip(points, (False, True), strict=True):
         point.parent.mkdir(parents=True)
         point.touch()
         assert methods.waits(line, tmp_path) is waits

@@ -15,7 +15,7 @@ from posefilter.callbacks.diagnostics import Diagnostics, draw_diagnostics, has_
 from posefilter.figures.canvas import AXES
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.signs import SignsOfFailure
-from posefilter.types import Belief, Cloud, Reading, Step, Trace
+from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
 
 
 def trace(steps: int = 3) -> Trace:
@@ -23,21 +23,33 @@ def trace(steps: int = 3) -> Trace:
     state = torch.rand(2, 20, 2, generator=g) * 40
     even = torch.full((2, 20), -3.0)
     pose = torch.eye(4).expand(2, 20, 4, 4)
-    clouds = tuple(Cloud(state + 30 * t, torch.zeros(2, 20, 0), even, torch.arange(20).expand(2, 20)) for t in range(steps))
-    readings = tuple(Reading(even, torch.full((2, 20, 2), 30.0), pose, torch.zeros(2, 20, 0)) for _ in range(steps))
+    history = tuple(
+        Particles(state + 30 * t, torch.zeros(2, 20, 0), even, torch.arange(20).expand(2, 20))
+        for t in range(steps)
+    )
+    outputs = tuple(
+        ParticleOutput(even, torch.full((2, 20, 2), 30.0), pose, torch.zeros(2, 20, 0))
+        for _ in range(steps)
+    )
     belief = Belief(pose, even, pose[:, 0], even[:, 0])
-    return Trace(clouds, readings, tuple(Step(t, steps, torch.tensor(0.0)) for t in range(steps)), belief)
+    return Trace(
+        history, outputs, tuple(Step(t, steps, torch.tensor(0.0)) for t in range(steps)), belief
+    )
 
 
 def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     batch, run = scenes(2), trace()
     logged: dict[str, float] = {}
     logger = SimpleNamespace(log_metrics=lambda values, step: logged.update(values))
-    trainer = SimpleNamespace(loggers=[logger], global_step=7, sanity_checking=False, is_global_zero=True)
+    trainer = SimpleNamespace(
+        loggers=[logger], global_step=7, sanity_checking=False, is_global_zero=True
+    )
     signs = SignsOfFailure()
     signs.update(run, batch)
     hull = torch.zeros(4, 3)
-    method = SimpleNamespace(scores={"signs": signs}, space=PixelSpace(), model=SimpleNamespace(hull=hull))
+    method = SimpleNamespace(
+        scores={"signs": signs}, space=PixelSpace(), model=SimpleNamespace(hull=hull)
+    )
     callback = Diagnostics(tmp_path, images=1)
     callback.on_validation_epoch_start(trainer, method)  # type: ignore[arg-type]
     callback.on_validation_epoch_end(trainer, method)  # type: ignore[arg-type]
@@ -46,19 +58,27 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     assert logged["signs/off_frame/last"] > 0.9
     assert logged["signs/on_object/last"] == 0
     files = sorted(path.name for path in tmp_path.iterdir())
-    assert files == ["test_animation_0.gif", "test_diagnostics.jpg", "test_trajectories_0.jpg", "validation_diagnostics.jpg"]
+    assert files == [
+        "test_animation_0.gif",
+        "test_diagnostics.jpg",
+        "test_trajectories_0.jpg",
+        "validation_diagnostics.jpg",
+    ]
     with Image.open(tmp_path / "test_animation_0.gif") as animation:
         assert animation.n_frames == 5  # three clouds, two frames from one to the next
     picture = draw_diagnostics(signs.compute(), "signs")
     red = np.argwhere((picture == AXES[0]).all(-1) & (np.arange(len(picture)) < 360)[:, None])
-    assert red[red[:, 1] > red[:, 1].max() - 3][:, 0].mean() < 110  # off the frame, at last: nearly all, at the top
+    # off the frame, at last: nearly all, at the top
+    assert red[red[:, 1] > red[:, 1].max() - 3][:, 0].mean() < 110
     green = np.argwhere((picture == AXES[1]).all(-1) & (np.arange(len(picture)) < 400)[:, None])
     assert green[green[:, 1] > green[:, 1].max() - 3][:, 0].mean() > 340  # on the object: none
 
 
 def test_methods_on_poses_are_left_alone(tmp_path: Path) -> None:
     run = trace()
-    poses = run._replace(clouds=tuple(c._replace(state=torch.eye(4).expand(2, 20, 4, 4)) for c in run.clouds))
+    poses = run._replace(
+        particles=tuple(c._replace(state=torch.eye(4).expand(2, 20, 4, 4)) for c in run.particles)
+    )
     assert has_pixel_particles(run)
     assert not has_pixel_particles(poses)
     assert not has_pixel_particles(None)

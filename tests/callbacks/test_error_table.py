@@ -1,4 +1,6 @@
-"""errors.csv: a row an image, from which the metrics come out again, and figures of the worst and best images."""
+"""errors.csv: a row an image, from which the metrics come out again, and figures of the worst and
+best images.
+"""
 
 import math
 from pathlib import Path
@@ -24,8 +26,12 @@ ROW = ImageError(1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.7
 
 
 def object_model(diameter: float = 0.2) -> ObjectModel:
-    points = torch.tensor([[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
-    return ObjectModel("box", points, torch.zeros(3), diameter / 2, diameter, torch.eye(4)[None], points)
+    points = torch.tensor(
+        [[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)]
+    )
+    return ObjectModel(
+        "box", points, torch.zeros(3), diameter / 2, diameter, torch.eye(4)[None], points
+    )
 
 
 def shifted(meters: list[float]) -> torch.Tensor:
@@ -60,15 +66,20 @@ class Method(torch.nn.Module):
 def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseErrors]:
     """Return the folder of a test of two batches, and the metric that its metrics.json would have."""
     monkeypatch.setattr("posefilter.callbacks.errors.PoseEstimator", Method)
-    monkeypatch.setattr("posefilter.callbacks.errors.find_shape", lambda trainer, method: method.model.hull)
+    monkeypatch.setattr(
+        "posefilter.callbacks.errors.find_shape", lambda trainer, method: method.model.hull
+    )
     errors = PoseErrors([object_model()])
-    records = [FrameRecord(f"scene_{i // 2}/{i:06d}", f"scene_{i // 2}", i // 2, i, 1, "box", 0, ()) for i in range(6)]
+    records = [
+        FrameRecord(f"scene_{i // 2}/{i:06d}", f"scene_{i // 2}", i // 2, i, 1, "box", 0, ())
+        for i in range(6)
+    ]
     data = SimpleNamespace(records=lambda split: records)
     trainer: Any = SimpleNamespace(datamodule=data, is_global_zero=True, loggers=[], global_step=3)
     method: Any = Method()
     method.model, method.tells_pose, method.scores = object_model(), True, {"poses": errors}
     method.seconds_per_image = [0.5]
-    method.particle_pixels = lambda cloud, batch: torch.full((len(batch.frame_id), 4, 2), 5.0)
+    method.particle_pixels = lambda particles, batch: torch.full((len(batch.frame_id), 4, 2), 5.0)
     table = ErrorTable(tmp_path, best=2, worst=2)
     table.on_test_epoch_start(trainer, method)
     K = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
@@ -84,7 +95,9 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
             visibility=torch.tensor([0.25, 0.5, 1.0]),
         )
         last = SimpleNamespace(log_weights=torch.zeros(3, 4))
-        trace = SimpleNamespace(clouds=[last], belief=SimpleNamespace(score=torch.arange(3.0), best=guess))
+        trace = SimpleNamespace(
+            particles=[last], belief=SimpleNamespace(score=torch.arange(3.0), best=guess)
+        )
         table.on_test_batch_end(trainer, method, trace, batch, 0)
     table.on_test_epoch_end(trainer, method)
     return tmp_path, errors
@@ -121,7 +134,14 @@ def test_a_selection_keeps_the_extremes_whatever_their_order() -> None:
 
 def test_lengths_are_in_meters_where_millimeters_get_long() -> None:
     lengths = (0.00123, 0.0356, 0.9994, 1.3561, 250.0, math.inf)
-    assert [format_length(x) for x in lengths] == ["1.23 mm", "35.6 mm", "999 mm", "1.36 m", "250 m", "missed"]
+    assert [format_length(x) for x in lengths] == [
+        "1.23 mm",
+        "35.6 mm",
+        "999 mm",
+        "1.36 m",
+        "250 m",
+        "missed",
+    ]
 
 
 def test_a_long_name_keeps_its_end() -> None:

@@ -34,7 +34,9 @@ TRUE = make_pose(exp_so3(torch.tensor([0.4, -0.3, 0.9])), torch.tensor([0.02, 0.
 
 
 def model() -> ObjectModel:
-    hull = CENTER + torch.tensor([[x, y, z] for x in (-0.05, 0.05) for y in (-0.08, 0.08) for z in (-0.1, 0.1)])
+    hull = CENTER + torch.tensor(
+        [[x, y, z] for x in (-0.05, 0.05) for y in (-0.08, 0.08) for z in (-0.1, 0.1)]
+    )
     return ObjectModel("box", hull, CENTER, 0.14, 0.28, torch.eye(4)[None], hull)
 
 
@@ -55,7 +57,9 @@ class Oracle:
     def __init__(self, truth: Tensor) -> None:
         self.truth, self.space = truth, PoseSpace(tuple(CENTER.tolist()), 0.14)
 
-    def score_poses(self, scene: object, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+    def score_poses(
+        self, scene: object, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
         return -0.5 * (self.space.distance(poses, self.truth) / sigma).square()
 
 
@@ -70,19 +74,24 @@ def test_slices_of_an_oracle_have_their_top_at_the_truth_and_its_exact_shape() -
             assert values == pytest.approx(exact, abs=2e-3 * abs(exact.min()))
         for values in field.turns[k]:
             assert field.degrees[values.argmax()] == 0
-            assert values == pytest.approx(-0.5 * (np.deg2rad(field.degrees) * 0.14 / sigma) ** 2, rel=2e-3, abs=2e-3)
+            assert values == pytest.approx(
+                -0.5 * (np.deg2rad(field.degrees) * 0.14 / sigma) ** 2, rel=2e-3, abs=2e-3
+            )
 
 
 def test_an_oracle_that_is_told_a_shifted_pose_has_its_top_there() -> None:
     wrong = TRUE @ make_pose(torch.eye(3), torch.tensor([0.0, 0.03, -0.03]))
-    field = evaluate_pose_field(Oracle(wrong), None, TRUE, model(), (0.01,), cells=9)  # 15 mm a cell
+    # 15 mm a cell
+    field = evaluate_pose_field(Oracle(wrong), None, TRUE, model(), (0.01,), cells=9)
     assert np.unravel_index(field.planes[0, 2].argmax(), (9, 9)) == (2, 6)  # rows z, columns y
-    assert field.planes[0, 2].max() == pytest.approx(0.5 * 18, rel=1e-2)  # it outscores the truth, and that is told
+    # it outscores the truth, and that is told
+    assert field.planes[0, 2].max() == pytest.approx(0.5 * 18, rel=1e-2)
 
 
 def test_shifts_are_along_the_objects_axes_and_turns_about_its_center() -> None:
     poses = shift_pose(TRUE, 0.1, 3)
-    moved = transform(invert(TRUE), origin_of(poses[1, 2, 0], CENTER)[None])[0] - CENTER  # plane x-z
+    # plane x-z
+    moved = transform(invert(TRUE), origin_of(poses[1, 2, 0], CENTER)[None])[0] - CENTER
     assert moved.tolist() == pytest.approx([-0.1, 0.0, 0.1], abs=1e-6)
     poses = turn_pose(TRUE, CENTER, torch.tensor([0.5]))
     assert (origin_of(poses, CENTER) - origin_of(TRUE, CENTER)).abs().max() < 1e-6
@@ -116,15 +125,21 @@ def test_a_pixel_is_read_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("depthwise", [False, True])
-def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_favours(depthwise: bool) -> None:
+def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_favors(
+    depthwise: bool,
+) -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
-    field = evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise)
+    field = evaluate_point_field(
+        Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise
+    )
     a, b = field.plane
     row, column = np.unravel_index(field.judged[0].argmax(), field.judged[0].shape)
     line = np.linspace(-field.reach, field.reach, field.judged.shape[1])
     assert abs(line[column] - float(Knows.place[a])) < line[1] - line[0]
     assert abs(line[row] - float(Knows.place[b])) < line[1] - line[0]
-    assert field.own[0] == pytest.approx(1 - np.linalg.norm(field.place - Knows.place.numpy()) / 0.14, abs=1e-5)
+    assert field.own[0] == pytest.approx(
+        1 - np.linalg.norm(field.place - Knows.place.numpy()) / 0.14, abs=1e-5
+    )
     ray = TRUE[:3, :3].T @ torch.tensor([(40 - 31.5) / 60, (30 - 23.5) / 60, 1.0])
     assert (int(ray.abs().argmax()) in field.plane) == depthwise
 
@@ -132,7 +147,9 @@ def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_fa
 def test_the_papers_likelihood_has_a_field_too() -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
     with torch.no_grad():
-        field = evaluate_point_field(PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,))
+        field = evaluate_point_field(
+            PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,)
+        )
     assert np.isfinite(field.judged).all()
     assert field.judged.std() > 0
 
@@ -144,7 +161,10 @@ def test_pixels_are_chosen_well_on_the_object_and_near_it() -> None:
     assert 22 <= on[1] <= 28
     assert not bool(scene().mask[0, 0, off[1], off[0]])
     assert off[1] >= 6  # where depth is known
-    assert choose_pixels(scene()._replace(mask=torch.zeros(1, 1, H, W, dtype=torch.bool)), model()) == []
+    assert (
+        choose_pixels(scene()._replace(mask=torch.zeros(1, 1, H, W, dtype=torch.bool)), model())
+        == []
+    )
 
 
 def test_picture_of_poses_is_brightest_at_the_truth_and_black_where_that_is_outscored() -> None:
@@ -162,14 +182,26 @@ def test_picture_of_poses_is_brightest_at_the_truth_and_black_where_that_is_outs
 
 def test_picture_of_points_shows_each_slice() -> None:
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
-    fields = [evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), d) for d in (False, True)]
-    picture = draw_point_field(fields, np.full((H, W, 3), 128, np.uint8), (model().points - CENTER).numpy(), "title")
+    fields = [
+        evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), d)
+        for d in (False, True)
+    ]
+    picture = draw_point_field(
+        fields, np.full((H, W, 3), 128, np.uint8), (model().points - CENTER).numpy(), "title"
+    )
     red = (picture[..., 0] > 120) & (picture[..., 1] < 60) & (picture[..., 2] < 80)
-    assert red.sum() > 200  # the favoured places
+    assert red.sum() > 200  # the favored places
 
 
 def test_ticks_are_round() -> None:
-    assert [round_down(x) for x in (72.0, 216.0, -6.7, 0.0, 1.0, 0.034)] == [70, 200, -6, 0, 1, pytest.approx(0.03)]
+    assert [round_down(x) for x in (72.0, 216.0, -6.7, 0.0, 1.0, 0.034)] == [
+        70,
+        200,
+        -6,
+        0,
+        1,
+        pytest.approx(0.03),
+    ]
 
 
 def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() -> None:
@@ -178,12 +210,18 @@ def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() 
             assert points.context is not None
             return points.context[..., 0]  # log of the share of the fragment there
 
-    centers = torch.tensor([[[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]])  # two halves, along the object's x
+    # two halves, along the object's x
+    centers = torch.tensor([[[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]])
     share = torch.tensor([0.9, 0.1]).log().expand(1, 6, 8, 2)
-    said = Coordinates(torch.zeros(1, 6, 8), share, torch.zeros(1, 6, 8, 2, 3), centers, torch.zeros(1, 6, 8, 4))
+    said = Coordinates(
+        torch.zeros(1, 6, 8), share, torch.zeros(1, 6, 8, 2, 3), centers, torch.zeros(1, 6, 8, 4)
+    )
     image = lay_out(scene().rgb, scene().depth, scene().intrinsics, said)
-    field = evaluate_point_field(Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True)
+    field = evaluate_point_field(
+        Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True
+    )
     assert 0 in field.plane
-    along_x = field.judged[0].mean(0 if field.plane[0] == 0 else 1)  # columns go along the plane's first axis
+    # columns go along the plane's first axis
+    along_x = field.judged[0].mean(0 if field.plane[0] == 0 else 1)
     assert along_x[:13] == pytest.approx(math.log(0.9), abs=1e-3)
     assert along_x[-13:] == pytest.approx(math.log(0.1), abs=1e-3)

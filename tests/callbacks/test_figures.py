@@ -24,24 +24,26 @@ from posefilter.figures.canvas import TRUTH
 from posefilter.figures.layout import THUMBNAIL, TITLE, WIDTH, tile_width
 from posefilter.figures.overlay import view_poses
 from posefilter.filters.estimate import Mean
-from posefilter.filters.initialise import FromProposals
+from posefilter.filters.initialize import FromProposals
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propose import Gaussian
+from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweigh import Annealed
+from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 H, W, IMAGES = 48, 64, 8
 
 
 def model() -> ObjectModel:
-    hull = torch.tensor([[x, y, z] for x in (-0.05, 0.05) for y in (-0.08, 0.08) for z in (-0.1, 0.1)])
+    hull = torch.tensor(
+        [[x, y, z] for x in (-0.05, 0.05) for y in (-0.08, 0.08) for z in (-0.1, 0.1)]
+    )
     return ObjectModel("box", hull, torch.zeros(3), 0.14, 0.28, torch.eye(4)[None], hull)
 
 
@@ -53,7 +55,16 @@ def scenes() -> list[Batch]:
         mask[:, 16:32, 20:44] = True
         K, one = intrinsics(60.0, 60.0, (W - 1) / 2, (H - 1) / 2), torch.tensor(1.0)
         out.append(
-            Batch(torch.full((3, H, W), 0.5), torch.ones(1, H, W), mask, K, pose, torch.tensor(0), torch.tensor(i), one)
+            Batch(
+                torch.full((3, H, W), 0.5),
+                torch.ones(1, H, W),
+                mask,
+                K,
+                pose,
+                torch.tensor(0),
+                torch.tensor(i),
+                one,
+            )
         )
     return out
 
@@ -62,28 +73,42 @@ class Told(PoseEstimator):
     """Knows the truth, but believes the object of image i to be i cm to the right."""
 
     def __init__(self) -> None:
-        pieces = (FromProposals(), Geometric(0.03, 0.005), Annealed(), Systematic(), Gaussian(0.4), Mean(), NoRefine())
+        pieces = (
+            FromProposals(),
+            Geometric(0.03, 0.005),
+            Annealed(),
+            Systematic(),
+            Gaussian(0.4),
+            Mean(),
+            NoRefine(),
+        )
         loss: Any = None
         super().__init__(ParticleFilter(100, 4, *pieces), loss, partial(torch.optim.SGD, lr=0.1))
-        self.adopt(model())
+        self.set_object(model())
         self.weight = torch.nn.Parameter(torch.ones(1))
 
     @property
     def space(self) -> PoseSpace:
         return PoseSpace((0.0, 0.0, 0.0), 0.14)
 
-    def observe(self, batch: Batch) -> torch.Tensor:
+    def encode(self, batch: Batch) -> torch.Tensor:
         shift = torch.zeros(len(batch.rgb), 6)
         shift[:, 0] = 0.01 * batch.frame_id
         return move_about(batch.camera_from_object, shift, torch.zeros(3))
 
-    def read(self, scene: torch.Tensor, cloud: Cloud, step: Step, generator: torch.Generator) -> Reading:
-        likely = -0.5 * (self.space.distance(cloud.state, scene[:, None]) / step.sigma).square()
-        still = torch.zeros(*cloud.state.shape[:2], 6)
-        return Reading(likely, still, cloud.state, cloud.memory)
+    def measure(
+        self, scene: torch.Tensor, particles: Particles, step: Step, generator: torch.Generator
+    ) -> ParticleOutput:
+        likely = -0.5 * (self.space.distance(particles.state, scene[:, None]) / step.sigma).square()
+        still = torch.zeros(*particles.state.shape[:2], 6)
+        return ParticleOutput(likely, still, particles.state, particles.latent)
 
-    def propose(self, scene: torch.Tensor, particles: int, generator: torch.Generator) -> torch.Tensor:
-        tangent = torch.randn(len(scene), particles, 6, generator=generator) * torch.tensor([0.03] * 3 + [0.2] * 3)
+    def propose_poses(
+        self, scene: torch.Tensor, particles: int, generator: torch.Generator
+    ) -> torch.Tensor:
+        tangent = torch.randn(len(scene), particles, 6, generator=generator) * torch.tensor(
+            [0.03] * 3 + [0.2] * 3
+        )
         return move_about(scene[:, None].expand(-1, particles, 4, 4), tangent, torch.zeros(3))
 
 
@@ -113,18 +138,34 @@ def test_best_and_worst_are_the_best_and_the_worst(run: tuple[Path, Figures, Fil
     assert kept["worst"][0].error == pytest.approx(0.07, abs=0.01)
 
 
-def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, FilterHealth]) -> None:
+def test_pictures_are_on_the_board_and_in_the_folder(
+    run: tuple[Path, Figures, FilterHealth],
+) -> None:
     folder = run[0]
     board = EventAccumulator(str(folder), size_guidance={"images": 0, "scalars": 0})
     board.Reload()
-    names = {"overlays", "worst", "best", "particles", "silhouettes", "belief", "animation", "health"}
-    assert {file.stem for file in (folder / "figures").iterdir()} == {f"validation_{name}" for name in names}
+    names = {
+        "overlays",
+        "worst",
+        "best",
+        "particles",
+        "silhouettes",
+        "belief",
+        "animation",
+        "health",
+    }
+    assert {file.stem for file in (folder / "figures").iterdir()} == {
+        f"validation_{name}" for name in names
+    }
     tags = sorted(board.Tags()["images"])  # as TensorBoard orders them
     assert tags == [
         "1_poses/overlays", "1_poses/worst", "2_filter/animation", "2_filter/health", "2_filter/particles",
         "3_belief/belief",
     ]  # fmt: skip
-    for tag, file in (("1_poses/overlays", "validation_overlays"), ("2_filter/health", "validation_health")):
+    for tag, file in (
+        ("1_poses/overlays", "validation_overlays"),
+        ("2_filter/health", "validation_health"),
+    ):
         written = (folder / "figures" / f"{file}.jpg").read_bytes()
         assert board.Images(tag)[0].encoded_image_string == written
     with Image.open(folder / "figures" / "validation_overlays.jpg") as overlays:
@@ -132,7 +173,10 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     assert picture.shape[1] == WIDTH
     assert (np.abs(picture.astype(int) - 128) < 4).all(-1).mean() > 0.3  # the gray photographs
     animation = board.Images("2_filter/animation")[0]
-    assert animation.encoded_image_string == (folder / "figures" / "validation_animation.gif").read_bytes()
+    assert (
+        animation.encoded_image_string
+        == (folder / "figures" / "validation_animation.gif").read_bytes()
+    )
     with Image.open(folder / "figures" / "validation_animation.gif") as moving:
         assert moving.n_frames == 7  # four clouds, two frames from one to the next
         assert moving.size == (animation.width, animation.height)
@@ -140,14 +184,20 @@ def test_pictures_are_on_the_board_and_in_the_folder(run: tuple[Path, Figures, F
     assert board.Scalars("filter/sigma_m/step_03")[0].value == pytest.approx(0.005)
 
 
-def test_titles_of_all_figures_are_read_in_thumbnails(run: tuple[Path, Figures, FilterHealth]) -> None:
-    """Shown as TensorBoard does, the first letter of each title is a capital of 12 pixels: its small letters have 9."""
+def test_titles_of_all_figures_are_read_in_thumbnails(
+    run: tuple[Path, Figures, FilterHealth],
+) -> None:
+    """Shown as TensorBoard does, the first letter of each title is a capital of 12 pixels: its
+    small letters have 9.
+    """
     files = sorted((run[0] / "figures").iterdir())
     assert len(files) == 8
     for file in files:
         with Image.open(file) as image:
             height = image.height * THUMBNAIL // image.width
-            small = np.asarray(image.convert("L").resize((THUMBNAIL, height), Image.Resampling.NEAREST))
+            small = np.asarray(
+                image.convert("L").resize((THUMBNAIL, height), Image.Resampling.NEAREST)
+            )
         ink = small[: round(TITLE * 1.25) // 2] < 128
         columns = np.nonzero(ink.any(0))[0]
         letter = np.nonzero(ink[:, columns[0] : columns[0] + 7].any(1))[0]
@@ -169,7 +219,9 @@ def test_looking_changes_nothing(tmp_path: Path) -> None:
     method, figures = Told(), Figures(tmp_path, share=None)
     state = {name: value.clone() for name, value in method.state_dict().items()}
     torch.set_rng_state(before)
-    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    trainer = Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
     batch = torch.utils.data.default_collate(scenes()[:2])
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     figures.on_validation_epoch_start(trainer, method)
@@ -184,7 +236,9 @@ def test_looking_changes_nothing(tmp_path: Path) -> None:
 
 def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     method, figures = Told(), Figures(tmp_path, every=2, share=None)
-    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    trainer = Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
     batch = torch.utils.data.default_collate(scenes()[:2])
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     drawn: list[int] = []
@@ -198,9 +252,13 @@ def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.Monkey
     assert drawn == [0, 2, 4]
 
 
-def test_drawing_that_costs_too_much_is_put_off_until_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drawing_that_costs_too_much_is_put_off_until_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     method, figures = Told(), Figures(tmp_path, share=0.05)
-    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False)
+    trainer = Trainer(
+        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
     drawn: list[int] = []
     now = [0]
 
@@ -240,8 +298,15 @@ def test_estimates_that_are_no_numbers_are_the_worst() -> None:
 
 
 def test_one_figure_alone_is_switched_off_by_its_name(tmp_path: Path) -> None:
-    assert set(Figures(without=["animation", "field"]).drawings) == set(DRAWINGS) - {"animation", "field"}
-    with pytest.raises(UserError, match=r"figures.without=fild: there is no such figure; there are .*field"):
+    assert set(Figures(without=["animation", "field"]).drawings) == set(DRAWINGS) - {
+        "animation",
+        "field",
+    }
+    with pytest.raises(
+        UserError,
+        match=r"figures.without=fild: there is no such figure; there "
+        r"are .*field",
+    ):
         Figures(without=["fild"])
 
 
@@ -257,7 +322,9 @@ def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:
     assert torch.is_grad_enabled()
 
 
-def test_overlays_outline_lies_on_the_mask_of_a_worst_image(run: tuple[Path, Figures, FilterHealth]) -> None:
+def test_overlays_outline_lies_on_the_mask_of_a_worst_image(
+    run: tuple[Path, Figures, FilterHealth],
+) -> None:
     worst = run[1]._selection.kept["worst"][0]
     width = tile_width(3)
     view = view_poses([worst.estimate, worst.truth], model().hull, worst.intrinsics, H, W, width)
@@ -270,5 +337,6 @@ def test_overlays_outline_lies_on_the_mask_of_a_worst_image(run: tuple[Path, Fig
         outer = places[ConvexHull(places).vertices]
         return float(np.linalg.norm(outer[:, None] - green[None], axis=-1).min(1).max())
 
-    assert farthest_corner(worst.truth) < 6  # the other outline lies over some of it; enlarged, 15 px are 1.5 cm
+    # the other outline lies over some of it; enlarged, 15 px are 1.5 cm
+    assert farthest_corner(worst.truth) < 6
     assert farthest_corner(worst.estimate) > 15  # it is 7 cm away

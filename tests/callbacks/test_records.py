@@ -27,7 +27,9 @@ from posefilter.types import Batch, Belief, Trace
 
 def poses(count: int, seed: int = 0) -> np.ndarray:
     g = torch.Generator().manual_seed(seed)
-    return make_pose(random_rotation(count, generator=g).double(), torch.randn(count, 3, generator=g).double()).numpy()
+    return make_pose(
+        random_rotation(count, generator=g).double(), torch.randn(count, 3, generator=g).double()
+    ).numpy()
 
 
 def record(i: int) -> FrameRecord:
@@ -116,18 +118,22 @@ def test_rows_are_native_and_leave_out_what_is_not_finite() -> None:
 
 
 def test_outcomes_and_beliefs(tmp_path: Path) -> None:
-    clouds = torch.from_numpy(poses(8)).reshape(2, 4, 4, 4)
+    history = torch.from_numpy(poses(8)).reshape(2, 4, 4, 4)
     weights = torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.25] * 4])
-    belief = Belief(clouds, weights.log(), clouds[:, 1], torch.tensor([1.5, -2.0]))
+    belief = Belief(history, weights.log(), history[:, 1], torch.tensor([1.5, -2.0]))
     empty = torch.zeros(2)
     batch = Batch(empty, empty, empty, empty, empty, empty, torch.tensor([1, 0]), empty)
     outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25)
     assert [(o.frame_id, o.score, o.seconds) for o in outcomes] == [(1, 1.5, 0.25), (0, -2.0, 0.25)]
-    assert (outcomes[0].estimate == clouds[0, 1].numpy()).all()
+    assert (outcomes[0].estimate == history[0, 1].numpy()).all()
     native_from_mesh = poses(1, seed=3)[0]
-    write_beliefs(tmp_path / "beliefs.npz", outcomes, [record(7), record(9)], lambda name: native_from_mesh)
+    write_beliefs(
+        tmp_path / "beliefs.npz", outcomes, [record(7), record(9)], lambda name: native_from_mesh
+    )
     with np.load(tmp_path / "beliefs.npz") as found:
         assert found["im_id"].tolist() == [9, 7]
         assert np.abs(found["weights"] - weights.numpy()).max() < 1e-6
-        assert np.abs(found["poses"] @ native_from_mesh - clouds.numpy()).max() < 1e-5
-    assert collect_outcomes(Trace((), (), (), belief), batch, 0.25, beliefs=False)[0].poses.shape == (0, 4, 4)
+        assert np.abs(found["poses"] @ native_from_mesh - history.numpy()).max() < 1e-5
+    assert collect_outcomes(Trace((), (), (), belief), batch, 0.25, beliefs=False)[
+        0
+    ].poses.shape == (0, 4, 4)

@@ -18,7 +18,12 @@ def test_images_waiting_and_validations_are_told_apart(monkeypatch: pytest.Monke
     drawer = SimpleNamespace(budget=Budget(None))
     drawer.budget.validated, drawer.budget.drawn = 20.0, 1.0
     trainer: Any = SimpleNamespace(
-        loggers=[logger], global_step=0, is_global_zero=True, sanity_checking=False, log_every_n_steps=4, callbacks=[drawer]
+        loggers=[logger],
+        global_step=0,
+        is_global_zero=True,
+        sanity_checking=False,
+        log_every_n_steps=4,
+        callbacks=[drawer],
     )
     method: Any = None
     callback, batch = Speed(), [[0] * 8]

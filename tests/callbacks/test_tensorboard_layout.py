@@ -20,12 +20,22 @@ from tensorboard.util.tensor_util import make_ndarray
 from posefilter.callbacks.tensorboard_layout import LAYOUT, TensorBoardLayout
 
 
-def run(folder: Path, particles: int, refine: str = "none", more: Any = None, swept: Any = ()) -> None:
+def run(
+    folder: Path, particles: int, refine: str = "none", more: Any = None, swept: Any = ()
+) -> None:
     """Go through a run's hooks, with the numbers that a training and a test would have left."""
     logger = TensorBoardLogger(folder, name="", version="")
-    trainer: Any = SimpleNamespace(loggers=[logger], global_step=10, is_global_zero=True, sanity_checking=False)
+    trainer: Any = SimpleNamespace(
+        loggers=[logger], global_step=10, is_global_zero=True, sanity_checking=False
+    )
     layout, method = TensorBoardLayout(), torch.nn.Module()
-    layout.settings = {"refine": refine, "filter.particles": particles, "data.settle": False, "seed": 0, **(more or {})}
+    layout.settings = {
+        "refine": refine,
+        "filter.particles": particles,
+        "data.settle": False,
+        "seed": 0,
+        **(more or {}),
+    }
     layout.swept = swept
     trainer.callback_metrics = {}
     layout.on_fit_start(trainer, method)  # type: ignore[arg-type]
@@ -50,7 +60,9 @@ def test_settings_and_metrics_are_read_back(tmp_path: Path) -> None:
 
 
 def read_experiment(folder: Path) -> tuple[list[str], Any, list[str]]:
-    """Return TensorBoard's runs below a folder, the table of the tab HParams, and the names of its lines."""
+    """Return TensorBoard's runs below a folder, the table of the tab HParams, and the names of its
+    lines.
+    """
     runs = EventMultiplexer().AddRunsFromDirectory(str(folder))
     runs.Reload()
     context = Context(TBContext(data_provider=MultiplexerDataProvider(runs, str(folder))))
@@ -71,7 +83,9 @@ def test_each_run_is_listed_once(tmp_path: Path) -> None:
 
 
 def test_what_matters_is_shown_first(tmp_path: Path) -> None:
-    """TensorBoard shows five settings unless asked: model, loss, particles and seed are always among them."""
+    """TensorBoard shows five settings unless asked: model, loss, particles and seed are always
+    among them.
+    """
     many = {
         "augment": "none",
         "budget": "short",
@@ -85,7 +99,11 @@ def test_what_matters_is_shown_first(tmp_path: Path) -> None:
     names = [info.name for info in experiment.hparam_infos]
     assert names[:5] == ["filter.particles", "loss", "model", "seed", "variant"]
     assert set(names) == {*many, "filter.particles", "seed", "refine", "data.settle"}
-    assert [metric.name.tag for metric in experiment.metric_infos[:3]] == ["val/score", "val/best_score", "test/add/auc"]
+    assert [metric.name.tag for metric in experiment.metric_infos[:3]] == [
+        "val/score",
+        "val/best_score",
+        "test/add/auc",
+    ]
     assert experiment.metric_infos[2].display_name == "test: ADD AUC"
     run(tmp_path / "b" / "a", 50, more=many, swept=("augment",))
     _, experiment, _ = read_experiment(tmp_path / "b")
@@ -96,7 +114,9 @@ def test_layout_is_read_back_in_the_storys_order(tmp_path: Path) -> None:
     run(tmp_path, 50)
     board = EventAccumulator(str(tmp_path))
     board.Reload()
-    layout = Layout.FromString(make_ndarray(board.Tensors("custom_scalars__config__")[0].tensor_proto).item())
+    layout = Layout.FromString(
+        make_ndarray(board.Tensors("custom_scalars__config__")[0].tensor_proto).item()
+    )
     assert [category.title for category in layout.category] == list(LAYOUT)
     assert layout.category[0].chart[0].multiline.tag == ["val/score$"]
 
@@ -113,4 +133,7 @@ def test_every_chart_finds_what_methods_log() -> None:
         for title, (_, tags) in charts.items():
             assert any(re.match(tag, name) for tag in tags for name in logged), title
     losses = LAYOUT["2  Does it learn?"]["losses"][1][0]
-    assert [name for name in logged if re.match(losses, name)] == ["train/total", "train/likelihood"]
+    assert [name for name in logged if re.match(losses, name)] == [
+        "train/total",
+        "train/likelihood",
+    ]

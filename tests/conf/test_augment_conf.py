@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.data.test_photometric import sample
 
-from posefilter.run.build import instantiate
-from posefilter.run.command import compose_job
+from posefilter.cli.command import compose_job
+from posefilter.cli.instantiate import instantiate
 
 CONF = Path(__file__).parents[2] / "conf"
 CHOICES = sorted(path.stem for path in (CONF / "augment").glob("*.yaml"))

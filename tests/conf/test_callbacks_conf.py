@@ -6,17 +6,22 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from posefilter.callbacks.figures import Figures
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
-from posefilter.run.best import Best
-from posefilter.run.command import compose_job
-from posefilter.run.comparing import comparable
-from posefilter.run.job import Job
-from posefilter.run.train import build_trainer
+from posefilter.cli.best import Best
+from posefilter.cli.command import compose_job
+from posefilter.cli.comparing import comparable
+from posefilter.cli.job import Job
+from posefilter.cli.train import build_trainer
 
 CONF = Path(__file__).parents[2] / "conf"
 
 
 def compose(folder: Path, *overrides: str) -> Job:
-    return compose_job("train", CONF, ["console=plain", "logger=none", "trainer.accelerator=cpu", *overrides], folder)
+    return compose_job(
+        "train",
+        CONF,
+        ["console=json", "logger=none", "trainer.accelerator=cpu", *overrides],
+        folder,
+    )
 
 
 def kinds(job: Job) -> list[type]:
@@ -46,7 +51,11 @@ def test_a_run_is_told_apart_by_choices_and_settings_but_not_by_where_it_is(tmp_
     assert settings["filter.particles"] == 50
     assert settings["seed"] == 3
     assert "model.filter" not in settings  # it repeats the section `filter`
-    assert not [key for key in settings if key.split(".")[0] in ("out", "folder", "callbacks", "logger", "console")]
+    assert not [
+        key
+        for key in settings
+        if key.split(".")[0] in ("out", "folder", "callbacks", "logger", "console")
+    ]
     assert not [value for value in settings.values() if isinstance(value, str) and "${" in value]
     (layout,) = [c for c in build_trainer(job).callbacks if isinstance(c, TensorBoardLayout)]  # type: ignore[attr-defined]
     assert layout.settings == settings

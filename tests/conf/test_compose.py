@@ -1,4 +1,6 @@
-"""Every choice that conf/ offers composes and builds; every experiment and sweep does; mistakes end in one good line."""
+"""Every choice that conf/ offers composes and builds; every experiment and sweep does; mistakes end
+in one good line.
+"""
 
 from itertools import product
 from pathlib import Path
@@ -8,13 +10,13 @@ import torch
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
+from posefilter.cli import run_command
+from posefilter.cli.checkpoints import build_method, check_loss, recipe
+from posefilter.cli.command import compose_job, explain
+from posefilter.cli.instantiate import instantiate
+from posefilter.cli.job import Job
 from posefilter.errors import UserError
 from posefilter.models.pose_pf import PosePF
-from posefilter.run import run_command
-from posefilter.run.build import instantiate
-from posefilter.run.command import compose_job, explain
-from posefilter.run.job import Job
-from posefilter.run.method import build_method, check_loss, recipe
 
 HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
@@ -22,7 +24,18 @@ MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
 VARIANTS = sorted(path.stem for path in (CONF / "variant").glob("*.yaml"))
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
-BUILT = ("initialise", "schedule", "reweigh", "resample", "propose", "estimate", "refine", "loss", "lesson", "likelihood")
+BUILT = (
+    "initialize",
+    "schedule",
+    "reweight",
+    "resample",
+    "propagate",
+    "estimate",
+    "refine",
+    "loss",
+    "lesson",
+    "likelihood",
+)
 
 
 def compose(tmp_path: Path, *overrides: str, name: str = "train") -> Job:
@@ -30,7 +43,9 @@ def compose(tmp_path: Path, *overrides: str, name: str = "train") -> Job:
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, variant: str, tmp_path: Path) -> None:
+def test_every_variant_of_every_model_builds_with_a_legal_loss(
+    model: str, variant: str, tmp_path: Path
+) -> None:
     job = compose(tmp_path, f"model={model}", f"variant={variant}")
     check_loss(job)
     method = build_method(recipe(job))
@@ -59,7 +74,11 @@ def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 @pytest.mark.parametrize("model", MODELS)
 def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) -> None:
-    chosen = [] if "override /model" in (CONF / "experiment" / f"{experiment}.yaml").read_text() else [f"model={model}"]
+    chosen = (
+        []
+        if "override /model" in (CONF / "experiment" / f"{experiment}.yaml").read_text()
+        else [f"model={model}"]
+    )
     job = compose(tmp_path, *chosen, f"experiment={experiment}", "data.meshes=somewhere")
     build_method(recipe(job))
     job.cfg.folder = str(tmp_path)
@@ -70,7 +89,9 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None:
     params = OmegaConf.load(CONF / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
     model = "cnn_patch" if "detect" in sweep else "patch_pf"
-    points = [f"{key}={value}" for key, values in params.items() for value in str(values).split(",")]
+    points = [
+        f"{key}={value}" for key, values in params.items() for value in str(values).split(",")
+    ]
     assert points
     for point in points:
         check_loss(compose(tmp_path, f"model={model}", point))
@@ -103,19 +124,23 @@ MISTAKES = {
     "filter.partcles=5": ("filter.partcles", "filter.particles"),
     "data=scene": ("data=scene", "scenes"),
     "trainer.max_step=3": ("trainer.max_step", "trainer.max_steps"),
-    "experiment=memorize": ("experiment=memorize", "memorise"),
+    "experiment=memorize": ("experiment=memorize", "memorize"),
     "loss=add": ("loss=add", "contrast, regression"),
     "filter.particles=many": ("filter.particles='many'", "whole number"),
     "filter.particles=0": ("particles=0", "1 or more"),
     "optimizer.lr=fast": ("optimizer.lr='fast'", "number"),
     "+filter.foo=1": ("filter.foo", "no such setting"),
     "seed=x": ("seed=x", "whole number"),
-    "console=loud": ("console=loud", "plain"),
+    "console=loud": ("console=loud", "json"),
     "resume=nowhere": ("resume=nowhere", "not a run's folder"),
-    "initialise.x=1": ("initialise.x", "no such setting"),
+    "initialize.x=1": ("initialize.x", "no such setting"),
     "x=[1": ("[1",),
     "loss=[bce,add]": ("loss=[bce,add]", "takes the name of a choice", "add, add_s"),
-    "stages=[{until: 1.0}]": ("stages=[{until: 1.0}]", "takes the name of a choice", "three_motion"),
+    "loss_schedule=[{until: 1.0}]": (
+        "loss_schedule=[{until: 1.0}]",
+        "takes the name of a choice",
+        "three_motion",
+    ),
 }
 
 
@@ -123,7 +148,7 @@ MISTAKES = {
 def test_a_mistake_ends_in_one_line_that_names_the_key_and_the_nearest(
     mistake: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    status = run_command("train", HOME, [f"out={tmp_path}", "console=plain", mistake])
+    status = run_command("train", HOME, [f"out={tmp_path}", "console=json", mistake])
     said = capfd.readouterr().err.strip().splitlines()
     assert status == 2
     assert len(said) == 1, said
@@ -133,12 +158,19 @@ def test_a_mistake_ends_in_one_line_that_names_the_key_and_the_nearest(
 
 
 def test_what_is_required_is_asked_for(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name, words in {"evaluate": "checkpoint=", "predict": "checkpoint", "generate": "out", "export": "out"}.items():
+    for name, words in {
+        "evaluate": "checkpoint=",
+        "predict": "checkpoint",
+        "generate": "out",
+        "export": "out",
+    }.items():
         assert run_command(name, HOME, [] if name != "predict" else [f"out={tmp_path}"]) == 2
         assert words in capfd.readouterr().err
 
 
-def test_a_trace_is_shown_only_when_asked_for(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_trace_is_shown_only_when_asked_for(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert run_command("train", HOME, [f"out={tmp_path}", "loss=add", "debug=trace"]) == 2
     assert "Traceback" in capfd.readouterr().err
 
@@ -146,7 +178,9 @@ def test_a_trace_is_shown_only_when_asked_for(tmp_path: Path, capfd: pytest.Capt
 class TestBuilding:
     """The one place that turns names into objects."""
 
-    @pytest.mark.parametrize("name", ["os.system", "builtins.eval", "subprocess.run", "posefilterx.y"])
+    @pytest.mark.parametrize(
+        "name", ["os.system", "builtins.eval", "subprocess.run", "posefilterx.y"]
+    )
     def test_only_names_of_ours_torch_and_lightning(self, name: str) -> None:
         with pytest.raises(UserError, match="may not be built"):
             instantiate({"_target_": name}, "x")
@@ -154,7 +188,11 @@ class TestBuilding:
     def test_misspelt_names_are_told(self) -> None:
         with pytest.raises(UserError, match="did you mean 'Adam'"):
             instantiate({"_target_": "torch.optim.AdamV"}, "optimizer")
-        node = {"_target_": "posefilter.filters.resample.BelowESS", "resampler": {}, "threshhold": 1}
+        node = {
+            "_target_": "posefilter.filters.resample.BelowESS",
+            "resampler": {},
+            "threshhold": 1,
+        }
         with pytest.raises(UserError, match=r"resample.threshhold.*did you mean 'threshold'"):
             instantiate(node, "resample")
 
@@ -162,31 +200,48 @@ class TestBuilding:
         with pytest.raises(UserError, match=r"schedule.sigma: is missing"):
             instantiate({"_target_": "posefilter.filters.schedule.Constant"}, "schedule")
         with pytest.raises(UserError, match=r"schedule.sigma=True: must be a number"):
-            instantiate({"_target_": "posefilter.filters.schedule.Constant", "sigma": True}, "schedule")
+            instantiate(
+                {"_target_": "posefilter.filters.schedule.Constant", "sigma": True}, "schedule"
+            )
 
     def test_partial_lists_nesting_and_nothing(self) -> None:
-        node = {"a": [{"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}], "none": {}}
+        node = {
+            "a": [{"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}],
+            "none": {},
+        }
         made = instantiate(node, "x")
         assert made["none"] is None
         assert made["a"][0](torch.zeros(1, 2)).shape == (1, 3)
-        later = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5}, "optimizer")
+        later = instantiate(
+            {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5}, "optimizer"
+        )
         assert later([torch.nn.Parameter(torch.zeros(1))]).param_groups[0]["lr"] == 0.5
 
 
 @pytest.mark.parametrize("entry", sorted(path.stem for path in CONF.glob("*.yaml")))
 def test_no_setting_is_called_as_a_group_that_its_command_does_not_compose(entry: str) -> None:
-    """Hydra would take `size=[320,240]` for the choice of a group `size`, and say that there is no such setting."""
+    """Hydra would take `size=[320,240]` for the choice of a group `size`, and say that there is no
+    such setting.
+    """
     page = OmegaConf.load(CONF / f"{entry}.yaml")
     composed = {
-        str(key).split()[-1].lstrip("/") for item in page.get("defaults", []) if OmegaConf.is_dict(item) for key in item
+        str(key).split()[-1].lstrip("/")
+        for item in page.get("defaults", [])
+        if OmegaConf.is_dict(item)
+        for key in item
     }
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    handled = {"debug", "augment"}  # debug is read before Hydra; augment is what a data module asks for, and not to be typed
+    # debug is read before Hydra; augment is what a data module asks for, and not to be typed
+    handled = {"debug", "augment"}
     assert not (set(page) & groups) - composed - handled
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("budget=patch_pf/wrking", "patch_pf/working"), ("context=unett", "unet")])
-def test_a_choice_that_is_not_there_names_the_nearest(typed: str, meant: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("typed", "meant"), [("budget=patch_pf/wrking", "patch_pf/working"), ("encoder=unett", "unet")]
+)
+def test_a_choice_that_is_not_there_names_the_nearest(
+    typed: str, meant: str, tmp_path: Path
+) -> None:
     with pytest.raises(MissingConfigException) as caught:
         compose_job("train", CONF, ["model=patch_pf", typed], tmp_path)
     told = explain(caught.value, "train", CONF, [typed])

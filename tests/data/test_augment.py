@@ -1,4 +1,6 @@
-"""Augmentation stays true: after any of it the known surface still fits the pose, the intrinsics and the mask."""
+"""Augmentation stays true: after any of it the known surface still fits the pose, the intrinsics
+and the mask.
+"""
 
 import dataclasses
 
@@ -6,37 +8,65 @@ import numpy as np
 import pytest
 from tests.models.toy import SIDE, scenes
 
-from posefilter.data.augment import Augment, Blank, Colour, Compose, DepthNoise, PasteOccluder, RollAndZoom, Window
+from posefilter.data.augmentation import (
+    Augment,
+    Blank,
+    Color,
+    Compose,
+    DepthNoise,
+    PasteOccluder,
+    RollAndZoom,
+    Window,
+)
 from posefilter.data.frames import Sample
 
 
 def sample(i: int = 0) -> Sample:
-    """Return a toy scene as a sample: a square whose colour tells the place on it."""
+    """Return a toy scene as a sample: a square whose color tells the place on it."""
     b = scenes(4)
     rgb = (b.rgb[i].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
     return Sample(
-        rgb, b.depth[i, 0].numpy(), b.mask[i, 0].numpy(), b.intrinsics[i].numpy(), b.camera_from_object[i].numpy(), 0, i, 1.0
+        rgb,
+        b.depth[i, 0].numpy(),
+        b.mask[i, 0].numpy(),
+        b.intrinsics[i].numpy(),
+        b.camera_from_object[i].numpy(),
+        0,
+        i,
+        1.0,
     )
 
 
 def misfit(x: Sample) -> tuple[float, float]:
-    """Return how far the mask's points lie off the square's plane [m], and how far their colour is from their place."""
+    """Return how far the mask's points lie off the square's plane [m], and how far their color is
+    from their place.
+    """
     rows, cols = np.nonzero(x.mask & (x.depth > 0))
     K = x.intrinsics
     z = x.depth[rows, cols]
     points = np.stack([(cols - K[0, 2]) / K[0, 0] * z, (rows - K[1, 2]) / K[1, 1] * z, z], -1)
     local = (points - x.camera_from_object[:3, 3]) @ x.camera_from_object[:3, :3]
     said = x.rgb[rows, cols, :2] / 255.0
-    return float(np.abs(local[:, 2]).max()), float(np.median(np.abs(said - (local[:, :2] / SIDE + 0.5))))
+    return float(np.abs(local[:, 2]).max()), float(
+        np.median(np.abs(said - (local[:, :2] / SIDE + 0.5)))
+    )
 
 
 def apply(step: Augment, seed: int, x: Sample | None = None) -> Sample:
-    return step(x or sample(), lambda rng: sample(int(rng.integers(4))), np.random.default_rng(seed))
+    return step(
+        x or sample(), lambda rng: sample(int(rng.integers(4))), np.random.default_rng(seed)
+    )
 
 
 @pytest.mark.parametrize(
     "step",
-    [RollAndZoom(any_roll=1.0), Window((32, 32)), PasteOccluder(1.0), Blank(), Compose([RollAndZoom(), Window((32, 48))])],
+    [
+        RollAndZoom(any_roll=1.0),
+        Window((32, 32)),
+        PasteOccluder(1.0),
+        Blank(),
+        Compose([RollAndZoom(), Window((32, 48))]),
+    ],
 )
 def test_geometry_stays_true(step: Augment) -> None:
     changed = 0
@@ -45,7 +75,8 @@ def test_geometry_stays_true(step: Augment) -> None:
         if not out.mask.any():
             continue
         off_plane, off_color = misfit(out)
-        # depth is the nearest pixel's: on a plane tilted by up to 0.4 rad, half a pixel (7 mm) is worth 3 mm
+        # depth is the nearest pixel's: on a plane tilted by up to 0.4 rad, half a pixel (7 mm) is
+        # worth 3 mm
         assert off_plane < 0.009
         assert off_color < 0.06
         changed += not np.array_equal(out.rgb, sample().rgb)
@@ -87,8 +118,8 @@ def test_noise_leaves_holes_alone_and_stays_small() -> None:
     assert 0 < np.abs(out.depth[known] - x.depth[known]).max() < 0.05
 
 
-def test_colour_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:
-    a, b, c = apply(Colour(), 1), apply(Colour(), 1), apply(Colour(), 2)
+def test_color_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:
+    a, b, c = apply(Color(), 1), apply(Color(), 1), apply(Color(), 2)
     np.testing.assert_array_equal(a.rgb, b.rgb)
     assert not np.array_equal(a.rgb, c.rgb)
     np.testing.assert_array_equal(a.depth, sample().depth)

@@ -1,4 +1,4 @@
-"""The BOP reader against analytic truth: millimetres, object numbers, one mask an instance."""
+"""The BOP reader against analytic truth: millimeters, object numbers, one mask an instance."""
 
 import json
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from dataset_trees import K, bop_scene, pose, scene, truth, write_png
 
-from posefilter.data import ycb
-from posefilter.data.bop import BopReader
-from posefilter.data.frames import BadData, NotShown
-from posefilter.errors import UserError
+from posefilter.data.frames import NotShown
+from posefilter.data.readers.bop import BopReader
+from posefilter.errors import BadData, UserError
+from posefilter.meshes import ycb
 
 FRONT = pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.35))
 
 
-def test_millimetres_become_metres(tmp_path):
+def test_millimeters_become_metres(tmp_path):
     bop_scene(tmp_path / "test" / "000048", [[(2, pose()), (2, FRONT)], [(5, pose())]])
     reader = BopReader(tmp_path, part="test")
     assert reader.objects == ("obj_000002", "obj_000005")
@@ -29,26 +29,37 @@ def test_millimetres_become_metres(tmp_path):
         np.testing.assert_allclose(sample.camera_from_object, expected, atol=1e-6)
         np.testing.assert_array_equal(sample.mask, index == k)
         np.testing.assert_array_equal(reader.others(k), index == 1 - k)
-        np.testing.assert_allclose(sample.depth[sample.mask], truth(expected)[sample.mask], atol=1.3e-4)  # 0.25 mm a unit
+        np.testing.assert_allclose(
+            sample.depth[sample.mask], truth(expected)[sample.mask], atol=1.3e-4
+        )  # 0.25 mm a unit
         np.testing.assert_allclose(sample.intrinsics, K, atol=1e-4)
     np.testing.assert_array_equal(reader.native_from_mesh("obj_000002"), np.eye(4))
     assert reader.read(2).object_id == 1
 
 
 def test_ycb_names_with_original_meshes(tmp_path):
-    """BOP's YCB-V frame sits at the centre of YCB-Video's model, so the original mesh's bounds centre maps to nearly 0."""
+    """BOP's YCB-V frame sits at the center of YCB-Video's model, so the original mesh's bounds
+    center maps to nearly 0.
+    """
     name = "003_cracker_box"
     bop_scene(tmp_path / "000048", [[(2, pose())]])
     reader = BopReader(tmp_path, name)
     native = reader.native_from_mesh(name)
     np.testing.assert_allclose(reader.read(0).camera_from_object, pose() @ native, atol=1e-6)
     np.testing.assert_array_equal(native[:3, :3], np.eye(3))
-    np.testing.assert_allclose(native[:3, 3] - ycb.ycbvideo_from_original(name)[:3, 3], [0.00056, 0.0017, 0.0048], atol=1e-9)
-    assert BopReader(tmp_path, name, mesh_frame="bop").read(0).camera_from_object == pytest.approx(pose(), abs=1e-6)
+    np.testing.assert_allclose(
+        native[:3, 3] - ycb.ycbvideo_from_original(name)[:3, 3],
+        [0.00056, 0.0017, 0.0048],
+        atol=1e-9,
+    )
+    assert BopReader(tmp_path, name, mesh_frame="bop").read(0).camera_from_object == pytest.approx(
+        pose(), abs=1e-6
+    )
 
 
 def test_hidden_instances(tmp_path):
-    bop_scene(tmp_path / "000001", [[(2, pose(position=(0, 0, 2.0))), (3, pose())]])  # the first is behind the wall
+    # the first is behind the wall
+    bop_scene(tmp_path / "000001", [[(2, pose(position=(0, 0, 2.0))), (3, pose())]])
     with pytest.raises(NotShown):
         BopReader(tmp_path).read(0)
 
@@ -63,12 +74,28 @@ def change(file, edit):
 
 
 BROKEN = {
-    "no scale": (change("scene_camera.json", lambda c: c["0"].pop("depth_scale")), "missing key '0.depth_scale'"),
-    "zero scale": (change("scene_camera.json", lambda c: c["0"].update(depth_scale=0)), "depth scale is not a positive"),
+    "no scale": (
+        change("scene_camera.json", lambda c: c["0"].pop("depth_scale")),
+        "missing key '0.depth_scale'",
+    ),
+    "zero scale": (
+        change("scene_camera.json", lambda c: c["0"].update(depth_scale=0)),
+        "depth scale is not a positive",
+    ),
     "no camera": (change("scene_camera.json", lambda c: c.pop("0")), "missing key '0'"),
-    "no pose": (change("scene_gt.json", lambda c: c["0"][0].pop("cam_t_m2c")), r"missing key '0\[0\].cam_t_m2c'"),
-    "no rotation": (change("scene_gt.json", lambda c: c["0"][0].update(cam_R_m2c=[1] * 9)), "no rotation"),
-    "nan": (change("scene_gt.json", lambda c: c["0"][0].update(cam_t_m2c=[1, 2, float("nan")])), "NaN"),
+    "no pose": (
+        change("scene_gt.json", lambda c: c["0"][0].pop("cam_t_m2c")),
+        r"missing key "
+        r"'0\[0\].cam_t_m2c'",
+    ),
+    "no rotation": (
+        change("scene_gt.json", lambda c: c["0"][0].update(cam_R_m2c=[1] * 9)),
+        "no rotation",
+    ),
+    "nan": (
+        change("scene_gt.json", lambda c: c["0"][0].update(cam_t_m2c=[1, 2, float("nan")])),
+        "NaN",
+    ),
     "short": (change("scene_gt.json", lambda c: c["0"][0].update(cam_t_m2c=[1, 2])), "wrong size"),
 }
 
@@ -89,7 +116,9 @@ def test_broken_json_is_named_or_counted(tmp_path, case):
 def test_broken_masks_and_folders(tmp_path):
     bop_scene(tmp_path / "000001", [[(2, pose())]])
     reader = BopReader(tmp_path)
-    write_png(tmp_path / "000001" / "mask_visib" / "000000_000000.png", np.full((10, 10), 255, np.uint8))
+    write_png(
+        tmp_path / "000001" / "mask_visib" / "000000_000000.png", np.full((10, 10), 255, np.uint8)
+    )
     with pytest.raises(BadData, match="wrong image size"):
         reader.read(0)
     with pytest.raises(UserError, match="no BOP scenes"):

@@ -1,4 +1,6 @@
-"""The meshes that the project draws itself: closed, of the right size, textured so that no two faces look alike."""
+"""The meshes that the project draws itself: closed, of the right size, textured so that no two
+faces look alike.
+"""
 
 import cv2
 import numpy as np
@@ -6,11 +8,13 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from posefilter.data import builtin, builtin_carton, ycb
-from posefilter.data.builtin_shapes import box, disc, lathe, tube, weld
-from posefilter.data.mesh import Mesh, surface_colors
-from posefilter.data.meshes import MeshStore
-from posefilter.data.symmetries import turn_about
+from posefilter.meshes import ycb
+from posefilter.meshes.builtin import carton as builtin_carton
+from posefilter.meshes.builtin import catalog as builtin
+from posefilter.meshes.builtin.shapes import box, disc, lathe, tube, weld
+from posefilter.meshes.mesh import Mesh, surface_colors
+from posefilter.meshes.store import MeshStore
+from posefilter.meshes.symmetries import turn_about
 
 # builtin -> (the YCB object it is as large as, in which order its x, y, z are FAT's aligned axes)
 TWINS = {
@@ -54,7 +58,7 @@ def test_sizes_are_those_of_ycb(name: str) -> None:
     twin, order = TWINS[name]
     size = np.ptp(builtin.build(name).vertices, axis=0)
     expected = np.array(ycb.SIZES_ALIGNED[twin])[list(order)]
-    if name == "brick":  # the table's y and z differ by a millimetre: either way up is right
+    if name == "brick":  # the table's y and z differ by a millimeter: either way up is right
         size, expected = np.sort(size), np.sort(expected)
     if name == "banana":
         expected = np.array(ycb.SIZES_ALIGNED[twin])[[0, 2, 1]]
@@ -125,17 +129,21 @@ def _picture(mesh: Mesh, face: str, height: int = 24, width: int = 24) -> np.nda
     right, up = {"top": ((1, 0, 0), (0, 1, 0)), "bottom": ((1, 0, 0), (0, -1, 0))}.get(
         face, (tuple(np.cross([0, 0, 1], normal)), (0, 0, 1))
     )
-    low, high = mesh.bounds
+    low, high = mesh.box_head
     center, half = (low + high) / 2, (high - low) / 2
     x = (np.arange(width) + 0.5) / width * 2 - 1
     y = 1 - (np.arange(height) + 0.5) / height * 2
     grid_x, grid_y = np.meshgrid(x, y)
-    on_face = center + half * (normal + grid_x[..., None] * np.array(right) + grid_y[..., None] * np.array(up))
+    on_face = center + half * (
+        normal + grid_x[..., None] * np.array(right) + grid_y[..., None] * np.array(up)
+    )
     candidates = np.flatnonzero(solid.face_normals @ normal > 0.9)
     points = on_face.reshape(-1, 3) - 1e-9 * (on_face.reshape(-1, 3) - center)
     out = np.zeros((len(points), 3))
     for one in candidates:
-        weights = trimesh.triangles.points_to_barycentric(np.repeat(solid.triangles[[one]], len(points), axis=0), points)
+        weights = trimesh.triangles.points_to_barycentric(
+            np.repeat(solid.triangles[[one]], len(points), axis=0), points
+        )
         inside = (weights > -1e-6).all(1)
         out[inside] = surface_colors(mesh, np.full(inside.sum(), one), weights[inside])
     return out.reshape(height, width, 3)
@@ -156,17 +164,20 @@ def test_the_carton_shows_its_print_upright_and_unmirrored(face: str) -> None:
 
 def test_every_face_of_the_carton_is_told_from_every_other_even_when_small() -> None:
     mesh = builtin.build("carton")
-    small = {face: _picture(mesh, face, 40, 40).reshape(5, 8, 5, 8, 3).mean(axis=(1, 3)) for face in NORMALS}  # 5 x 5 pixels
+    small = {
+        face: _picture(mesh, face, 40, 40).reshape(5, 8, 5, 8, 3).mean(axis=(1, 3))
+        for face in NORMALS
+    }  # 5 x 5 pixels
     means = {face: picture.mean(axis=(0, 1)) for face, picture in small.items()}
     for a in NORMALS:
         for b in NORMALS:
             if a < b:
-                assert np.abs(means[a] - means[b]).max() > 0.1, f"{a} and {b} have the same colour"
+                assert np.abs(means[a] - means[b]).max() > 0.1, f"{a} and {b} have the same color"
         half_turn = np.abs(small[a] - small[a][::-1, ::-1]).mean()
         assert half_turn > 0.03, f"{a} looks the same upside down"
 
 
-def test_declared_symmetries_hold_for_shape_and_colour() -> None:
+def test_declared_symmetries_hold_for_shape_and_color() -> None:
     store = MeshStore("builtin")
     symmetric = [name for name in store.names() if len(store.load(name).symmetries) > 1]
     assert symmetric == ["bowl", "brick"]
@@ -178,16 +189,19 @@ def test_declared_symmetries_hold_for_shape_and_colour() -> None:
             assert distance.max() < 1e-6
             assert np.abs(colors[vertex] - colors).mean() < 0.05
     brick = store.load("brick")
-    quarter = turn_about(np.array([0, 0, 1.0]), np.pi / 2, brick.bounds.mean(0))  # this one is none
+    # this one is none
+    quarter = turn_about(np.array([0, 0, 1.0]), np.pi / 2, brick.box_head.mean(0))
     turned = brick.vertices @ quarter[:3, :3].T + quarter[:3, 3]
     assert cKDTree(brick.vertices).query(turned)[0].max() > 1e-3
 
 
 def _vertex_colors(mesh: Mesh) -> np.ndarray:
-    """Return the mean colour of each vertex's corners.  -> (V, 3)."""
+    """Return the mean color of each vertex's corners.  -> (V, 3)."""
     total, count = np.zeros((len(mesh.vertices), 3)), np.zeros((len(mesh.vertices), 1))
     for corner in range(3):
         weights = np.tile(np.eye(3)[corner], (len(mesh.faces), 1))
-        np.add.at(total, mesh.faces[:, corner], surface_colors(mesh, np.arange(len(mesh.faces)), weights))
+        np.add.at(
+            total, mesh.faces[:, corner], surface_colors(mesh, np.arange(len(mesh.faces)), weights)
+        )
         np.add.at(count, mesh.faces[:, corner], 1)
     return total / count

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from dataset_trees import HIGH, LOW, K, bop_scene, pose, write_mesh, ycb_frame
 
-from posefilter.data import ycb
-from posefilter.data.bop import BopReader
-from posefilter.data.check import check_dataset, format_report
-from posefilter.data.meshes import MeshStore
-from posefilter.data.ycb_video import YCBVideoReader
+from posefilter.data.checking.check import check_dataset, format_report
+from posefilter.data.readers.bop import BopReader
+from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import UserError
+from posefilter.meshes import ycb
+from posefilter.meshes.store import MeshStore
 
 NAME = "003_cracker_box"
 NATIVE = ycb.ycbvideo_from_original(NAME)
-POSES = [pose((0.2 + 0.5 * k, 0.3 * k - 0.7, 0.4), (0.05 - 0.03 * k, 0.01 * k - 0.02, 0.42 + 0.02 * k)) for k in range(4)]
+POSES = [
+    pose((0.2 + 0.5 * k, 0.3 * k - 0.7, 0.4), (0.05 - 0.03 * k, 0.01 * k - 0.02, 0.42 + 0.02 * k))
+    for k in range(4)
+]
 FRONT = pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.33))
 
 
@@ -83,13 +86,20 @@ WRONG = {
     "depth x 10": ({"factor_depth": 1000.0}, "depth is 10 times"),
     "depth x 0.1": ({"factor_depth": 100_000.0}, "depth is 0.1 times"),
     "depth x 1000": ({"factor_depth": 10.0}, "depth is 1000 times"),
-    "millimetres": ({"poses": scaled(1000)}, "translations are in millimetres"),
-    "centimetres": ({"poses": scaled(100)}, "translations are in centimetres"),
+    "millimeters": ({"poses": scaled(1000)}, "translations are in millimeters"),
+    "centimeters": ({"poses": scaled(100)}, "translations are in centimeters"),
     "kilometres": ({"poses": scaled(0.001)}, "translations are too small by a factor of 1000"),
     "inverse": ({"poses": inverted}, "wrong way round"),
-    "frame": ({"native": np.eye(4)}, "poses are of the mesh file's frame already|google_16k\\) frame"),
+    "frame": (
+        {"native": np.eye(4)},
+        "poses are of the mesh file's frame already|google_16k\\) frame",
+    ),
     "640 wide": ({"K": wide(4.0)}, "intrinsics belong to pictures 640 px wide, not 160"),
-    "half pixel": ({"K": K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])}, r"off by \+0\.5 px: pixel corners"),
+    "half pixel": (
+        {"K": K + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])},
+        r"off by \+0\.5 "
+        r"px: pixel corners",
+    ),
 }
 
 
@@ -103,7 +113,7 @@ def test_the_cause_is_named(tmp_path, meshes, case):
 
 def test_two_causes_at_once(tmp_path, meshes):
     report = check(tree(tmp_path, poses=scaled(1000), factor_depth=1000.0), meshes)
-    assert "millimetres" in report["problems"][0]
+    assert "millimeters" in report["problems"][0]
     assert "depth is 10 times" in report["problems"][1]
 
 
@@ -112,17 +122,18 @@ def test_models_of_the_other_frame(tmp_path, meshes):
     assert "YCB-Video's object frame, meshes in the original" in report["problems"][0]
 
 
-def test_a_centred_frame_is_named(tmp_path, meshes):
+def test_a_centerd_frame_is_named(tmp_path, meshes):
     center = np.eye(4)
     center[:3, 3] = (LOW + HIGH) / 2
     bop_scene(tmp_path / "000001", [[(2, each @ center)] for each in POSES])
-    for folder in (tmp_path / "000001",):  # pixels show the mesh at `each @ center`; let the file say the centre's pose
+    # pixels show the mesh at `each @ center`; let the file say the center's pose
+    for folder in (tmp_path / "000001",):
         content = json.loads((folder / "scene_gt.json").read_text())
         for k, each in enumerate(POSES):
             content[str(k)][0]["cam_t_m2c"] = ((each @ center @ center)[:3, 3] * 1000).tolist()
         (folder / "scene_gt.json").write_text(json.dumps(content))
     report = check_dataset(BopReader(tmp_path, "obj_000002", meshes), meshes)
-    assert "centre of the bounding box" in report["problems"][0]
+    assert "center of the bounding box" in report["problems"][0]
 
 
 def test_a_wrong_mesh_is_a_problem_without_a_cause(tmp_path, meshes):

@@ -1,17 +1,31 @@
-"""The FAT reader against analytic truth, with canaries for the conventions that are easily confused."""
+"""The FAT reader against analytic truth, with canaries for the conventions that are easily
+confused.
+"""
 
 import json
 
 import cv2
 import numpy as np
 import pytest
-from dataset_trees import ALIGNED, HEIGHT, WIDTH, K, fat_folder, fat_frame, pose, scene, truth, write_mesh, write_png
+from dataset_trees import (
+    ALIGNED,
+    HEIGHT,
+    WIDTH,
+    K,
+    fat_folder,
+    fat_frame,
+    pose,
+    scene,
+    truth,
+    write_mesh,
+    write_png,
+)
 from scipy.spatial.transform import Rotation
 
-from posefilter.data.fat import FatReader
-from posefilter.data.frames import BadData, tight_box
-from posefilter.data.meshes import MeshStore
-from posefilter.errors import UserError
+from posefilter.data.frames import tight_box
+from posefilter.data.readers.fat import FatReader
+from posefilter.errors import BadData, UserError
+from posefilter.meshes.store import MeshStore
 
 
 @pytest.fixture
@@ -22,7 +36,9 @@ def meshes(tmp_path):
 def one_frame(root, ending="jpg", eyes=("left",), truth_pose=None):
     folder = fat_folder(root / "single" / "toy_16k" / "kitchen_0", {"toy": 255})
     for eye in eyes:
-        fat_frame(folder, 7, [("toy", 255, pose() if truth_pose is None else truth_pose)], eye, ending)
+        fat_frame(
+            folder, 7, [("toy", 255, pose() if truth_pose is None else truth_pose)], eye, ending
+        )
     return folder
 
 
@@ -34,7 +50,8 @@ def test_pose_depth_mask_and_camera_are_the_truth(tmp_path):
     np.testing.assert_allclose(sample.camera_from_object, pose(), atol=1e-6)
     np.testing.assert_allclose(sample.intrinsics, K, atol=1e-4)
     np.testing.assert_array_equal(sample.mask, expected > 0)
-    assert np.abs(sample.depth - np.where(expected > 0, expected, 0.9)).max() <= 0.5e-4 + 1e-6  # 0.1 mm a unit
+    # 0.1 mm a unit
+    assert np.abs(sample.depth - np.where(expected > 0, expected, 0.9)).max() <= 0.5e-4 + 1e-6
     np.testing.assert_allclose(reader.native_from_mesh("toy"), ALIGNED, atol=1e-6)
     assert reader.objects == ("toy",)
     assert np.isnan(sample.visibility)
@@ -43,7 +60,11 @@ def test_pose_depth_mask_and_camera_are_the_truth(tmp_path):
 def test_canary_the_column_reading_of_the_transform_is_another_pose(tmp_path):
     """Had F been taken for columns, or its factor 100 left in, the test above would notice."""
     folder = one_frame(tmp_path)
-    F = np.array(json.loads((folder / "_object_settings.json").read_text())["exported_objects"][0]["fixed_model_transform"])
+    F = np.array(
+        json.loads((folder / "_object_settings.json").read_text())["exported_objects"][0][
+            "fixed_model_transform"
+        ]
+    )
     camera_from_aligned = pose() @ np.linalg.inv(ALIGNED)
     columns = np.eye(4)
     columns[:3, :3] = F[:3, :3] / 100
@@ -52,25 +73,31 @@ def test_canary_the_column_reading_of_the_transform_is_another_pose(tmp_path):
     assert np.abs(np.linalg.det(F[:3, :3]) - 1e6) < 1
 
 
-def test_right_camera_stands_six_centimetres_to_the_right(tmp_path):
+def test_right_camera_stands_six_centimeters_to_the_right(tmp_path):
     one_frame(tmp_path, eyes=("left", "right"))
     reader = FatReader(tmp_path)
     names = {record.name: i for i, record in enumerate(reader.records())}
     left = reader.read(names["single/toy_16k/kitchen_0/000007.left"])
     right = reader.read(names["single/toy_16k/kitchen_0/000007.right"])
-    np.testing.assert_allclose(left.camera_from_object[:3, 3] - right.camera_from_object[:3, 3], [0.06, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        left.camera_from_object[:3, 3] - right.camera_from_object[:3, 3], [0.06, 0, 0], atol=1e-6
+    )
     assert tight_box(right.mask)[0] < tight_box(left.mask)[0]
     records = reader.records()
     assert {record.group for record in records} == {"kitchen_0"}  # stereo pairs are never split
     assert len({(r.scene_id, r.im_id, r.obj_id) for r in records}) == 2
-    assert [r.name for r in FatReader(tmp_path, eyes=("left",)).records()] == ["single/toy_16k/kitchen_0/000007.left"]
+    assert [r.name for r in FatReader(tmp_path, eyes=("left",)).records()] == [
+        "single/toy_16k/kitchen_0/000007.left"
+    ]
 
 
 def test_four_decimals_of_a_quaternion_still_make_a_rotation(tmp_path):
     folder = one_frame(tmp_path)
     path = folder / "000007.left.json"
     content = json.loads(path.read_text())
-    content["objects"][0]["quaternion_xyzw"] = [round(x, 4) for x in content["objects"][0]["quaternion_xyzw"]]
+    content["objects"][0]["quaternion_xyzw"] = [
+        round(x, 4) for x in content["objects"][0]["quaternion_xyzw"]
+    ]
     path.write_text(json.dumps(content))
     R = FatReader(tmp_path).read(0).camera_from_object[:3, :3].astype(np.float64)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
@@ -78,12 +105,14 @@ def test_four_decimals_of_a_quaternion_still_make_a_rotation(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png"])
-def test_colour_is_rgb(tmp_path, ending):
+def test_color_is_rgb(tmp_path, ending):
     folder = one_frame(tmp_path, ending)
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     picture[..., 0] = 250
     write_png(folder / f"000007.left.{ending}", picture)
-    np.testing.assert_allclose(FatReader(tmp_path).read(0).rgb.reshape(-1, 3).mean(0), [250, 0, 0], atol=4)
+    np.testing.assert_allclose(
+        FatReader(tmp_path).read(0).rgb.reshape(-1, 3).mean(0), [250, 0, 0], atol=4
+    )
 
 
 def test_visibility_is_the_share_of_pixels_not_what_the_json_says(tmp_path, meshes):
@@ -128,7 +157,8 @@ def test_single_scene_folder_and_parts(tmp_path):
 
 def test_hidden_objects_are_left_out_and_counted_at_reading(tmp_path):
     folder = fat_folder(tmp_path / "mixed" / "temple_1", {"toy": 24, "other": 36})
-    fat_frame(folder, 0, [("toy", 24, pose(position=(0, 0, 2.0))), ("other", 36, pose())])  # behind the wall
+    # behind the wall
+    fat_frame(folder, 0, [("toy", 24, pose(position=(0, 0, 2.0))), ("other", 36, pose())])
     path = folder / "000000.left.json"
     path.write_text(path.read_text().replace("0.81", "0.0"))
     with pytest.raises(BadData, match="listed, but not in the label"):
@@ -178,12 +208,16 @@ def nan_location(folder):
 
 
 BROKEN = {
-    "cut colour": (cut("000007.left.jpg"), "000007.left.jpg", "truncated or corrupt"),
+    "cut color": (cut("000007.left.jpg"), "000007.left.jpg", "truncated or corrupt"),
     "cut depth": (cut("000007.left.depth.png"), "000007.left.depth.png", "truncated or corrupt"),
     "cut json": (cut("000007.left.json"), "000007.left.json", "not readable as JSON"),
     "cut settings": (cut("_object_settings.json"), "_object_settings.json", "not readable as JSON"),
     "corrupt depth": (flip_byte, "000007.left.depth.png", "checksum"),
-    "no pose": (spoil_json("quaternion_xyzw"), "000007.left.json", "missing key 'objects\\[0\\].quaternion_xyzw'"),
+    "no pose": (
+        spoil_json("quaternion_xyzw"),
+        "000007.left.json",
+        "missing key 'objects\\[0\\].quaternion_xyzw'",
+    ),
     "no class": (spoil_json("class"), "000007.left.json", "missing key 'objects\\[0\\].class'"),
     "nan location": (nan_location, "000007.left.json", "holds NaN"),
     "nan depth": (nan_depth, "000007.left.depth.png", "NaN"),
@@ -198,9 +232,13 @@ BROKEN = {
         "empty mask",
     ),
     "unknown class": (unknown_class, "000007.left.json", "unknown class.*toast"),
-    "no colour": (lambda f: (f / "000007.left.jpg").unlink(), "000007.left.jpg", "missing file"),
+    "no color": (lambda f: (f / "000007.left.jpg").unlink(), "000007.left.jpg", "missing file"),
     "no json": (lambda f: (f / "000007.left.json").unlink(), "000007.left.json", "missing file"),
-    "no cameras": (lambda f: (f / "_camera_settings.json").unlink(), "_camera_settings.json", "missing file"),
+    "no cameras": (
+        lambda f: (f / "_camera_settings.json").unlink(),
+        "_camera_settings.json",
+        "missing file",
+    ),
 }
 
 
@@ -236,7 +274,7 @@ def test_unknown_object_and_folder(tmp_path):
         FatReader(empty)
 
 
-def test_a_newer_export_is_recognised(tmp_path):
+def test_a_newer_export_is_recognized(tmp_path):
     (tmp_path / "000000.cs.png").write_bytes(b"")
     with pytest.raises(UserError, match="newer export"):
         FatReader(tmp_path)

@@ -1,4 +1,6 @@
-"""The generator: the same files for a seed, whatever it takes to write them, in the format as real files show it."""
+"""The generator: the same files for a seed, whatever it takes to write them, in the format as real
+files show it.
+"""
 
 import json
 from pathlib import Path
@@ -9,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from posefilter.data import fat_format
-from posefilter.data.generate import camera_matrix, generate
-from posefilter.data.meshes import MeshStore
-from posefilter.data.render import EmbreeRenderer, render_depth
 from posefilter.errors import UserError
+from posefilter.meshes.store import MeshStore
+from posefilter.rendering.embree import EmbreeRenderer, render_depth
+from posefilter.synthetic import fat_format
+from posefilter.synthetic.generate import camera_matrix, generate
 
 SIZE = (160, 120)
 SETTINGS: dict[str, Any] = {
@@ -38,7 +40,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+    return {
+        str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()
+    }
 
 
 def load(path: Path) -> Any:
@@ -64,8 +68,17 @@ def test_the_layout_is_fats(dataset: Path) -> None:
     names = set(contents(dataset))
     endings = ("jpg", "json", "depth.png", "seg.png")
     frames = [(0, k) for k in range(4)] + [(1, k) for k in range(2)]
-    expected = {f"mixed/scene{s:04d}_0/{k:06d}.{eye}.{e}" for s, k in frames for eye in ("left", "right") for e in endings}
-    expected |= {f"mixed/scene{s:04d}_0/{n}" for s in (0, 1) for n in ("_object_settings.json", "_camera_settings.json")}
+    expected = {
+        f"mixed/scene{s:04d}_0/{k:06d}.{eye}.{e}"
+        for s, k in frames
+        for eye in ("left", "right")
+        for e in endings
+    }
+    expected |= {
+        f"mixed/scene{s:04d}_0/{n}"
+        for s in (0, 1)
+        for n in ("_object_settings.json", "_camera_settings.json")
+    }
     assert names == expected | {"_generator.json"}
 
 
@@ -108,21 +121,36 @@ def test_truth_rendered_again_is_what_the_images_show(dataset: Path) -> None:
 def test_records_hold_together(dataset: Path) -> None:
     for path in sorted(dataset.glob("mixed/*/??????.left.json")):
         K = intrinsics(path.parent)
-        settings = {e["class"]: e for e in load(path.parent / "_object_settings.json")["exported_objects"]}
+        settings = {
+            e["class"]: e for e in load(path.parent / "_object_settings.json")["exported_objects"]
+        }
         ids = [e["segmentation_class_id"] for e in settings.values()]
         assert len(set(ids)) == len(ids)
         assert all(0 < i < 255 for i in ids)
         objects = load(path)["objects"]
         assert len({o["class"] for o in objects}) == len(objects)
-        seg = cv2.imread(str(path.with_name(path.name.replace(".json", ".seg.png"))), cv2.IMREAD_UNCHANGED)
-        assert set(np.unique(seg)) - {0} <= {settings[o["class"]]["segmentation_class_id"] for o in objects}
+        seg = cv2.imread(
+            str(path.with_name(path.name.replace(".json", ".seg.png"))), cv2.IMREAD_UNCHANGED
+        )
+        assert set(np.unique(seg)) - {0} <= {
+            settings[o["class"]]["segmentation_class_id"] for o in objects
+        }
         for one in objects:
             assert len(one["quaternion_xyzw"]) == 4
             assert np.linalg.norm(one["quaternion_xyzw"]) == pytest.approx(1, abs=1e-6)
             R = Rotation.from_quat(one["quaternion_xyzw"]).as_matrix()
             size = np.array(settings[one["class"]]["cuboid_dimensions"])
             local = (np.array(one["cuboid"]) - one["location"]) @ R / (size / 2)
-            expected = [[1, -1, 1], [-1, -1, 1], [-1, 1, 1], [1, 1, 1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1], [1, 1, -1]]
+            expected = [
+                [1, -1, 1],
+                [-1, -1, 1],
+                [-1, 1, 1],
+                [1, 1, 1],
+                [1, -1, -1],
+                [-1, -1, -1],
+                [-1, 1, -1],
+                [1, 1, -1],
+            ]
             np.testing.assert_allclose(local, expected, atol=1e-4)
             cuboid = np.array(one["cuboid"])
             pixels = cuboid[:, :2] / cuboid[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
@@ -138,28 +166,43 @@ def test_the_cuboid_is_the_meshs_box(dataset: Path) -> None:
     mesh = MeshStore("builtin").load("carton")
     F = np.array(exported["fixed_model_transform"])
     aligned = np.concatenate([mesh.vertices, np.ones((len(mesh.vertices), 1))], 1) @ F
-    np.testing.assert_allclose(aligned[:, :3].max(0), np.array(exported["cuboid_dimensions"]) / 2, atol=1e-5)
-    np.testing.assert_allclose(aligned[:, :3].min(0), -np.array(exported["cuboid_dimensions"]) / 2, atol=1e-5)
+    np.testing.assert_allclose(
+        aligned[:, :3].max(0), np.array(exported["cuboid_dimensions"]) / 2, atol=1e-5
+    )
+    np.testing.assert_allclose(
+        aligned[:, :3].min(0), -np.array(exported["cuboid_dimensions"]) / 2, atol=1e-5
+    )
     np.testing.assert_allclose(F[:3, :3] @ F[:3, :3].T, 1e4 * np.eye(3), atol=1e-6)
     assert np.linalg.det(F[:3, :3]) == pytest.approx(1e6)
     assert aligned[mesh.vertices[:, 2].argmax(), 1] < 0  # y points down
 
 
-def test_the_right_camera_stands_six_centimetres_to_the_right(dataset: Path) -> None:
+def test_the_right_camera_stands_six_centimeters_to_the_right(dataset: Path) -> None:
     for path in sorted(dataset.glob("mixed/*/??????.left.json")):
         left = {o["class"]: o for o in load(path)["objects"]}
-        right = {o["class"]: o for o in load(path.with_name(path.name.replace("left", "right")))["objects"]}
+        right = {
+            o["class"]: o
+            for o in load(path.with_name(path.name.replace("left", "right")))["objects"]
+        }
         assert "carton_16k" in right
         for name in left.keys() & right.keys():
-            np.testing.assert_allclose(np.subtract(right[name]["location"], left[name]["location"]), [-6, 0, 0], atol=1e-5)
+            np.testing.assert_allclose(
+                np.subtract(right[name]["location"], left[name]["location"]), [-6, 0, 0], atol=1e-5
+            )
             assert left[name]["quaternion_xyzw"] == right[name]["quaternion_xyzw"]
 
 
 def test_keys_are_those_of_a_real_frame(dataset: Path, real_data: Path) -> None:
     folder = dataset / "mixed/scene0000_0"
-    pairs = (("left", "000000.left.json"), ("object", "_object_settings.json"), ("camera", "_camera_settings.json"))
+    pairs = (
+        ("left", "000000.left.json"),
+        ("object", "_object_settings.json"),
+        ("camera", "_camera_settings.json"),
+    )
     for real, ours in pairs:
-        assert_covers(load(folder / ours), load(real_data / "fat" / f"real_fat_single_banana.{real}.json"))
+        assert_covers(
+            load(folder / ours), load(real_data / "fat" / f"real_fat_single_banana.{real}.json")
+        )
 
 
 def assert_covers(ours: Any, real: Any) -> None:
@@ -243,7 +286,9 @@ def test_a_spoilt_record_is_named(tmp_path: Path) -> None:
         ({"renderer": "blender"}, "renderer=blender"),
     ],
 )
-def test_bad_values_end_in_one_line_that_names_them(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+def test_bad_values_end_in_one_line_that_names_them(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UserError, match=message) as caught:
         generate(tmp_path / "out", 1, **{**SETTINGS, **change})
     assert "\n" not in str(caught.value)
@@ -252,16 +297,18 @@ def test_bad_values_end_in_one_line_that_names_them(tmp_path: Path, change: dict
 
 def test_named_cameras_are_the_published_ones() -> None:
     fat = camera_matrix("fat", 960, 540)
-    np.testing.assert_allclose(fat, [[768.16058349609375, 0, 480], [0, 768.16058349609375, 270], [0, 0, 1]])
+    np.testing.assert_allclose(
+        fat, [[768.16058349609375, 0, 480], [0, 768.16058349609375, 270], [0, 0, 1]]
+    )
     ycb = camera_matrix("ycb_video", 640, 480)
     np.testing.assert_allclose(ycb, [[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
     half = camera_matrix("ycb_video", 320, 240)
     point = np.array([0.07, -0.03, 0.9])
     whole, small = ((K @ point)[:2] / point[2] for K in (ycb, half))
-    np.testing.assert_allclose(small, (whole + 0.5) / 2 - 0.5)  # pixel centres at integers in both
+    np.testing.assert_allclose(small, (whole + 0.5) / 2 - 0.5)  # pixel centers at integers in both
     np.testing.assert_allclose(camera_matrix((500, 510, 300, 200), 640, 480)[:2, 2], [300, 200])
 
 
-def test_depth_is_stored_in_tenths_of_millimetres_and_never_wraps() -> None:
+def test_depth_is_stored_in_tenths_of_millimeters_and_never_wraps() -> None:
     units = fat_format.depth_units(np.array([[0.0, 0.5, 6.5535, 6.6]], np.float32))
     np.testing.assert_array_equal(units, [[0, 5000, 65535, 0]])

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from PIL import Image
 
-from posefilter.data.mesh import Mesh, sample_surface, surface_colors, surface_points
-from posefilter.data.mesh_files import read_mesh
 from posefilter.errors import UserError
+from posefilter.meshes.files import read_mesh
+from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface_points
 
 # A pyramid over a square base: corners of the base share positions, not texture coordinates.
 OBJ = """mtllib a.mtl
@@ -55,34 +55,43 @@ def test_obj_keeps_polygons_seams_and_normals(pyramid: Path) -> None:
     assert len(mesh.vertices) == 5
     assert mesh.faces.tolist() == [[0, 3, 2], [0, 2, 1], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
     assert mesh.corner_uv is not None
-    assert mesh.corner_uv[2].tolist() == [[1, 0], [0, 0], [0.5, 0.5]]  # the face in negative indices
+    # the face in negative indices
+    assert mesh.corner_uv[2].tolist() == [[1, 0], [0, 0], [0.5, 0.5]]
     assert mesh.corner_uv[0, 0].tolist() == [0, 0]  # the same vertex in another face
     assert mesh.corner_normals[0].tolist() == [[0, 0, -1]] * 3
     assert mesh.corner_normals[2].tolist() == [[0, -1, 0]] * 3
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume == pytest.approx(0.1 * 0.1 * 0.2 / 3)
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume == pytest.approx(
+        0.1 * 0.1 * 0.2 / 3
+    )
     picture = cv2.imread(str(pyramid.parent / "pic ture.png"))[..., ::-1]
     assert np.array_equal(mesh.texture, picture)  # as it is, in RGB: Kd beside a picture is ignored
 
 
 def test_scale_turns_units_into_metres(pyramid: Path) -> None:
-    assert np.allclose(read_mesh(pyramid, "a", scale=0.5).vertices, read_mesh(pyramid, "a").vertices * 0.5)
+    assert np.allclose(
+        read_mesh(pyramid, "a", scale=0.5).vertices, read_mesh(pyramid, "a").vertices * 0.5
+    )
 
 
 def test_stray_vertices_are_left_out(pyramid: Path) -> None:
     pyramid.write_text(OBJ + "v 50 50 50\n")
-    assert read_mesh(pyramid, "a").bounds[1].max() == pytest.approx(0.2)
+    assert read_mesh(pyramid, "a").box_head[1].max() == pytest.approx(0.2)
 
 
 def test_materials_are_put_into_one_picture(tmp_path: Path) -> None:
     picture = _picture(tmp_path / "b.png", 8)
-    (tmp_path / "b.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl pic\nmap_Kd b.png\nnewmtl unused\nKd 0 1 0\n")
+    (tmp_path / "b.mtl").write_text(
+        "newmtl red\nKd 1 0 0\nnewmtl pic\nmap_Kd b.png\nnewmtl unused\nKd 0 1 0\n"
+    )
     (tmp_path / "b.obj").write_text(
         "mtllib b.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0.5 0.5\nvt 3.0 0\nvt 4 0\nvt 3 1\n"
         "usemtl red\nf 1/1 2/1 3/1\nusemtl pic\nf 1/2 2/3 4/4\n"
     )
     mesh = read_mesh(tmp_path / "b.obj", "b")
     weights = np.array([[0.4, 0.3, 0.3]])
-    assert surface_colors(mesh, np.array([0]), weights)[0].tolist() == pytest.approx([1, 0, 0], abs=1e-6)
+    assert surface_colors(mesh, np.array([0]), weights)[0].tolist() == pytest.approx(
+        [1, 0, 0], abs=1e-6
+    )
     plain = Mesh("p", mesh.vertices, mesh.faces[1:], np.array([[[0, 0], [1, 0], [0, 1]]], dtype=np.float32), picture, None,
                  mesh.corner_normals[1:])  # fmt: skip
     assert surface_colors(mesh, np.array([1]), weights) == pytest.approx(
@@ -90,7 +99,7 @@ def test_materials_are_put_into_one_picture(tmp_path: Path) -> None:
     )
 
 
-def test_plain_obj_has_one_colour(tmp_path: Path) -> None:
+def test_plain_obj_has_one_color(tmp_path: Path) -> None:
     (tmp_path / "c.mtl").write_text("newmtl m\nKd 0.2 0.4 0.6\n")
     (tmp_path / "c.obj").write_text("mtllib c.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     mesh = read_mesh(tmp_path / "c.obj", "c")
@@ -99,7 +108,7 @@ def test_plain_obj_has_one_colour(tmp_path: Path) -> None:
     assert mesh.corner_normals.tolist() == [[[0, 0, 1]] * 3]
 
 
-def test_glb_shows_the_colours_of_the_same_obj(pyramid: Path, tmp_path: Path) -> None:
+def test_glb_shows_the_colors_of_the_same_obj(pyramid: Path, tmp_path: Path) -> None:
     mesh = read_mesh(pyramid, "a")
     assert mesh.corner_uv is not None
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture))
@@ -115,11 +124,14 @@ def test_glb_shows_the_colours_of_the_same_obj(pyramid: Path, tmp_path: Path) ->
     other = read_mesh(tmp_path / "a.glb", "a")
     face, weights = sample_surface(mesh, 200)
     shifted = surface_points(mesh, face, weights) + np.array([0, 0, 0.3])
-    assert surface_points(other, face, weights) == pytest.approx(shifted, abs=1e-6)  # transforms of the scene are applied
-    assert surface_colors(other, face, weights) == pytest.approx(surface_colors(mesh, face, weights), abs=1e-5)
+    # transforms of the scene are applied
+    assert surface_points(other, face, weights) == pytest.approx(shifted, abs=1e-6)
+    assert surface_colors(other, face, weights) == pytest.approx(
+        surface_colors(mesh, face, weights), abs=1e-5
+    )
 
 
-def test_ply_keeps_vertex_colours(tmp_path: Path) -> None:
+def test_ply_keeps_vertex_colors(tmp_path: Path) -> None:
     body = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
     body.visual.vertex_colors = np.concatenate(
         [np.random.default_rng(5).integers(0, 256, (42, 3)), np.full((42, 1), 255)], 1
@@ -128,24 +140,32 @@ def test_ply_keeps_vertex_colours(tmp_path: Path) -> None:
     mesh = read_mesh(tmp_path / "ball.ply", "ball")
     assert mesh.corner_colors is not None
     assert mesh.corner_uv is None
-    assert mesh.corner_colors == pytest.approx(body.visual.vertex_colors[:, :3][mesh.faces] / 255, abs=1e-6)
-    assert surface_colors(mesh, np.array([7]), np.array([[1.0, 0, 0]]))[0] == pytest.approx(mesh.corner_colors[7, 0])
+    assert mesh.corner_colors == pytest.approx(
+        body.visual.vertex_colors[:, :3][mesh.faces] / 255, abs=1e-6
+    )
+    assert surface_colors(mesh, np.array([7]), np.array([[1.0, 0, 0]]))[0] == pytest.approx(
+        mesh.corner_colors[7, 0]
+    )
 
 
 def test_ply_of_bop_reads_its_texture(tmp_path: Path) -> None:
     picture = _picture(tmp_path / "obj_000001.png")
     (tmp_path / "obj_000001.ply").write_text(
-        "ply\nformat ascii 1.0\ncomment TextureFile obj_000001.png\nelement vertex 3\nproperty float x\nproperty float y\n"
-        "property float z\nproperty float nx\nproperty float ny\nproperty float nz\nproperty float texture_u\n"
-        "property float texture_v\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "ply\nformat ascii 1.0\ncomment TextureFile obj_000001.png\nelement vertex 3\nproperty "
+        "float x\nproperty float y\n"
+        "property float z\nproperty float nx\nproperty float ny\nproperty float nz\nproperty "
+        "float texture_u\n"
+        "property float texture_v\nelement face 1\nproperty list uchar int "
+        "vertex_indices\nend_header\n"
         "0 0 0 0 0.6 0.8 0 0\n10 0 0 0 0.6 0.8 1 0\n0 10 0 0 0.6 0.8 0 1\n3 0 1 2\n"
     )
     mesh = read_mesh(tmp_path / "obj_000001.ply", "obj_000001", scale=0.001)
-    assert mesh.bounds[1].tolist() == pytest.approx([0.01, 0.01, 0])
+    assert mesh.box_head[1].tolist() == pytest.approx([0.01, 0.01, 0])
     assert mesh.corner_uv is not None
     assert mesh.corner_uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
     assert np.array_equal(mesh.texture, picture)
-    assert mesh.corner_normals[0, 0] == pytest.approx([0, 0.6, 0.8], abs=1e-6)  # the file's, not the triangle's
+    # the file's, not the triangle's
+    assert mesh.corner_normals[0, 0] == pytest.approx([0, 0.6, 0.8], abs=1e-6)
     (tmp_path / "obj_000001.png").unlink()
     _rejects(tmp_path / "obj_000001.ply", "obj_000001.png", "missing texture")
 

@@ -6,8 +6,8 @@ import torch
 import trimesh
 from scipy.spatial.distance import pdist
 
-from posefilter.data import builtin
-from posefilter.data.mesh import (
+from posefilter.meshes.builtin import catalog as builtin
+from posefilter.meshes.mesh import (
     Mesh,
     creased_normals,
     diameter,
@@ -22,7 +22,12 @@ from posefilter.data.mesh import (
 SIZE = np.array([0.2, 0.3, 0.5])
 
 
-def _mesh(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None, texture: np.ndarray | None = None) -> Mesh:
+def _mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    uv: np.ndarray | None = None,
+    texture: np.ndarray | None = None,
+) -> Mesh:
     texture = np.full((1, 1, 3), 128, dtype=np.uint8) if texture is None else texture
     return Mesh("test", vertices, faces, uv, texture, None, creased_normals(vertices, faces))
 
@@ -30,7 +35,10 @@ def _mesh(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None,
 @pytest.fixture
 def cuboid() -> Mesh:
     body = trimesh.creation.box(SIZE)
-    return _mesh(np.asarray(body.vertices) + np.array([1.0, 2.0, 3.0]), np.asarray(body.faces, dtype=np.int64))
+    return _mesh(
+        np.asarray(body.vertices) + np.array([1.0, 2.0, 3.0]),
+        np.asarray(body.faces, dtype=np.int64),
+    )
 
 
 def test_object_model_of_a_cuboid_is_analytic(cuboid: Mesh) -> None:
@@ -42,8 +50,13 @@ def test_object_model_of_a_cuboid_is_analytic(cuboid: Mesh) -> None:
     assert model.points.shape == (500, 3)
     assert model.points.dtype == torch.float32
     assert torch.equal(model.symmetries, torch.eye(4)[None])
-    reach = ((model.points - model.center).abs() * 2 / torch.tensor(SIZE, dtype=torch.float32)).max(dim=1).values
-    assert torch.allclose(reach, torch.ones(500), atol=1e-5)  # every point lies on the surface, none inside
+    reach = (
+        ((model.points - model.center).abs() * 2 / torch.tensor(SIZE, dtype=torch.float32))
+        .max(dim=1)
+        .values
+    )
+    # every point lies on the surface, none inside
+    assert torch.allclose(reach, torch.ones(500), atol=1e-5)
 
 
 def test_given_points_are_kept(cuboid: Mesh) -> None:
@@ -57,18 +70,24 @@ def test_points_are_spread_by_area_and_seeded(cuboid: Mesh) -> None:
     assert weights.min() >= 0
     points = surface_points(cuboid, face, weights) - [1, 2, 3]
     for axis in range(3):
-        area = np.prod(np.delete(SIZE, axis)) / (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[0] * SIZE[2]) / 2
+        area = (
+            np.prod(np.delete(SIZE, axis))
+            / (SIZE[0] * SIZE[1] + SIZE[1] * SIZE[2] + SIZE[0] * SIZE[2])
+            / 2
+        )
         for side in (-1, 1):
             share = np.isclose(points[:, axis], side * SIZE[axis] / 2).mean()
             assert share == pytest.approx(area, abs=2e-3)
     assert np.array_equal(object_model(cuboid, seed=1).points, object_model(cuboid, seed=1).points)
-    assert not np.array_equal(object_model(cuboid, seed=1).points, object_model(cuboid, seed=2).points)
+    assert not np.array_equal(
+        object_model(cuboid, seed=1).points, object_model(cuboid, seed=2).points
+    )
 
 
 def test_diameter_is_the_brute_force_one() -> None:
-    cloud = np.random.default_rng(1).normal(size=(400, 3)) * [0.02, 0.05, 0.03]
-    assert diameter(cloud) == pytest.approx(pdist(cloud).max(), rel=1e-12)
-    flat = cloud * [1, 1, 0]
+    particles = np.random.default_rng(1).normal(size=(400, 3)) * [0.02, 0.05, 0.03]
+    assert diameter(particles) == pytest.approx(pdist(particles).max(), rel=1e-12)
+    flat = particles * [1, 1, 0]
     assert diameter(flat) == pytest.approx(pdist(flat).max(), rel=1e-9)
 
 
@@ -80,7 +99,7 @@ def _short(hull: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", builtin.names())
-def test_few_hull_vertices_draw_the_outline_within_about_a_millimetre(name: str) -> None:
+def test_few_hull_vertices_draw_the_outline_within_about_a_millimeter(name: str) -> None:
     vertices = builtin.build(name).vertices
     hull = outline_hull(vertices)
     assert len(hull) <= 128
@@ -104,11 +123,15 @@ def test_normals_are_crisp_on_boxes_and_smooth_on_spheres(cuboid: Mesh) -> None:
     body = trimesh.Trimesh(cuboid.vertices, cuboid.faces, process=False)
     assert np.allclose(cuboid.corner_normals, body.face_normals[:, None], atol=1e-6)
     ball = trimesh.creation.icosphere(subdivisions=3)
-    loose = np.asarray(ball.triangles).reshape(-1, 3)  # every triangle with its own vertices, as texture seams leave them
+    # every triangle with its own vertices, as texture seams leave them
+    loose = np.asarray(ball.triangles).reshape(-1, 3)
     normals = creased_normals(loose, np.arange(len(loose)).reshape(-1, 3))
     cosine = np.einsum("fic,fic->fi", normals, loose.reshape(-1, 3, 3))
     assert np.rad2deg(np.arccos(cosine.clip(-1, 1))).max() < 1.0
-    assert np.rad2deg(np.arccos(np.einsum("fc,fic->fi", ball.face_normals, normals).clip(-1, 1))).max() > 2.0  # not flat
+    assert (
+        np.rad2deg(np.arccos(np.einsum("fc,fic->fi", ball.face_normals, normals).clip(-1, 1))).max()
+        > 2.0
+    )  # not flat
 
 
 def test_normals_match_a_naive_loop() -> None:
@@ -119,14 +142,21 @@ def test_normals_match_a_naive_loop() -> None:
     for face in range(0, len(mesh.faces), 97):
         for corner in range(3):
             around = (mesh.faces == mesh.faces[face, corner]).any(1)
-            total = sum(weighted[f] for f in np.flatnonzero(around) if unit[f] @ unit[face] >= np.cos(np.deg2rad(40)))
-            assert mesh.corner_normals[face, corner] == pytest.approx(total / np.linalg.norm(total), abs=1e-5)
+            total = sum(
+                weighted[f]
+                for f in np.flatnonzero(around)
+                if unit[f] @ unit[face] >= np.cos(np.deg2rad(40))
+            )
+            assert mesh.corner_normals[face, corner] == pytest.approx(
+                total / np.linalg.norm(total), abs=1e-5
+            )
 
 
 def test_colors_are_read_bilinearly_with_v_upwards() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    texture = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)  # red is top left
+    # red is top left
+    texture = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)
     mesh = _mesh(vertices, faces, vertices[faces][..., :2].astype(np.float32), texture)
 
     def at(x: float, y: float) -> list[float]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from posefilter.data import ycb
-from posefilter.data.meshes import MeshStore, symmetry_group
-from posefilter.data.symmetries import turn_about
 from posefilter.errors import UserError
+from posefilter.meshes import ycb
+from posefilter.meshes.store import MeshStore, symmetry_group
+from posefilter.meshes.symmetries import turn_about
 
 HALF = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about z
 
@@ -30,7 +30,8 @@ def _fails(store: MeshStore, name: str) -> str:
 
 def test_all_layouts_are_found(tmp_path: Path) -> None:
     _box(tmp_path / "003_cracker_box" / "google_16k" / "textured.obj", (0.1, 0.1, 0.11))
-    _box(tmp_path / "003_cracker_box" / "textured.ply", (0.1, 0.1, 0.12))  # the YCB layout goes first
+    # the YCB layout goes first
+    _box(tmp_path / "003_cracker_box" / "textured.ply", (0.1, 0.1, 0.12))
     _box(tmp_path / "tin" / "textured.glb")
     _box(tmp_path / "tin" / "other.ply")  # textured.* goes first
     _box(tmp_path / "cup" / "scan.PLY".lower(), (0.1, 0.1, 0.13))
@@ -40,7 +41,9 @@ def test_all_layouts_are_found(tmp_path: Path) -> None:
     store = MeshStore(tmp_path)
     assert store.names() == ["003_cracker_box", "cup", "flat", "tin"]
     heights = {name: float(np.ptp(store.load(name).vertices[:, 2])) for name in store.names()}
-    assert heights == pytest.approx({"003_cracker_box": 0.11, "cup": 0.13, "flat": 0.14, "tin": 0.3})
+    assert heights == pytest.approx(
+        {"003_cracker_box": 0.11, "cup": 0.13, "flat": 0.14, "tin": 0.3}
+    )
     assert store.load("tin") is store.load("tin")
     assert store.load("tin").name == "tin"
 
@@ -58,7 +61,8 @@ def test_empty_and_ambiguous_folders_are_named(tmp_path: Path) -> None:
             MeshStore(root)
     _box(tmp_path / "two" / "a.ply")
     _box(tmp_path / "two" / "a.obj", (0.1, 0.1, 0.11))
-    assert np.ptp(MeshStore(tmp_path).load("two").vertices[:, 2]) == pytest.approx(0.11)  # one mesh in two formats
+    # one mesh in two formats
+    assert np.ptp(MeshStore(tmp_path).load("two").vertices[:, 2]) == pytest.approx(0.11)
     _box(tmp_path / "two" / "b.obj")
     with pytest.raises(UserError, match="two: 3 meshes"):
         MeshStore(tmp_path)
@@ -68,10 +72,12 @@ def test_units_are_not_guessed(tmp_path: Path) -> None:
     _box(tmp_path / "mm.obj", (100, 200, 300))
     _box(tmp_path / "tiny.obj", (1e-4, 2e-4, 3e-4))
     store = MeshStore(tmp_path)
-    assert "millimetres" in _fails(store, "mm")
+    assert "millimeters" in _fails(store, "mm")
     assert "scale=0.001" in _fails(store, "mm")
     assert "scale=1000" in _fails(store, "tiny")
-    assert np.ptp(MeshStore(tmp_path, scale=0.001).load("mm").vertices, axis=0) == pytest.approx([0.1, 0.2, 0.3])
+    assert np.ptp(MeshStore(tmp_path, scale=0.001).load("mm").vertices, axis=0) == pytest.approx(
+        [0.1, 0.2, 0.3]
+    )
 
 
 def test_symmetries_come_from_the_argument_then_the_file_then_the_table(tmp_path: Path) -> None:
@@ -79,14 +85,17 @@ def test_symmetries_come_from_the_argument_then_the_file_then_the_table(tmp_path
     _box(tmp_path / "obj_000002.ply", (100, 200, 300))
     far = HALF.copy()
     far[:3, 3] = [20.0, 0, 0]
-    info = {"13": {"diameter": 300, "symmetries_discrete": [far.ravel().tolist()]}, "2": {"diameter": 300}}
+    info = {
+        "13": {"diameter": 300, "symmetries_discrete": [far.ravel().tolist()]},
+        "2": {"diameter": 300},
+    }
     (tmp_path / "models_info.json").write_text(json.dumps(info))
     store = MeshStore(tmp_path, scale=0.001)
     assert store.load("obj_000002").symmetries.tolist() == [np.eye(4).tolist()]
     read = store.load("obj_000013").symmetries
     assert read.shape == (2, 4, 4)
     assert read[0].tolist() == np.eye(4).tolist()
-    assert read[1, :3, 3].tolist() == pytest.approx([0.02, 0, 0])  # millimetres, as the mesh
+    assert read[1, :3, 3].tolist() == pytest.approx([0.02, 0, 0])  # millimeters, as the mesh
     given = MeshStore(tmp_path, scale=0.001, symmetries={"obj_000013": np.stack([HALF, np.eye(4)])})
     assert np.array_equal(given.load("obj_000013").symmetries, np.stack([np.eye(4), HALF]))
 
@@ -95,7 +104,10 @@ def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
     _box(tmp_path / "024_bowl" / "textured.obj")
     table = MeshStore(tmp_path).load("024_bowl").symmetries
     assert table == pytest.approx(ycb.symmetries("024_bowl"))
-    own = {"symmetries_discrete": [], "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0.01, 0, 0]}]}
+    own = {
+        "symmetries_discrete": [],
+        "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0.01, 0, 0]}],
+    }
     (tmp_path / "024_bowl" / "symmetries.json").write_text(json.dumps(own))
     read = MeshStore(tmp_path, symmetry_steps=4).load("024_bowl").symmetries
     assert len(read) == 4
@@ -105,12 +117,18 @@ def test_a_folder_of_its_own_may_say_its_symmetries(tmp_path: Path) -> None:
 
 def test_bad_symmetries_are_named(tmp_path: Path) -> None:
     _box(tmp_path / "a.obj")
-    for text in ('{"a": {"symmetries_discrete": [[1, 2]]}}', "{", '{"a": {"symmetries_continuous": [{}]}}'):
+    for text in (
+        '{"a": {"symmetries_discrete": [[1, 2]]}}',
+        "{",
+        '{"a": {"symmetries_continuous": [{}]}}',
+    ):
         (tmp_path / "symmetries.json").write_text(text)
         assert "symmetries.json" in _fails(MeshStore(tmp_path), "a")
     (tmp_path / "symmetries.json").unlink()
     mirror = np.diag([-1.0, 1, 1, 1])
-    assert "mirror" in _fails(MeshStore(tmp_path, symmetries={"a": np.stack([np.eye(4), mirror])}), "a")
+    assert "mirror" in _fails(
+        MeshStore(tmp_path, symmetries={"a": np.stack([np.eye(4), mirror])}), "a"
+    )
     assert "(S, 4, 4)" in _fails(MeshStore(tmp_path, symmetries={"a": np.eye(4)}), "a")
 
 

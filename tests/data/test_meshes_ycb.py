@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from posefilter.data import ycb
-from posefilter.data.mesh import diameter, outline_hull, sample_surface, sphere_directions, surface_points
-from posefilter.data.meshes import MeshStore
+from posefilter.meshes import ycb
+from posefilter.meshes.mesh import (
+    diameter,
+    outline_hull,
+    sample_surface,
+    sphere_directions,
+    surface_points,
+)
+from posefilter.meshes.store import MeshStore
 
 FITTING = [name for name in ycb.CLASSES if name not in ycb.WITHOUT_GEOMETRY]
 SYMMETRIC = [name for name in ycb.CLASSES if ycb.symmetries(name) is not None]
@@ -27,7 +33,10 @@ def fat_settings(real_data: Path) -> dict[str, dict]:
     file = real_data / "fat" / "nvdu_ycb_original.json"
     if not file.is_file():
         pytest.skip(f"no {file}")
-    return {entry["class"].removesuffix("_16k"): entry for entry in json.loads(file.read_text())["exported_objects"]}
+    return {
+        entry["class"].removesuffix("_16k"): entry
+        for entry in json.loads(file.read_text())["exported_objects"]
+    }
 
 
 def test_ids_count_from_one() -> None:
@@ -46,20 +55,28 @@ def test_ids_and_sizes_are_those_of_fat(fat_settings: dict[str, dict]) -> None:
     assert list(fat_settings) == list(ycb.CLASSES)
     for name, entry in fat_settings.items():
         assert ycb.fat_segmentation_id(name) == entry["segmentation_class_id"]
-        assert np.array(ycb.SIZES_ALIGNED[name]) * 100 == pytest.approx(np.array(entry["cuboid_dimensions"]), abs=2e-3)
+        assert np.array(ycb.SIZES_ALIGNED[name]) * 100 == pytest.approx(
+            np.array(entry["cuboid_dimensions"]), abs=2e-3
+        )
 
 
 @pytest.mark.parametrize("name", FITTING)
-def test_meshes_fill_the_cuboids_of_fat(store: MeshStore, fat_settings: dict[str, dict], name: str) -> None:
+def test_meshes_fill_the_cuboids_of_fat(
+    store: MeshStore, fat_settings: dict[str, dict], name: str
+) -> None:
     vertices = store.load(name).vertices
-    aligned = np.c_[vertices, np.ones(len(vertices))] @ np.array(fat_settings[name]["fixed_model_transform"])
+    aligned = np.c_[vertices, np.ones(len(vertices))] @ np.array(
+        fat_settings[name]["fixed_model_transform"]
+    )
     low, high = aligned[:, :3].min(0) / 100, aligned[:, :3].max(0) / 100
     assert high - low == pytest.approx(np.array(ycb.SIZES_ALIGNED[name]), abs=1e-4)
     assert (high + low) / 2 == pytest.approx(np.zeros(3), abs=1e-4)
 
 
 @pytest.mark.parametrize("name", FITTING)
-def test_meshes_lie_on_the_points_of_ycb_video(store: MeshStore, real_data: Path, name: str) -> None:
+def test_meshes_lie_on_the_points_of_ycb_video(
+    store: MeshStore, real_data: Path, name: str
+) -> None:
     points = np.loadtxt(real_data / "ycbv" / "models" / name / "points.xyz")
     mesh = store.load(name)
     surface = surface_points(mesh, *sample_surface(mesh, 40000))
@@ -93,7 +110,9 @@ def test_real_meshes_are_read_well(store: MeshStore, name: str) -> None:
     facing = np.einsum("fc,fic->fi", np.cross(b - a, c - a), mesh.corner_normals)
     assert (facing > 0).mean() > 0.98  # the file's normals point where the winding says
     directions = sphere_directions(1000).T
-    reach = [(points @ directions).max(axis=0) for points in (mesh.vertices, outline_hull(mesh.vertices))]
+    reach = [
+        (points @ directions).max(axis=0) for points in (mesh.vertices, outline_hull(mesh.vertices))
+    ]
     assert (reach[0] - reach[1]).max() < 1e-3
     box = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     assert 0.6 * box < diameter(mesh.vertices) <= box

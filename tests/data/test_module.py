@@ -6,13 +6,24 @@ import json
 import numpy as np
 import pytest
 import torch
-from dataset_trees import HIGH, LOW, K, bop_scene, fat_folder, fat_frame, fat_tree, pose, truth, write_mesh
+from dataset_trees import (
+    HIGH,
+    LOW,
+    K,
+    bop_scene,
+    fat_folder,
+    fat_frame,
+    fat_tree,
+    pose,
+    truth,
+    write_mesh,
+)
 from torch.utils.data import default_collate
 
-from posefilter.data.meshes import MeshStore
 from posefilter.data.module import PoseDataModule, spare_cores
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
+from posefilter.meshes.store import MeshStore
 from posefilter.types import Batch
 
 
@@ -24,7 +35,13 @@ def root(tmp_path_factory):
 
 
 def module(root, **how):
-    settings = {"source": "fat", "root": root / "data", "object": "toy", "meshes": root / "meshes", "progress": False}
+    settings = {
+        "source": "fat",
+        "root": root / "data",
+        "object": "toy",
+        "meshes": root / "meshes",
+        "progress": False,
+    }
     return PoseDataModule(**{**settings, **how})
 
 
@@ -48,7 +65,8 @@ def test_scenes_by_name_lists_and_the_rest(root, tmp_path):
     dm = module(root, split={"test": "list.txt", "val": ["kitchen_4"], "train": 1.0})
     assert [r.name for r in dm.records("test")] == ["mixed/kitchen_5/000001.left"]
     assert {r.group for r in dm.records("val")} == {"kitchen_4"}
-    assert {r.group for r in dm.records("train")} == {f"kitchen_{i}" for i in range(4)}  # not the rest of kitchen_5
+    # not the rest of kitchen_5
+    assert {r.group for r in dm.records("train")} == {f"kitchen_{i}" for i in range(4)}
     assert len(module(root, split={"test": 1.0}).records("test")) == 18
     for split, words in (
         ({"train": 0.9, "test": 0.3}, "sum to 1"),
@@ -67,19 +85,28 @@ def test_too_few_scenes_say_so(tmp_path):
         PoseDataModule("fat", tmp_path, "toy").setup()
 
 
-def test_bops_own_models_are_in_millimetres(tmp_path):
-    path = write_mesh(tmp_path / "meshes", "obj_000002") / "obj_000002" / "google_16k" / "textured.obj"
+def test_bops_own_models_are_in_millimeters(tmp_path):
+    path = (
+        write_mesh(tmp_path / "meshes", "obj_000002") / "obj_000002" / "google_16k" / "textured.obj"
+    )
     lines = [line.split() for line in path.read_text().splitlines()]
-    path.write_text("\n".join(" ".join([x[0], *(str(float(n) * 1000) for n in x[1:])] if x[0] == "v" else x) for x in lines))
+    path.write_text(
+        "\n".join(
+            " ".join([x[0], *(str(float(n) * 1000) for n in x[1:])] if x[0] == "v" else x)
+            for x in lines
+        )
+    )
     bop_scene(tmp_path / "000048", [[(2, pose())]])
     dm = PoseDataModule("bop", tmp_path, "obj_000002", tmp_path / "meshes", split={"test": 1.0})
-    np.testing.assert_allclose(dm.meshes.load("obj_000002").bounds, [LOW, HIGH], atol=1e-9)
+    np.testing.assert_allclose(dm.meshes.load("obj_000002").box_head, [LOW, HIGH], atol=1e-9)
     assert float(dm.test_dataset[0].visibility) == pytest.approx(1.0, abs=0.01)
 
 
 def test_bop_targets_choose_frames(tmp_path):
     bop_scene(tmp_path / "000048", [[(2, pose())], [(2, pose())]])
-    (tmp_path / "targets.json").write_text(json.dumps([{"scene_id": 48, "im_id": 1, "obj_id": 2, "inst_count": 1}]))
+    (tmp_path / "targets.json").write_text(
+        json.dumps([{"scene_id": 48, "im_id": 1, "obj_id": 2, "inst_count": 1}])
+    )
     dm = PoseDataModule("bop", tmp_path, "obj_000002", split={"test": "targets.json"})
     assert [r.im_id for r in dm.records("test")] == [1]
 
@@ -112,7 +139,14 @@ def test_a_batch_is_the_truth_at_network_size(root):
 
 def test_caches_agree_and_disk_notices_change(root, tmp_path):
     def batch(kind):
-        dm = module(root, image_width=80, split={"test": 1.0}, batch_size=18, cache=kind, cache_dir=tmp_path / "cache")
+        dm = module(
+            root,
+            image_width=80,
+            split={"test": 1.0},
+            batch_size=18,
+            cache=kind,
+            cache_dir=tmp_path / "cache",
+        )
         return next(iter(dm.test_dataloader()))
 
     first = batch("memory")
@@ -123,10 +157,18 @@ def test_caches_agree_and_disk_notices_change(root, tmp_path):
 
 def test_disk_cache_is_used_and_renewed(tmp_path, monkeypatch):
     fat_tree(tmp_path / "data", scenes=1, frames=2)
-    how = {"source": "fat", "root": tmp_path / "data", "object": "toy", "split": {"test": 1.0}, "cache": "disk"}
+    how = {
+        "source": "fat",
+        "root": tmp_path / "data",
+        "object": "toy",
+        "split": {"test": 1.0},
+        "cache": "disk",
+    }
     first = PoseDataModule(**how).test_dataset[0]
     fresh = PoseDataModule(**how)
-    monkeypatch.setattr(type(fresh.reader), "read", lambda self, i: pytest.fail("decoded although cached"))
+    monkeypatch.setattr(
+        type(fresh.reader), "read", lambda self, i: pytest.fail("decoded although cached")
+    )
     torch.testing.assert_close(fresh.test_dataset[0].rgb, first.rgb)
     monkeypatch.undo()
     other = pose((0.9, 0.1, 0.2), (0.02, 0.01, 0.5))
@@ -170,23 +212,34 @@ def test_smaller_limits_take_a_part_of_larger_ones(root):
 
 def shade(sample, draw, rng):
     other = draw(rng)
-    return dataclasses.replace(sample, rgb=np.full_like(sample.rgb, rng.integers(256)), visibility=float(other.frame_id))
+    return dataclasses.replace(
+        sample, rgb=np.full_like(sample.rgb, rng.integers(256)), visibility=float(other.frame_id)
+    )
 
 
 def epoch_of(dm, epoch):
     loader = dm.train_dataloader()
     loader.sampler.set_epoch(epoch)  # as Lightning does
-    return default_collate([item for batch in loader for item in map(Batch._make, zip(*batch, strict=True))])
+    return default_collate(
+        [item for batch in loader for item in map(Batch._make, zip(*batch, strict=True))]
+    )
 
 
 def test_augmentation_depends_on_seed_epoch_and_frame_alone(root):
     def run(workers, seed, epoch):
-        how = {"split": {"train": 0.7, "test": 0.3}, "augment": shade, "batch_size": 3, "workers": workers, "seed": seed}
+        how = {
+            "split": {"train": 0.7, "test": 0.3},
+            "augment": shade,
+            "batch_size": 3,
+            "workers": workers,
+            "seed": seed,
+        }
         dm = module(root, image_width=80, **how)
         batch = epoch_of(dm, epoch)
         order = batch.frame_id.argsort()
         return batch.frame_id.tolist(), [
-            f[order][:, 0, 0, 0].tolist() if f.ndim == 4 else f[order].tolist() for f in (batch.rgb, batch.visibility)
+            f[order][:, 0, 0, 0].tolist() if f.ndim == 4 else f[order].tolist()
+            for f in (batch.rgb, batch.visibility)
         ]
 
     order, values = run(0, 0, 3)
@@ -225,7 +278,11 @@ def test_broken_frames_raise_or_are_counted(tmp_path):
         PoseDataModule(**how).setup("test")
     dm = PoseDataModule(**how, on_error="skip")
     assert [r.im_id for r in dm.records("test")] == [0, 1, 3]
-    assert dm.describe()["splits"]["test"] == {"frames": 3, "scenes": 1, "left_out": {"truncated or corrupt image": 1}}
+    assert dm.describe()["splits"]["test"] == {
+        "frames": 3,
+        "scenes": 1,
+        "left_out": {"truncated or corrupt image": 1},
+    }
 
 
 def test_scenes_are_rendered_where_they_are_missing(tmp_path):
@@ -239,7 +296,8 @@ def test_scenes_are_rendered_where_they_are_missing(tmp_path):
     for _ in range(2):
         dm.prepare_data()
     assert calls == [tmp_path / "new"]
-    (tmp_path / "new" / "_generator.json").write_text(json.dumps({"frames": 10}))  # nine are there: it was cut short
+    # nine are there: it was cut short
+    (tmp_path / "new" / "_generator.json").write_text(json.dumps({"frames": 10}))
     dm.prepare_data()
     assert len(calls) == 2
     with pytest.raises(UserError, match="no scenes here"):
@@ -278,15 +336,21 @@ def test_an_open_mesh_store_may_be_given(root):
     assert dm.object_model(0).name == "toy"
 
 
-@pytest.mark.parametrize(("cores", "threads", "workers"), [(2, 2, 0), (4, 3, 1), (16, 8, 4), (1, 2, 0)])
+@pytest.mark.parametrize(
+    ("cores", "threads", "workers"), [(2, 2, 0), (4, 3, 1), (16, 8, 4), (1, 2, 0)]
+)
 def test_loader_processes_take_the_cores_that_are_spare(monkeypatch, cores, threads, workers):
-    monkeypatch.setattr("posefilter.data.module.os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setattr(
+        "posefilter.data.module.os.sched_getaffinity", lambda _: set(range(cores)), raising=False
+    )
     monkeypatch.setattr("posefilter.data.module.torch.get_num_threads", lambda: threads)
     monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: False)
     assert spare_cores() == workers
 
 
 def test_a_gpu_leaves_the_cores_to_the_loader(monkeypatch):
-    monkeypatch.setattr("posefilter.data.module.os.sched_getaffinity", lambda _: set(range(4)), raising=False)
+    monkeypatch.setattr(
+        "posefilter.data.module.os.sched_getaffinity", lambda _: set(range(4)), raising=False
+    )
     monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: True)
     assert spare_cores() == 3

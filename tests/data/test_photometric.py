@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from posefilter.data.augment import Augment
+from posefilter.data.augmentation import Augment
 from posefilter.data.frames import Sample
 from posefilter.data.photometric import (
     ColorResponse,
@@ -49,7 +49,9 @@ def sample(seed: int = 0) -> Sample:
     mask = np.zeros((48, 64), bool)
     mask[10:30, 20:50] = True
     depth = rng.uniform(0.5, 1, (48, 64)).astype(np.float32)
-    return Sample(rgb, depth, mask, np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32), 0, 0, 1.0)
+    return Sample(
+        rgb, depth, mask, np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32), 0, 0, 1.0
+    )
 
 
 def apply(step: Augment, x: Sample, seed: int = 1) -> Sample:
@@ -77,7 +79,8 @@ def test_only_color_changes_and_the_seed_decides_how(step: Augment) -> None:
 
 
 @pytest.mark.parametrize(
-    ("on", "off"), [(ColorResponse(), OFF[0]), (ColorResponse(), OFF[2]), (Jpeg(), Jpeg(probability=0))]
+    ("on", "off"),
+    [(ColorResponse(), OFF[0]), (ColorResponse(), OFF[2]), (Jpeg(), Jpeg(probability=0))],
 )
 def test_what_is_drawn_does_not_depend_on_the_strength(on: Augment, off: Augment) -> None:
     after = []
@@ -96,7 +99,8 @@ def test_a_rotation_of_hue_keeps_gray_and_the_mean_of_the_channels() -> None:
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(turn) == pytest.approx(1)
     red = np.array([1.0, 0, 0])
-    np.testing.assert_allclose(hue_rotation(2 * np.pi / 3) @ red, [0, 1, 0], atol=1e-12)  # red, green, blue in turn
+    # red, green, blue in turn
+    np.testing.assert_allclose(hue_rotation(2 * np.pi / 3) @ red, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(hue_rotation(0.3) @ hue_rotation(0.5), hue_rotation(0.8), atol=1e-12)
 
 
@@ -138,13 +142,16 @@ def test_the_object_changes_apart_from_its_surroundings() -> None:
 
 
 def test_the_drawn_hues_have_the_spread_that_is_asked_for() -> None:
-    """The standard deviation of hue is measured on a saturated color, to within its sampling error (3 sigma)."""
+    """The standard deviation of hue is measured on a saturated color, to within its sampling error
+    (3 sigma).
+    """
     color = np.array([150, 110, 90], np.uint8)
     flat = dataclasses.replace(sample(), rgb=np.broadcast_to(color, (48, 64, 3)).copy())
     step = ColorResponse(hue_deg=14, mixing=0, tint=0, gamma=0)
     angles = [hue_of(apply(step, flat, seed).rgb[0, 0]) - hue_of(color) for seed in range(400)]
     spread = np.rad2deg(np.std((np.array(angles) + np.pi) % (2 * np.pi) - np.pi))
-    assert abs(spread - 14) < 3 * 14 / np.sqrt(2 * 400) + 0.5  # and half a degree for the rounding to bytes
+    # and half a degree for the rounding to bytes
+    assert abs(spread - 14) < 3 * 14 / np.sqrt(2 * 400) + 0.5
 
 
 def hue_of(color: np.ndarray) -> float:
@@ -173,13 +180,17 @@ def test_highlights_clip_and_never_darken() -> None:
 def test_motion_blur_keeps_a_constant_image_and_smooths_another() -> None:
     flat = dataclasses.replace(sample(), rgb=np.full((48, 64, 3), 77, np.uint8))
     for seed in range(5):
-        assert np.abs(apply(MotionBlur(0.2, probability=1), flat, seed).rgb.astype(int) - 77).max() <= 1
+        assert (
+            np.abs(apply(MotionBlur(0.2, probability=1), flat, seed).rgb.astype(int) - 77).max()
+            <= 1
+        )
     assert apply(MotionBlur(0.2, probability=1), sample()).rgb.std() < 0.9 * sample().rgb.std()
 
 
 def test_a_jpeg_of_high_quality_is_closer_than_one_of_low() -> None:
     smooth = dataclasses.replace(
-        sample(), rgb=np.repeat(np.arange(48, dtype=np.uint8)[:, None, None] * 5, 64, 1).repeat(3, -1)
+        sample(),
+        rgb=np.repeat(np.arange(48, dtype=np.uint8)[:, None, None] * 5, 64, 1).repeat(3, -1),
     )
     error = []
     for quality in (95, 10):

@@ -1,4 +1,6 @@
-"""The renderers against geometry: depth on spheres, boxes and oblique planes to 0.1 mm, with half-pixel canaries."""
+"""The renderers against geometry: depth on spheres, boxes and oblique planes to 0.1 mm, with
+half-pixel canaries.
+"""
 
 from collections.abc import Callable
 
@@ -7,19 +9,21 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from posefilter.data.lookalikes import box, stretched
-from posefilter.data.mesh import Mesh, creased_normals
-from posefilter.data.render import EmbreeRenderer, render_depth
-from posefilter.data.sampling import sample_texture
-from posefilter.data.surfaces import Instance, Lights, Plane, Surfaces, light, pixel_rays
 from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.rendering.embree import EmbreeRenderer, render_depth
+from posefilter.rendering.sampling import sample_texture
+from posefilter.rendering.surfaces import Instance, Lights, Plane, Surfaces, light, pixel_rays
+from posefilter.synthetic.lookalikes import box, stretched
 
 H, W = 120, 160
 K = np.array([[270.0, 0, 81.3], [0, 268.0, 58.6], [0, 0, 1]])
 TOLERANCE = 1e-4  # [m]
 
 
-def plain(name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int] = (200, 100, 50)) -> Mesh:
+def plain(
+    name: str, vertices: np.ndarray, faces: np.ndarray, color: tuple[int, int, int] = (200, 100, 50)
+) -> Mesh:
     texture = np.array(color, np.uint8).reshape(1, 1, 3)
     return Mesh(name, vertices, faces, None, texture, None, creased_normals(vertices, faces))
 
@@ -72,14 +76,18 @@ SPHERE, BOX, PLANE = (
 SIDES = np.array([0.16, 0.21, 0.07])
 CASES: dict[str, tuple[Mesh, np.ndarray, Callable[[np.ndarray], np.ndarray]]] = {
     "sphere": (sphere(0.12), SPHERE, lambda K: exact_sphere(K, SPHERE, 0.12)),
-    "box": (box("box", SIDES, [np.zeros((4, 4, 3), np.uint8)] * 6), BOX, lambda K: exact_box(K, BOX, SIDES)),
+    "box": (
+        box("box", SIDES, [np.zeros((4, 4, 3), np.uint8)] * 6),
+        BOX,
+        lambda K: exact_box(K, BOX, SIDES),
+    ),
     "plane": (quad(5.0), PLANE, lambda K: exact_plane(K, PLANE)),
 }
 
 
 def depth_by_gl(mesh: Mesh, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     pytest.importorskip("moderngl", reason="the optional extra [moderngl] is not installed")
-    from posefilter.data.render_gl import GLRenderer
+    from posefilter.rendering.opengl import GLRenderer
 
     try:
         seen = GLRenderer().surfaces([Instance(mesh, T)], K, H, W)
@@ -96,10 +104,13 @@ def judge(depth: np.ndarray, exact: np.ndarray) -> tuple[float, int]:
     """Largest depth error [m] away from the outline, and pixels whose hit or miss differs."""
     both = (depth > 0) & (exact > 0)
     grazing = np.zeros_like(both)
-    for axis in (0, 1):  # the outline's own pixels may fall either way, and grazed spheres are faceted
+    # the outline's own pixels may fall either way, and grazed spheres are faceted
+    for axis in (0, 1):
         for shift in (-4, -2, -1, 1, 2, 4):
             grazing |= np.roll(exact, shift, axis) == 0
-    return float(np.abs(depth - exact)[both & ~grazing].max()), int(((depth > 0) != (exact > 0)).sum())
+    return float(np.abs(depth - exact)[both & ~grazing].max()), int(
+        ((depth > 0) != (exact > 0)).sum()
+    )
 
 
 @pytest.mark.parametrize("render", [depth_by_embree, depth_by_gl])
@@ -112,12 +123,16 @@ def test_depth_agrees_with_geometry_and_half_a_pixel_would_not(render: Callable,
     assert misfits <= 4
     assert ((index == 0) == (depth > 0)).all()
     assert (index == 0).sum() > 1000
-    for shift in ((0.5, 0), (0, 0.5), (-0.5, 0), (0, -0.5)):  # the canary: the classic silent slip must fail
+    # the canary: the classic silent slip must fail
+    for shift in ((0.5, 0), (0, 0.5), (-0.5, 0), (0, -0.5)):
         moved = K.copy()
         moved[:2, 2] += shift
         slipped, misplaced = judge(depth, exact(moved))
         assert slipped > 2 * TOLERANCE or misplaced > 30
-    wrong = [judge(depth, exact(K + np.array([[0, 0, a], [0, 0, b], [0, 0, 0]])))[0] for a, b in ((0.5, 0), (0, 0.5))]
+    wrong = [
+        judge(depth, exact(K + np.array([[0, 0, a], [0, 0, b], [0, 0, 0]])))[0]
+        for a, b in ((0.5, 0), (0, 0.5))
+    ]
     assert max(wrong) > 2 * TOLERANCE
 
 
@@ -146,7 +161,9 @@ def test_a_stretched_pose_equals_a_stretched_mesh() -> None:
     mesh, T = CASES["box"][0], CASES["box"][1]
     factors = np.array([1.3, 0.7, 1.1])
     seen = EmbreeRenderer().surfaces([Instance(mesh, T @ np.diag([*factors, 1]))], K, H, W)
-    baked = EmbreeRenderer().surfaces([Instance(stretched(mesh, "other", factors, mesh.texture), T)], K, H, W)
+    baked = EmbreeRenderer().surfaces(
+        [Instance(stretched(mesh, "other", factors, mesh.texture), T)], K, H, W
+    )
     np.testing.assert_allclose(seen.depth, baked.depth, atol=2e-6)
     np.testing.assert_allclose(seen.normal, baked.normal, atol=1e-4)
 
@@ -154,7 +171,8 @@ def test_a_stretched_pose_equals_a_stretched_mesh() -> None:
 def test_each_face_of_a_box_shows_its_own_print_the_right_way_up() -> None:
     prints = [np.full((8, 8, 3), 20 + 35 * k, np.uint8) for k in range(6)]
     prints[5] = prints[5].copy()
-    prints[5][:, :4] = 255  # the left half of the print on the -z face, which faces an unturned camera
+    # the left half of the print on the -z face, which faces an unturned camera
+    prints[5][:, :4] = 255
     mesh = box("box", np.array([0.2, 0.2, 0.2]), prints)
     normals = {0: (1, 0, 0), 1: (-1, 0, 0), 2: (0, 1, 0), 3: (0, -1, 0), 4: (0, 0, 1)}
     for k, normal in normals.items():
@@ -165,7 +183,8 @@ def test_each_face_of_a_box_shows_its_own_print_the_right_way_up() -> None:
         np.testing.assert_allclose(seen.albedo[58, 81], (20 + 35 * k) / 255, atol=1e-3)
         np.testing.assert_allclose(seen.normal[58, 81], (0, 0, -1), atol=1e-5)
     seen = EmbreeRenderer().surfaces([Instance(mesh, pose((0, 0, 0), (0, 0, 1)))], K, H, W)
-    assert seen.albedo[58, 71].mean() == pytest.approx(1, abs=1e-3)  # u runs along +x of the object there
+    # u runs along +x of the object there
+    assert seen.albedo[58, 71].mean() == pytest.approx(1, abs=1e-3)
     assert seen.albedo[58, 91].mean() == pytest.approx((20 + 35 * 5) / 255, abs=1e-3)
 
 
@@ -180,7 +199,11 @@ def test_light_follows_lambert_and_shadow_takes_only_its_lamp() -> None:
     normal = np.zeros((1, 2, 3), np.float32)
     normal[...] = (0, 0, -1)
     seen = Surfaces(
-        np.ones((1, 2, 3), np.float32), normal, np.ones((1, 2), np.float32), np.zeros((1, 2), np.int32), np.array([2])
+        np.ones((1, 2, 3), np.float32),
+        normal,
+        np.ones((1, 2), np.float32),
+        np.zeros((1, 2), np.int32),
+        np.array([2]),
     )
     lights = Lights(ambient=0.2, directions=((0, 0, -2), (0, 3**0.5, -1)), strengths=(0.5, 0.4))
     rgb = light(seen, pixel_rays(np.eye(3), 1, 2), lights, np.array([[1.0, 0.0]], np.float32))
@@ -188,24 +211,40 @@ def test_light_follows_lambert_and_shadow_takes_only_its_lamp() -> None:
 
 
 def test_a_shadow_falls_where_the_lamp_throws_it() -> None:
-    lights = Lights(ambient=0.1, directions=((1.0, 0, -1.0),), strengths=(0.5,), shadows=True, shadow_blur=0.4)
+    lights = Lights(
+        ambient=0.1, directions=((1.0, 0, -1.0),), strengths=(0.5,), shadows=True, shadow_blur=0.4
+    )
     floor = Plane(pose((0, 0, 0), (0, 0, 1.0)), (2, 2), np.full((4, 4, 3), 255, np.uint8), 1.0)
     ball = Instance(sphere(0.03), pose((0, 0, 0), (0.0, 0, 0.8)))
     picture = EmbreeRenderer().render([ball], K, H, W, lights, [floor])
-    # lamp from the right: the shadow of a ball at z = 0.8 lies 0.2 m to the left on the floor at z = 1
+    # lamp from the right: the shadow of a ball at z = 0.8 lies 0.2 m to the left on the floor at z
+    # = 1
     column, row = round(-0.2 * K[0, 0] + K[0, 2]), round(K[1, 2])
     assert picture.rgb[row, column, 0] == pytest.approx(0.1, abs=0.01)
-    assert picture.rgb[row, round(0.2 * K[0, 0] + K[0, 2]), 0] == pytest.approx(0.1 + 0.5 / 2**0.5, abs=0.01)
+    assert picture.rgb[row, round(0.2 * K[0, 0] + K[0, 2]), 0] == pytest.approx(
+        0.1 + 0.5 / 2**0.5, abs=0.01
+    )
 
 
-def test_both_renderers_agree_on_colour_and_index() -> None:
+def test_both_renderers_agree_on_color_and_index() -> None:
     pytest.importorskip("moderngl", reason="the optional extra [moderngl] is not installed")
-    from posefilter.data.render_gl import GLRenderer
+    from posefilter.rendering.opengl import GLRenderer
 
     rng = np.random.default_rng(0)
-    prints = [np.kron(rng.integers(0, 255, (4, 4, 3)), np.ones((16, 16, 1))).astype(np.uint8) for _ in range(6)]
-    instances = [Instance(box("box", SIDES, prints), BOX), Instance(sphere(0.08), pose((0, 0, 0), (0.1, 0.05, 0.7)))]
-    plane = Plane(pose((0.4, 0.2, 0), (0, 0, 1.1)), (0.4, 0.3), np.kron(prints[0], np.ones((2, 2, 1))).astype(np.uint8), 0.3)
+    prints = [
+        np.kron(rng.integers(0, 255, (4, 4, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+        for _ in range(6)
+    ]
+    instances = [
+        Instance(box("box", SIDES, prints), BOX),
+        Instance(sphere(0.08), pose((0, 0, 0), (0.1, 0.05, 0.7))),
+    ]
+    plane = Plane(
+        pose((0.4, 0.2, 0), (0, 0, 1.1)),
+        (0.4, 0.3),
+        np.kron(prints[0], np.ones((2, 2, 1))).astype(np.uint8),
+        0.3,
+    )
     try:
         a = GLRenderer().surfaces(instances, K, H, W, [plane])
     except UserError as error:

@@ -14,7 +14,14 @@ from posefilter.geometry.camera import resize_intrinsics
 def test_depth_of_an_oblique_plane_stays_exact(size):
     def plane(camera, height, width):
         v, u = np.mgrid[:height, :width]
-        rays = np.stack([(u - camera[0, 2]) / camera[0, 0], (v - camera[1, 2]) / camera[1, 1], np.ones(u.shape)], -1)
+        rays = np.stack(
+            [
+                (u - camera[0, 2]) / camera[0, 0],
+                (v - camera[1, 2]) / camera[1, 1],
+                np.ones(u.shape),
+            ],
+            -1,
+        )
         return 0.6 / (rays @ np.array([0.5, -0.4, 0.75]))
 
     old = plane(K, HEIGHT, WIDTH).astype(np.float32)

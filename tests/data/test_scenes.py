@@ -1,16 +1,26 @@
-"""Layouts keep their promises: things rest on tables, keep apart, and stand in front of the target when asked."""
+"""Layouts keep their promises: things rest on tables, keep apart, and stand in front of the target
+when asked.
+"""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from posefilter.data.generate import camera_matrix
-from posefilter.data.lookalikes import box, make_lookalike
-from posefilter.data.meshes import MeshStore
-from posefilter.data.placing import View
-from posefilter.data.render import EmbreeRenderer
-from posefilter.data.scenes import Layout, Library, SceneSet, SceneSettings, draw_layout, draw_set, shift_camera
-from posefilter.data.solids import make_solid, resting_rotations, separated, turn_down
+from posefilter.meshes.store import MeshStore
+from posefilter.rendering.embree import EmbreeRenderer
+from posefilter.synthetic.generate import camera_matrix
+from posefilter.synthetic.lookalikes import box, make_lookalike
+from posefilter.synthetic.placing import View
+from posefilter.synthetic.scenes import (
+    Layout,
+    Library,
+    SceneSet,
+    SceneSettings,
+    draw_layout,
+    draw_set,
+    shift_camera,
+)
+from posefilter.synthetic.solids import make_solid, resting_rotations, separated, turn_down
 
 H, W = 240, 320
 K = camera_matrix("ycb_video", W, H)
@@ -67,7 +77,8 @@ def test_separated_never_calls_overlapping_boxes_apart() -> None:
         turn = Rotation.random(rng=rng).as_matrix()
         shift = rng.normal(0, 1.2, 3)
         a, b = corners * SIDES, corners * SIDES * rng.uniform(0.5, 1.5) @ np.eye(3) + shift * SIDES
-        overlap = ((a.min(0) < b.max(0)) & (b.min(0) < a.max(0))).all()  # exact: axis-aligned before both are turned
+        # exact: axis-aligned before both are turned
+        overlap = ((a.min(0) < b.max(0)) & (b.min(0) < a.max(0))).all()
         said = separated(a @ turn.T, b @ turn.T)
         assert not (said and overlap)
         apart += said
@@ -89,7 +100,9 @@ def test_objects_rest_on_the_table_keep_apart_and_stay_on_it(scene: SceneSet) ->
             assert all(separated(one.hull, other.hull) for other in layout.placed[:k])
         eye_height = top_from_camera[2, 3]
         assert eye_height > 0.02  # the camera looks down on the table
-        assert (layout.planes[1].camera_from_plane[:3, 2] @ table.camera_from_plane[:3, 2]) == pytest.approx(1)
+        assert (
+            layout.planes[1].camera_from_plane[:3, 2] @ table.camera_from_plane[:3, 2]
+        ) == pytest.approx(1)
 
 
 def test_numbers_of_distractors_are_kept_and_no_class_comes_twice(scene: SceneSet) -> None:
@@ -107,14 +120,19 @@ def visible_shares(layouts: list[Layout]) -> np.ndarray:
         out.append((seen.index == 0).sum() / max(seen.alone[0], 1))
         depth, _ = renderer.depth(layout.instances()[:1], K, H, W)
         hidden = (depth > 0) & (seen.index > 0)
-        assert (seen.depth[hidden] <= depth[hidden]).all()  # whatever hides the target lies in front of it
+        # whatever hides the target lies in front of it
+        assert (seen.depth[hidden] <= depth[hidden]).all()
     return np.array(out)
 
 
 @pytest.mark.parametrize("tabletop", [0.0, 1.0])
 def test_occluders_stand_in_front_when_asked(scene: SceneSet, tabletop: float) -> None:
-    asked = visible_shares(draw(scene, SceneSettings(occluded_share=1.0, tabletop_share=tabletop), 24))
-    free = visible_shares(draw(scene, SceneSettings(occluded_share=0.0, tabletop_share=tabletop), 24))
+    asked = visible_shares(
+        draw(scene, SceneSettings(occluded_share=1.0, tabletop_share=tabletop), 24)
+    )
+    free = visible_shares(
+        draw(scene, SceneSettings(occluded_share=0.0, tabletop_share=tabletop), 24)
+    )
     assert ((asked > 0.2) & (asked < 0.65)).mean() > 0.6
     assert (free > 0.6).mean() > 0.85
     assert np.median(free) > np.median(asked) + 0.25
@@ -122,7 +140,8 @@ def test_occluders_stand_in_front_when_asked(scene: SceneSet, tabletop: float) -
 
 def test_without_occlusion_nothing_hides_the_target(scene: SceneSet) -> None:
     layouts = draw(scene, SceneSettings(occlusion=0.0, occluded_share=0.0), 10)
-    assert visible_shares(layouts).min() > 0.85  # the foreseen outlines are coarse; the generator rejects the rest
+    # the foreseen outlines are coarse; the generator rejects the rest
+    assert visible_shares(layouts).min() > 0.85
 
 
 def test_the_foreseen_share_is_near_the_rendered_one(scene: SceneSet) -> None:
@@ -133,12 +152,14 @@ def test_the_foreseen_share_is_near_the_rendered_one(scene: SceneSet) -> None:
 
 def test_lookalikes_are_not_the_target(library: Library) -> None:
     target = library.store.load("carton")
-    sides = target.bounds[1] - target.bounds[0]
+    sides = target.box_head[1] - target.box_head[0]
     for seed in range(12):
         other = make_lookalike(target, "lookalike_00", [], np.random.default_rng(seed))
         assert other.name == "lookalike_00"
-        differs = np.abs((other.bounds[1] - other.bounds[0]) / sides - 1).max() > 0.1
-        same_print = other.texture.shape == target.texture.shape and (other.texture == target.texture).all()
+        differs = np.abs((other.box_head[1] - other.box_head[0]) / sides - 1).max() > 0.1
+        same_print = (
+            other.texture.shape == target.texture.shape and (other.texture == target.texture).all()
+        )
         assert differs or not same_print
         np.testing.assert_allclose(np.linalg.norm(other.corner_normals, axis=-1), 1, atol=1e-4)
 
@@ -161,19 +182,26 @@ def test_settled_objects_lie_on_the_table_and_touch_but_do_not_mix(scene: SceneS
         for k, one in enumerate(layout.placed):
             heights = one.hull @ top_from_camera[2, :3] + top_from_camera[2, 3]
             assert heights.min() > -0.004
-            for other in layout.placed[:k]:  # contacts give way by a few millimetres at most
+            for other in layout.placed[:k]:  # contacts give way by a few millimeters at most
                 a = one.center + 0.85 * (one.hull - one.center)
                 b = other.center + 0.85 * (other.hull - other.center)
                 assert separated(a, b)
-            tilts += np.abs(one.camera_from_object[:3, :3].T @ layout.planes[0].camera_from_plane[:3, 2]).max() < 0.98
+            tilts += (
+                np.abs(
+                    one.camera_from_object[:3, :3].T @ layout.planes[0].camera_from_plane[:3, 2]
+                ).max()
+                < 0.98
+            )
     assert tilts > 0  # placed by hand, boxes and cans only ever stand or lie square
 
 
 def test_solids_measure_their_mesh(library: Library) -> None:
     mesh = library.store.load("carton")
     solid = make_solid(mesh)
-    np.testing.assert_allclose(solid.center, mesh.bounds.mean(0))
-    assert solid.radius == pytest.approx(np.linalg.norm(mesh.vertices - solid.center, axis=1).max(), rel=0.02)
+    np.testing.assert_allclose(solid.center, mesh.box_head.mean(0))
+    assert solid.radius == pytest.approx(
+        np.linalg.norm(mesh.vertices - solid.center, axis=1).max(), rel=0.02
+    )
     full, some = mesh.vertices, solid.hull
     for d in np.random.default_rng(0).normal(size=(50, 3)):
         assert (some @ d).max() >= (full @ d).max() - 0.003 * np.linalg.norm(d)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from posefilter.data.sensor import sense, sense_color, sense_depth, sensor_model
 from posefilter.errors import UserError
+from posefilter.synthetic.sensor import sense, sense_color, sense_depth, sensor_model
 
 H, W = 240, 320
 
@@ -33,14 +33,17 @@ def test_the_ideal_sensor_changes_nothing() -> None:
 
 
 def test_the_same_generator_gives_the_same_reading() -> None:
-    a, b, c = (sense(GREY, step_scene(), sensor_model("kinect"), np.random.default_rng(s)) for s in (1, 1, 2))
+    a, b, c = (
+        sense(GREY, step_scene(), sensor_model("kinect"), np.random.default_rng(s))
+        for s in (1, 1, 2)
+    )
     np.testing.assert_array_equal(a[0], b[0])
     np.testing.assert_array_equal(a[1], b[1])
     assert (a[0] != c[0]).any()
     assert (a[1] != c[1]).any()
 
 
-def test_depth_errors_are_millimetres_and_grow_with_distance() -> None:
+def test_depth_errors_are_millimeters_and_grow_with_distance() -> None:
     near, far = [], []
     for seed in range(24):
         for z, errors in ((0.6, near), (1.2, far)):
@@ -59,7 +62,13 @@ def test_disparity_comes_in_steps() -> None:
 
 
 def test_depth_is_lost_at_edges_more_than_elsewhere() -> None:
-    edge = cv2.dilate((np.abs(cv2.Laplacian(step_scene(), cv2.CV_32F)) > 0.1).astype(np.uint8), np.ones((5, 5))) > 0
+    edge = (
+        cv2.dilate(
+            (np.abs(cv2.Laplacian(step_scene(), cv2.CV_32F)) > 0.1).astype(np.uint8),
+            np.ones((5, 5)),
+        )
+        > 0
+    )
     at_edge, elsewhere = [], []
     for seed in range(20):
         lost = sense_depth(step_scene(), GREY, np.random.default_rng(seed)) == 0
@@ -90,7 +99,7 @@ def test_nothing_stays_nothing() -> None:
     assert not sense_depth(depth, GREY, np.random.default_rng(0)).any()
 
 
-def test_colour_stays_in_range_and_varies_in_brightness() -> None:
+def test_color_stays_in_range_and_varies_in_brightness() -> None:
     means = []
     for seed in range(20):
         photo = sense_color(GREY * np.float32(1.3), np.random.default_rng(seed))
@@ -115,7 +124,10 @@ def test_real_depth_could_have_come_from_it(real_data: Path) -> None:
                 (depth * 100).astype(np.uint8), (depth == 0).astype(np.uint8), 3, cv2.INPAINT_NS
             ) / np.float32(100)
             model = [
-                sense_depth(whole, np.full((*depth.shape, 3), 0.5, np.float32), np.random.default_rng(s)) for s in range(6)
+                sense_depth(
+                    whole, np.full((*depth.shape, 3), 0.5, np.float32), np.random.default_rng(s)
+                )
+                for s in range(6)
             ]
             holes.append([(m == 0).mean() for m in model])
     assert len(shares) >= 10

@@ -1,14 +1,16 @@
-"""The YCB-Video reader against analytic truth: frames, labels, lists, and what is listed but not shown."""
+"""The YCB-Video reader against analytic truth: frames, labels, lists, and what is listed but not
+shown.
+"""
 
 import numpy as np
 import pytest
 import scipy.io
 from dataset_trees import HEIGHT, WIDTH, K, pose, truth, write_png, ycb_frame
 
-from posefilter.data import ycb
-from posefilter.data.frames import BadData, NotShown
-from posefilter.data.ycb_video import YCBVideoReader
-from posefilter.errors import UserError
+from posefilter.data.frames import NotShown
+from posefilter.data.readers.ycb_video import YCBVideoReader
+from posefilter.errors import BadData, UserError
+from posefilter.meshes import ycb
 
 NAME = "003_cracker_box"
 NATIVE = ycb.ycbvideo_from_original(NAME)
@@ -18,7 +20,11 @@ NATIVE = ycb.ycbvideo_from_original(NAME)
 def root(tmp_path):
     for scene in ("0048", "0050"):
         for frame in (1, 2):
-            ycb_frame(tmp_path / "data" / scene / f"{frame:06d}", [(2, pose((0.1 * frame, 0.2, 0.3)))], NATIVE)
+            ycb_frame(
+                tmp_path / "data" / scene / f"{frame:06d}",
+                [(2, pose((0.1 * frame, 0.2, 0.3)))],
+                NATIVE,
+            )
     ycb_frame(tmp_path / "data_syn" / "000123", [(2, pose())], NATIVE, syn=True)
     (tmp_path / "image_sets").mkdir()
     (tmp_path / "image_sets" / "keyframe.txt").write_text("0048/000002\n0050/000001\n0099/000001\n")
@@ -34,10 +40,18 @@ def test_pose_is_of_the_original_mesh_frame(root):
     np.testing.assert_allclose(sample.intrinsics, K, atol=1e-4)
     assert np.abs(sample.depth - np.where(sample.mask, truth(expected), 0.9)).max() < 0.6e-4
     record = reader.records()[0]
-    assert (record.scene_id, record.im_id, record.obj_id, record.group, record.name) == (48, 1, 2, "0048", "0048/000001")
+    assert (record.scene_id, record.im_id, record.obj_id, record.group, record.name) == (
+        48,
+        1,
+        2,
+        "0048",
+        "0048/000001",
+    )
     raw = scipy.io.loadmat(record.files[3])["poses"][..., 0]
     np.testing.assert_allclose(
-        (sample.camera_from_object @ np.linalg.inv(reader.native_from_mesh(NAME)))[:3], raw, atol=1e-6
+        (sample.camera_from_object @ np.linalg.inv(reader.native_from_mesh(NAME)))[:3],
+        raw,
+        atol=1e-6,
     )
     assert np.linalg.norm(raw[:, 3] - expected[:3, 3]) > 0.1  # canary: the two frames are far apart
 
@@ -70,7 +84,7 @@ def test_a_list_of_key_frames_chooses_and_counts_what_is_not_there(root):
 
 
 def test_listed_but_not_in_the_label(root):
-    ycb_frame(root / "data" / "0051" / "000001", [(2, pose())], NATIVE, unlabelled=5)
+    ycb_frame(root / "data" / "0051" / "000001", [(2, pose())], NATIVE, unlabeled=5)
     reader = YCBVideoReader(root, ["006_mustard_bottle"])
     assert [r.name for r in reader.records()] == ["0051/000001"]
     with pytest.raises(NotShown):
@@ -79,9 +93,13 @@ def test_listed_but_not_in_the_label(root):
 
 @pytest.mark.parametrize("factor", [1000.0, 10_000.0])
 def test_factor_depth_scales_depth(tmp_path, factor):
-    ycb_frame(tmp_path / "0001" / "000001", [(2, pose())], NATIVE, units=factor, factor_depth=factor)
+    ycb_frame(
+        tmp_path / "0001" / "000001", [(2, pose())], NATIVE, units=factor, factor_depth=factor
+    )
     sample = YCBVideoReader(tmp_path, NAME).read(0)
-    np.testing.assert_allclose(sample.depth[sample.mask], truth(pose())[sample.mask], atol=0.6 / factor)
+    np.testing.assert_allclose(
+        sample.depth[sample.mask], truth(pose())[sample.mask], atol=0.6 / factor
+    )
 
 
 def test_the_wood_block_is_refused_with_the_way_out(tmp_path):

@@ -20,34 +20,51 @@ from posefilter.figures.particles import color_by_weight, draw_iterations
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, Cloud, Reading, Step, Trace
+from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
 
 H, W = 60, 80
 K = np.array([[80.0, 0, 39.5], [0, 80.0, 29.5], [0, 0, 1]])
 RGB = np.full((H, W, 3), 128, np.uint8)
-HULL = torch.tensor([[x, y, z] for x in (-0.1, 0.1) for y in (-0.06, 0.06) for z in (-0.05, 0.05)], dtype=torch.float64)
+HULL = torch.tensor(
+    [[x, y, z] for x in (-0.1, 0.1) for y in (-0.06, 0.06) for z in (-0.05, 0.05)],
+    dtype=torch.float64,
+)
 
 
 def pose(x: float = 0.0, z: float = 0.8) -> torch.Tensor:
     return make_pose(exp_so3(torch.tensor([0.2, 0.3, 0.4])), torch.tensor([x, 0.0, z])).double()
 
 
-def trace_of(states: list[torch.Tensor], parents: list[list[int]]) -> Trace:
+def trace_of(states: list[torch.Tensor], ancestors: list[list[int]]) -> Trace:
     """States (N, *S) of each step, of one image, evenly weighted."""
-    clouds, readings = [], []
-    for state, own in zip(states, parents, strict=True):
+    history, outputs = [], []
+    for state, own in zip(states, ancestors, strict=True):
         N = len(state)
-        clouds.append(Cloud(state[None], torch.zeros(1, N, 0), torch.full((1, N), -np.log(N)), torch.tensor([own])))
-        readings.append(
-            Reading(torch.zeros(1, N), torch.zeros(1, N, 2), torch.eye(4).expand(1, N, 4, 4), torch.zeros(1, N, 0))
+        history.append(
+            Particles(
+                state[None],
+                torch.zeros(1, N, 0),
+                torch.full((1, N), -np.log(N)),
+                torch.tensor([own]),
+            )
+        )
+        outputs.append(
+            ParticleOutput(
+                torch.zeros(1, N),
+                torch.zeros(1, N, 2),
+                torch.eye(4).expand(1, N, 4, 4),
+                torch.zeros(1, N, 0),
+            )
         )
     steps = tuple(Step(t, len(states), torch.tensor(0.04 / (t + 1))) for t in range(len(states)))
     belief = Belief(torch.eye(4)[None, None], torch.zeros(1, 1), torch.eye(4)[None], torch.zeros(1))
-    return Trace(tuple(clouds), tuple(readings), steps, belief)
+    return Trace(tuple(history), tuple(outputs), steps, belief)
 
 
 def shown_truth() -> tuple[np.ndarray, np.ndarray]:
-    """Return which pixels of a 320-pixel view the object covers, from its faces' points, and how far each lies inside."""
+    """Return which pixels of a 320-pixel view the object covers, from its faces' points, and how
+    far each lies inside.
+    """
     view = full_view(H, W, 320)
     line = np.linspace(0, 1, 60)
     a, b, c = np.meshgrid(line, line, line)
@@ -64,7 +81,9 @@ def shown_truth() -> tuple[np.ndarray, np.ndarray]:
 def test_silhouettes_cover_the_object_and_nothing_else() -> None:
     mask, count = shown_truth()
     poses = torch.stack([pose(), pose(), pose(0.3), pose(z=-1.0)])
-    share = compute_coverage(project_hulls(poses, HULL, K), np.array([0.4, 0.2, 0.3, 0.1]), full_view(H, W, 320))
+    share = compute_coverage(
+        project_hulls(poses, HULL, K), np.array([0.4, 0.2, 0.3, 0.1]), full_view(H, W, 320)
+    )
     assert share.max() < 0.91  # the one behind the camera covers nothing
     covered = np.abs(share - 0.6) < 1e-6
     assert (covered & mask).sum() > 0.98 * count
@@ -81,7 +100,8 @@ def test_figure_of_silhouettes_shows_the_true_outline_in_every_tile() -> None:
     for step in steps:
         assert green[step[0] : step[-1], 300:].any()  # the close-up, beside it
     yellow = np.array([240, 240, 60])
-    assert (np.abs(figure.astype(int) - yellow).max(-1) < 70).sum() > 2000  # where every particle agrees
+    # where every particle agrees
+    assert (np.abs(figure.astype(int) - yellow).max(-1) < 70).sum() > 2000
 
 
 def test_close_ups_are_beside_their_frames_however_few_steps_there_are() -> None:
@@ -94,24 +114,37 @@ def test_close_ups_are_beside_their_frames_however_few_steps_there_are() -> None
         ]
         for figure in figures:
             assert figure.shape[1] == WIDTH
-            filled = (figure[:, 300:590] != 255).any(-1).mean(1) > 0.98  # rows of the close-ups, beside their frames
+            # rows of the close-ups, beside their frames
+            filled = (figure[:, 300:590] != 255).any(-1).mean(1) > 0.98
             assert abs(filled.sum() - count * 218) < 10
 
 
 def test_pixels_move_from_their_parents_to_themselves() -> None:
-    first, second = torch.tensor([[10.0, 10.0], [60.0, 40.0]]), torch.tensor([[70.0, 40.0], [70.0, 50.0]])
+    first, second = (
+        torch.tensor([[10.0, 10.0], [60.0, 40.0]]),
+        torch.tensor([[70.0, 40.0], [70.0, 50.0]]),
+    )
     trace = trace_of([first, second], [[0, 1], [1, 1]])
     triangle = [np.array([[5.0, 5.0], [9.0, 5.0], [9.0, 9.0]])]
     frames = list(Animation(RGB, K, trace, PixelSpace(), HULL, triangle).frames(between=2))
     assert len(frames) == 3
     view, color = full_view(H, W, 480), color_by_weight(np.full(2, 0.5))[0].astype(int)
-    top = int(np.nonzero((frames[0] == TRUTH).all(-1))[0].min()) - int(view.place(np.array([5.0, 5.0]))[1]) + 1
+    top = (
+        int(np.nonzero((frames[0] == TRUTH).all(-1))[0].min())
+        - int(view.place(np.array([5.0, 5.0]))[1])
+        + 1
+    )
     left = (WIDTH - view.width) // 2
 
     def is_at(frame: np.ndarray, u: float, v: float) -> bool:
         column, row = (view.place(np.array([u, v])) + np.array([left, 0])).round().astype(int)
         return bool(
-            np.abs(frame[top + row - 1 : top + row + 2, column - 1 : column + 2].astype(int) - color).min(-1).min() < 12
+            np.abs(
+                frame[top + row - 1 : top + row + 2, column - 1 : column + 2].astype(int) - color
+            )
+            .min(-1)
+            .min()
+            < 12
         )
 
     assert is_at(frames[0], 10, 10)
@@ -123,7 +156,9 @@ def test_pixels_move_from_their_parents_to_themselves() -> None:
 def test_animation_of_poses_shows_frame_and_close_up() -> None:
     trace = trace_of([pose(0.02).expand(5, 4, 4), pose().expand(5, 4, 4)], [[0] * 5] * 2)
     target = outline_hulls(project_hulls(pose()[None], HULL, K))
-    frames = list(Animation(RGB, K, trace, PoseSpace((0.0, 0.0, 0.0), 0.14), HULL, target).frames(between=1))
+    frames = list(
+        Animation(RGB, K, trace, PoseSpace((0.0, 0.0, 0.0), 0.14), HULL, target).frames(between=1)
+    )
     green = (frames[-1] == TRUTH).all(-1)
     assert frames[-1].shape[1] == WIDTH
     green = green[: len(green) * 2 // 3]  # the legend is below

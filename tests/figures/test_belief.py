@@ -16,7 +16,12 @@ from posefilter.figures.belief import (
 )
 from posefilter.figures.canvas import halve
 from posefilter.figures.layout import WIDTH
-from posefilter.figures.mollweide import color_by_turn, draw_blank_map, map_to_sphere, project_to_map
+from posefilter.figures.mollweide import (
+    color_by_turn,
+    draw_blank_map,
+    map_to_sphere,
+    project_to_map,
+)
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import exp_so3
 from posefilter.types import Belief, ObjectModel
@@ -26,26 +31,38 @@ RGB = np.full((120, 160, 3), 128, np.uint8)
 
 
 def model() -> ObjectModel:
-    hull = torch.tensor([[x, y, z] for x in (-0.03, 0.03) for y in (-0.08, 0.08) for z in (0.0, 0.21)])
-    return ObjectModel("box", hull, torch.tensor([0.0, 0.0, 0.105]), 0.136, 0.27, torch.eye(4)[None], hull)
+    hull = torch.tensor(
+        [[x, y, z] for x in (-0.03, 0.03) for y in (-0.08, 0.08) for z in (0.0, 0.21)]
+    )
+    return ObjectModel(
+        "box", hull, torch.tensor([0.0, 0.0, 0.105]), 0.136, 0.27, torch.eye(4)[None], hull
+    )
 
 
 def looking(longitude: float, latitude: float) -> torch.Tensor:
     """Return a pose whose z axis points there on the map."""
     z = torch.tensor(
-        [math.cos(latitude) * math.sin(longitude), -math.sin(latitude), -math.cos(latitude) * math.cos(longitude)],
+        [
+            math.cos(latitude) * math.sin(longitude),
+            -math.sin(latitude),
+            -math.cos(latitude) * math.cos(longitude),
+        ],
         dtype=torch.float64,
     )
     x = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), z)
     x = x / x.norm()
     R = torch.stack([x, torch.linalg.cross(z, x), z], -1)
-    return make_pose(R, torch.tensor([0.02, -0.01, 0.7], dtype=torch.float64) - R @ model().center.double())
+    return make_pose(
+        R, torch.tensor([0.02, -0.01, 0.7], dtype=torch.float64) - R @ model().center.double()
+    )
 
 
 def two_modes(share: float = 0.3, count: int = 400) -> tuple[Belief, torch.Tensor, torch.Tensor]:
     a, b = looking(0.5, 0.4), looking(-1.4, -0.5)
     g = torch.Generator().manual_seed(0)
-    tangent = torch.randn(count, 6, generator=g, dtype=torch.float64) * torch.tensor([0.004] * 3 + [0.03] * 3)
+    tangent = torch.randn(count, 6, generator=g, dtype=torch.float64) * torch.tensor(
+        [0.004] * 3 + [0.03] * 3
+    )
     start = torch.where((torch.arange(count) < count // 2)[:, None, None], a, b)
     poses = move_about(start, tangent, model().center.double())
     weights = torch.where(torch.arange(count) < count // 2, 1 - share, share) * 2 / count
@@ -54,9 +71,16 @@ def two_modes(share: float = 0.3, count: int = 400) -> tuple[Belief, torch.Tenso
 
 @pytest.mark.parametrize(
     ("z_axis", "longitude", "latitude"),
-    [((0, 0, -1), 0, 0), ((1, 0, 0), math.pi / 2, 0), ((-1, 0, 0), -math.pi / 2, 0), ((0, -1, 0), None, math.pi / 2)],
+    [
+        ((0, 0, -1), 0, 0),
+        ((1, 0, 0), math.pi / 2, 0),
+        ((-1, 0, 0), -math.pi / 2, 0),
+        ((0, -1, 0), None, math.pi / 2),
+    ],
 )
-def test_map_is_the_images_own(z_axis: tuple[int, ...], longitude: float | None, latitude: float) -> None:
+def test_map_is_the_images_own(
+    z_axis: tuple[int, ...], longitude: float | None, latitude: float
+) -> None:
     z = torch.tensor(z_axis, dtype=torch.float64)
     x = torch.tensor([0.0, 0.0, 1.0] if z[2] == 0 else [0.0, -1.0, 0.0], dtype=torch.float64)
     u, v, _ = map_to_sphere(torch.stack([x, torch.linalg.cross(z, x), z], -1), 2)
@@ -68,7 +92,15 @@ def test_tilt_turns_clockwise_from_upwards() -> None:
     z = torch.tensor([0.0, 0.0, -1.0])
     for x, expected in (((0, -1, 0), 0.0), ((1, 0, 0), math.pi / 2), ((-1, 0, 0), -math.pi / 2)):
         first = torch.tensor(x, dtype=torch.float32)
-        assert abs(float(map_to_sphere(torch.stack([first, torch.linalg.cross(z, first), z], -1), 2)[2]) - expected) < 1e-6
+        assert (
+            abs(
+                float(
+                    map_to_sphere(torch.stack([first, torch.linalg.cross(z, first), z], -1), 2)[2]
+                )
+                - expected
+            )
+            < 1e-6
+        )
     R = looking(0.5, 0.4)[:3, :3]
     turned = R @ exp_so3(torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64))
     before, after = map_to_sphere(R, 2), map_to_sphere(turned, 2)
@@ -85,17 +117,24 @@ def test_the_map_keeps_areas() -> None:
     """A hundredth of the sphere is a hundredth of the map, near a pole or at the equator."""
     ellipse = math.pi / 4 * 980 * 490  # on a map of 1000 pixels, rim aside
     for latitude in (0.0, 0.6, 1.2):
-        height = 0.02 * math.pi / (math.pi / 4) / math.cos(latitude)  # of a patch a quarter of the way round
-        low, high = (math.sin(latitude) + side * height * math.cos(latitude) / 2 for side in (-1, 1))
+        # of a patch a quarter of the way round
+        height = 0.02 * math.pi / (math.pi / 4) / math.cos(latitude)
+        low, high = (
+            math.sin(latitude) + side * height * math.cos(latitude) / 2 for side in (-1, 1)
+        )
         edge = np.arcsin(np.linspace(low, high, 50))
-        right, left = (project_to_map(np.full(50, turn), edge, 1000) for turn in (math.pi / 4, -math.pi / 4))
+        right, left = (
+            project_to_map(np.full(50, turn), edge, 1000) for turn in (math.pi / 4, -math.pi / 4)
+        )
         area = np.trapezoid(right[:, 0] - left[:, 0], -right[:, 1])
         assert area / ellipse == pytest.approx((high - low) / 2 / 4, rel=0.01)
 
 
 def test_corners_of_the_map_are_where_they_should_be() -> None:
     places = project_to_map(
-        np.array([0.0, math.pi, -math.pi, 2.0, 0.5]), np.array([0.0, 0.0, 0.0, math.pi / 2, -math.pi / 2]), 1000
+        np.array([0.0, math.pi, -math.pi, 2.0, 0.5]),
+        np.array([0.0, 0.0, 0.0, math.pi / 2, -math.pi / 2]),
+        1000,
     )
     expected = [[500, 250], [990, 250], [10, 250], [500, 5], [500, 495]]
     assert places == pytest.approx(np.array(expected), abs=0.5)
@@ -112,7 +151,9 @@ def test_pixels_of_the_map_are_colored_where_the_belief_is_and_only_there() -> N
     belief, a, b = two_modes()
     poses, weights, best = select_single(belief)
     picture = draw_rotations(poses, weights, best, None, 2, 588).astype(int)
-    longitude, latitude, tilt = (x.numpy() for x in map_to_sphere(torch.stack([a, b])[:, :3, :3], 2))
+    longitude, latitude, tilt = (
+        x.numpy() for x in map_to_sphere(torch.stack([a, b])[:, :3, :3], 2)
+    )
     places, colors = project_to_map(longitude, latitude, 588), color_by_turn(tilt).astype(int)
     empty = halve(draw_blank_map(2 * 588)).astype(int)
     drawn = np.argwhere(np.abs(picture - empty).max(-1) > 100)[:, ::-1]
@@ -132,7 +173,10 @@ def test_the_heavier_mode_covers_more_of_the_map() -> None:
     empty = halve(draw_blank_map(2 * 588)).astype(int)
     drawn = np.argwhere(np.abs(picture - empty).max(-1) > 60)[:, ::-1]
     longitude, latitude, _ = (x.numpy() for x in map_to_sphere(torch.stack([a, b])[:, :3, :3], 2))
-    heavy, light = (int((np.linalg.norm(drawn - at, axis=1) < 40).sum()) for at in project_to_map(longitude, latitude, 588))
+    heavy, light = (
+        int((np.linalg.norm(drawn - at, axis=1) < 40).sum())
+        for at in project_to_map(longitude, latitude, 588)
+    )
     assert heavy > 1.5 * light > 100
 
 
@@ -163,7 +207,11 @@ def test_marginals_are_in_the_units_they_say() -> None:
 def test_what_lies_beyond_a_histogram_is_told() -> None:
     belief, _, _ = two_modes(share=0.01)
     poses, weights, best = select_single(belief)
-    beyond = [one.beyond for row in compute_marginals(poses, weights, best, None, model().center.double()) for one in row]
+    beyond = [
+        one.beyond
+        for row in compute_marginals(poses, weights, best, None, model().center.double())
+        for one in row
+    ]
     assert 0.01 <= max(beyond) < 0.02  # the mode, and some of the tails
     assert all(one == pytest.approx(0, abs=0.06) for one in beyond)
 

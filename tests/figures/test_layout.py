@@ -1,4 +1,6 @@
-"""Figures are read in small: the letters of titles and legends keep their size, and nothing is cut off."""
+"""Figures are read in small: the letters of titles and legends keep their size, and nothing is cut
+off.
+"""
 
 import numpy as np
 import pytest
@@ -42,7 +44,8 @@ def test_a_stroke_of_a_title_survives_every_second_pixel() -> None:
     whole = compose_figure("lllll")
     small = whole[::2, ::2]
     columns = (small < 128).all(-1).any(0)
-    assert (np.diff(columns.astype(int)) == 1).sum() == 5  # each letter is there, apart from the next
+    # each letter is there, apart from the next
+    assert (np.diff(columns.astype(int)) == 1).sum() == 5
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3])

@@ -55,14 +55,17 @@ def test_figure_of_relevance_shows_map_rim_and_both_clouds() -> None:
     figure = draw_relevance(relevance, RGB, MASK, (start, weights), (end, weights), "relevance")
     assert figure.shape[1] == WIDTH
     green = np.nonzero((figure == TRUTH).all(-1).any(1))[0]
-    top = int(green[green > 480].min()) - round(16 * tile_width(2) / 64)  # of the clouds' photographs, below the map
+    # of the clouds' photographs, below the map
+    top = int(green[green > 480].min()) - round(16 * tile_width(2) / 64)
     scale = tile_width(2) / 64
 
     def dot(tile: int, u: float, v: float) -> int:
         """Return how far the picture there is from the gray ground."""
         row, column = top + round(v * scale), 6 + tile * 297 + round(u * scale)
         near = figure[row - 2 : row + 3, column - 2 : column + 3].astype(int)
-        return int(np.abs(near - figure[top + round(44 * scale), 6 + tile * 297 + round(60 * scale)]).max())
+        return int(
+            np.abs(near - figure[top + round(44 * scale), 6 + tile * 297 + round(60 * scale)]).max()
+        )
 
     assert dot(0, 8.0, 8.0) > 50
     assert dot(1, 8.0, 8.0) < 5
@@ -82,7 +85,8 @@ def test_figure_of_proposals_shows_them_where_they_are() -> None:
     figure = draw_proposals(said, RGB, K, truth, hull, 0.14, "proposals")
     red, cyan = (figure == (255, 0, 0)).all(-1), (figure == (0, 255, 255)).all(-1)
     side = 16 * tile_width(2) / 64
-    assert red[:, :300].sum() == pytest.approx(side**2, rel=0.03)  # the predicted and the true points, 16 x 16 pixels
+    # the predicted and the true points, 16 x 16 pixels
+    assert red[:, :300].sum() == pytest.approx(side**2, rel=0.03)
     assert cyan[:, 300:].sum() == pytest.approx(side**2, rel=0.03)
     orange = (np.abs(figure.astype(int) - (255, 190, 40)).max(-1) < 12)[:330, 303:]
     assert orange.any()

@@ -6,13 +6,19 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from posefilter.data.mesh import Mesh
-from posefilter.data.meshes import MeshStore, object_model
 from posefilter.figures.canvas import AXES, ESTIMATE, TRUTH, View, close_up, full_view
-from posefilter.figures.overlay import draw_overlay, outline_object, render_silhouette, trace_outline, view_poses
+from posefilter.figures.overlay import (
+    draw_overlay,
+    outline_object,
+    render_silhouette,
+    trace_outline,
+    view_poses,
+)
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
+from posefilter.meshes.mesh import Mesh
+from posefilter.meshes.store import MeshStore, object_model
 
 H, W = 120, 160
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
@@ -27,16 +33,26 @@ def carton() -> Mesh:
 
 
 def pose(x: float = 0.02, z: float = 0.6) -> np.ndarray:
-    return make_pose(exp_so3(torch.tensor([0.5, 0.6, 0.1])), torch.tensor([x, 0.01, z])).double().numpy()
+    return (
+        make_pose(exp_so3(torch.tensor([0.5, 0.6, 0.1])), torch.tensor([x, 0.01, z]))
+        .double()
+        .numpy()
+    )
 
 
-def edge_distances(picture: np.ndarray, mask: np.ndarray, color: tuple[int, int, int]) -> tuple[float, float]:
-    """Return how far a drawn pixel is from the mask's edge at most, and an edge pixel from a drawn one.  [px]"""
+def edge_distances(
+    picture: np.ndarray, mask: np.ndarray, color: tuple[int, int, int]
+) -> tuple[float, float]:
+    """Return how far a drawn pixel is from the mask's edge at most, and an edge pixel from a drawn
+    one.  [px]
+    """
     drawn = (picture == color).all(-1)[: len(mask)]
     edge = np.zeros_like(mask)
     for line in trace_outline(mask):
         edge[line[:, 1], line[:, 0]] = True
-    return float(distance_transform_edt(~edge)[drawn].max()), float(distance_transform_edt(~drawn)[edge].max())
+    return float(distance_transform_edt(~edge)[drawn].max()), float(
+        distance_transform_edt(~drawn)[edge].max()
+    )
 
 
 @pytest.mark.parametrize("kind", ["mesh", "hull"])
@@ -45,12 +61,14 @@ def test_outline_lies_on_the_edge_of_the_mask(carton: Mesh, kind: str) -> None:
     picture = draw_overlay(GREY, K, pose(), shape)
     shown = full_view(H, W, 640)
     mask = render_silhouette(carton, pose(), shown.camera(K), 480, 640)
-    inside = picture.copy()  # the knobs of the axes have the outline's color: leave out what is far inside
+    # the knobs of the axes have the outline's color: leave out what is far inside
+    inside = picture.copy()
     inside[:480][distance_transform_edt(mask) > 12] = 0
     drawn_far, edge_far = edge_distances(inside, mask, ESTIMATE)
     assert drawn_far < 3
     assert edge_far < 3
-    moved = render_silhouette(carton, pose(x=0.04), shown.camera(K), 480, 640)  # canary: 2 cm are 20 px
+    # canary: 2 cm are 20 px
+    moved = render_silhouette(carton, pose(x=0.04), shown.camera(K), 480, 640)
     assert edge_distances(picture, moved, ESTIMATE)[1] > 12
 
 
@@ -61,7 +79,12 @@ def test_axes_start_at_the_centre_of_the_box(carton: Mesh) -> None:
     for axis, color in enumerate(AXES):
         end = model.center.double() + 0.2 * model.radius * torch.eye(3, dtype=torch.float64)[axis]
         T = torch.from_numpy(pose())
-        u, v = project((T[:3, :3] @ end + T[:3, 3])[None], torch.from_numpy(shown.camera(K)))[0].round().int().tolist()
+        u, v = (
+            project((T[:3, :3] @ end + T[:3, 3])[None], torch.from_numpy(shown.camera(K)))[0]
+            .round()
+            .int()
+            .tolist()
+        )
         near = picture[v - 2 : v + 3, u - 2 : u + 3].reshape(-1, 3)
         assert (near == color).all(-1).any()
 
@@ -80,13 +103,15 @@ def test_poses_that_cannot_be_seen_draw_nothing(carton: Mesh, kind: str, bad: st
 
 
 def test_hull_that_reaches_behind_the_camera_is_cut_at_the_near_plane() -> None:
-    beam = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.3) for z in (-0.5, 1.5)])  # below the camera
+    # below the camera
+    beam = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (0.2, 0.3) for z in (-0.5, 1.5)])
     picture = draw_overlay(GREY, K, np.eye(4), beam)
     cx, cy = full_view(H, W, 640).place(np.array([79.5, 59.5]))
     v, u = np.nonzero((picture[:480] == ESTIMATE).all(-1))
     u, v = np.abs(u - cx), v - cy
     u, v = u[u > 8], v[u > 8]  # without the knob of the axis along the beam
-    top = 150 * 4 * 0.2 / 1.5  # of its far end; its edges run from there towards the viewer, u / v = 0.1 / 0.2
+    # of its far end; its edges run from there towards the viewer, u / v = 0.1 / 0.2
+    top = 150 * 4 * 0.2 / 1.5
     sides = np.abs(u - v / 2) < 3
     assert (sides | (np.abs(v - top) < 3)).all()
     assert len(np.unique(v[sides])) >= 480 - cy - top - 3  # down to the frame's edge
@@ -123,11 +148,17 @@ def test_close_up_holds_what_it_should(carton: Mesh) -> None:
 
 
 def test_a_coarse_outline_misses_the_fine_one_by_its_coarseness_at_most(carton: Mesh) -> None:
-    fine, coarse = (outline_object(pose(), carton, K * [[4], [4], [1]], 480, 640, c) for c in (1, 3))
-    far = np.linalg.norm(np.concatenate(coarse)[:, None] - np.concatenate(fine)[None], axis=-1).min(1)
+    fine, coarse = (
+        outline_object(pose(), carton, K * [[4], [4], [1]], 480, 640, c) for c in (1, 3)
+    )
+    far = np.linalg.norm(np.concatenate(coarse)[:, None] - np.concatenate(fine)[None], axis=-1).min(
+        1
+    )
     assert far.max() <= 3
     inside = [
-        cv2.fillPoly(np.zeros((480, 640), np.uint8), [x.astype(np.int32) for x in lines], 1) for lines in (fine, coarse)
+        cv2.fillPoly(np.zeros((480, 640), np.uint8), [x.astype(np.int32) for x in lines], 1)
+        for lines in (fine, coarse)
     ]
-    assert (inside[0] ^ inside[1]).sum() < 0.03 * inside[0].sum()  # no corner is lost, and nothing is shifted
+    # no corner is lost, and nothing is shifted
+    assert (inside[0] ^ inside[1]).sum() < 0.03 * inside[0].sum()
     assert sum(map(len, coarse)) < 40  # few and straight lines

@@ -33,7 +33,9 @@ def test_rows_rise_and_columns_go_right() -> None:
 def test_marks_are_where_they_point_and_on_the_rim_where_that_is_beyond() -> None:
     plain = np.full((3, 3, 3), 128, np.uint8)
     for x, y, u, v in ((5.0, -5.0, 75, 75), (100.0, 0.0, 90, 50)):
-        plot = draw_heat_panel(plain, X, Y, 101 + LEFT + RIGHT, [Mark(x, y, TRUTH)])[TOP : TOP + 101, LEFT : LEFT + 101]
+        plot = draw_heat_panel(plain, X, Y, 101 + LEFT + RIGHT, [Mark(x, y, TRUTH)])[
+            TOP : TOP + 101, LEFT : LEFT + 101
+        ]
         rows, columns = np.nonzero((plot == TRUTH).all(-1))
         assert abs(columns.mean() - u) < 1.5
         assert abs(rows.mean() - v) < 1.5
@@ -52,7 +54,9 @@ def test_a_curve_goes_through_its_numbers_and_is_cut_at_the_ends() -> None:
 def test_a_histogram_stands_on_its_edges_and_lines_are_upright() -> None:
     mass, edges = np.array([0.0, 5.0, 10.0]), np.array([-10.0, -4.0, 0.0, 10.0])
     up = Axis("share", 0, 10, (0, 10))
-    panel = draw_histogram_panel(mass, edges, [(5.0, (255, 0, 0))], X, up, 101 + LEFT + RIGHT, 101 + TOP + BOTTOM)
+    panel = draw_histogram_panel(
+        mass, edges, [(5.0, (255, 0, 0))], X, up, 101 + LEFT + RIGHT, 101 + TOP + BOTTOM
+    )
     plot = panel[TOP : TOP + 101, LEFT : LEFT + 101]
     blue = (plot[..., 2].astype(int) - plot[..., 0]) > 40
     assert not blue[:, :29].any()

@@ -19,7 +19,7 @@ from posefilter.figures.particles import (
 )
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, Cloud, Reading, Step, Trace
+from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
 
 RGB = np.full((60, 80, 3), 128, np.uint8)
 K = np.array([[80.0, 0, 39.5], [0, 80.0, 29.5], [0, 0, 1]])
@@ -28,17 +28,28 @@ K = np.array([[80.0, 0, 39.5], [0, 80.0, 29.5], [0, 0, 1]])
 def trace_of(states: torch.Tensor, weights: torch.Tensor) -> Trace:
     """States (T, N, *S), weights (T, N): one image."""
     T, N = weights.shape
-    clouds = tuple(
-        Cloud(states[t][None], torch.zeros(1, N, 0), weights[t].log()[None], torch.zeros(1, N).long()) for t in range(T)
+    history = tuple(
+        Particles(
+            states[t][None], torch.zeros(1, N, 0), weights[t].log()[None], torch.zeros(1, N).long()
+        )
+        for t in range(T)
     )
     poses = torch.eye(4).expand(1, N, 4, 4)
-    reading = Reading(torch.zeros(1, N), torch.zeros(1, N, 2), poses, torch.zeros(1, N, 0))
+    output = ParticleOutput(torch.zeros(1, N), torch.zeros(1, N, 2), poses, torch.zeros(1, N, 0))
     steps = tuple(Step(t, T, torch.tensor(0.04 / (t + 1))) for t in range(T))
-    return Trace(clouds, (reading,) * T, steps, Belief(poses, weights[-1].log()[None], poses[:, 0], torch.zeros(1)))
+    return Trace(
+        history,
+        (output,) * T,
+        steps,
+        Belief(poses, weights[-1].log()[None], poses[:, 0], torch.zeros(1)),
+    )
 
 
 def test_dots_are_where_particles_are_and_the_heaviest_on_top() -> None:
-    pixels, weights = np.array([[20.0, 10.0], [60.0, 40.0], [60.4, 40.0]]), np.array([0.02, 0.08, 0.9])
+    pixels, weights = (
+        np.array([[20.0, 10.0], [60.0, 40.0], [60.4, 40.0]]),
+        np.array([0.02, 0.08, 0.9]),
+    )
     view = full_view(60, 80, 480)
     picture = draw_particles(RGB, pixels, weights, view).astype(int)
     colors = color_by_weight(weights)
@@ -67,16 +78,20 @@ def test_rows_of_pixels_tells_who_left_the_frame() -> None:
     figure = draw_iterations(RGB, K, trace, 0, PixelSpace())
     assert figure.shape[1] == WIDTH
     title = round(TITLE * 1.25) + round(CAPTION * 1.25)
-    said = (figure[title : title + round(DETAIL * 1.25)] < 128).all(-1)  # below "step 0" and "step 1"
+    # below "step 0" and "step 1"
+    said = (figure[title : title + round(DETAIL * 1.25)] < 128).all(-1)
     assert said[:, 300:].sum() > 1.3 * said[:, :300].sum()
     assert measure_off_frame(states[1].numpy(), 60, 80) == 0.5
-    assert measure_off_frame(np.array([[-0.4, 59.4], [79.6, 0.0], [0.0, -0.6]]), 60, 80) == pytest.approx(2 / 3)
+    assert measure_off_frame(
+        np.array([[-0.4, 59.4], [79.6, 0.0], [0.0, -0.6]]), 60, 80
+    ) == pytest.approx(2 / 3)
     assert describe_step(trace, 0, 1, "px") == "step 1: noise 0.02 px, 100% effective"
 
 
 def test_rows_of_poses_puts_dots_on_projected_centers() -> None:
     space = PoseSpace((0.0, 0.0, 0.1), 0.1)
-    pose = make_pose(torch.eye(3), torch.tensor([0.1, -0.05, 0.7]))  # its center at (0.1, -0.05, 0.8) -> (49.5, 24.5) px
+    # its center at (0.1, -0.05, 0.8) -> (49.5, 24.5) px
+    pose = make_pose(torch.eye(3), torch.tensor([0.1, -0.05, 0.7]))
     trace = trace_of(pose.expand(3, 50, 4, 4), torch.full((3, 50), 0.02))
     figure = draw_iterations(RGB, K, trace, 0, space)
     color = color_by_weight(np.full(50, 0.02))[0].astype(int)

@@ -3,7 +3,15 @@
 import numpy as np
 
 from posefilter.figures.layout import draw_legend
-from posefilter.figures.trajectories import OFF, ON, START, draw_glimpses, draw_trajectories, enlarge, find_hits
+from posefilter.figures.trajectories import (
+    OFF,
+    ON,
+    START,
+    draw_glimpses,
+    draw_trajectories,
+    enlarge,
+    find_hits,
+)
 
 MASK = np.zeros((40, 60), bool)
 MASK[10:25, 20:45] = True
@@ -25,7 +33,11 @@ def test_who_stands_on_the_mask() -> None:
 
 def test_ends_are_green_on_the_object_and_red_off_it() -> None:
     picture = draw_trajectories(RGB, MASK, STATES, "trajectories")
-    top = len(picture) - 400 - len(draw_legend([("start", START), ("on the object", ON), ("off it", OFF)]))
+    top = (
+        len(picture)
+        - 400
+        - len(draw_legend([("start", START), ("on the object", ON), ("off it", OFF)]))
+    )
     at = lambda u, v: picture[top + round((v + 0.5) * 10), round((u + 0.5) * 10)]  # noqa: E731
     assert tuple(at(30, 20)) == ON
     assert tuple(at(58, 38)) == OFF

@@ -1,4 +1,6 @@
-"""What the 3-D view shows is what the filter did: checked number by number, without the library that draws it."""
+"""What the 3-D view shows is what the filter did: checked number by number, without the library
+that draws it.
+"""
 
 import sys
 from pathlib import Path
@@ -12,11 +14,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 import toy
 from views import FIRST, SHARES, STEPS, H, N, W, box, hypotheses_of_belief, run, two_images
 
-from posefilter.data import builtin
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
 from posefilter.figures.view_data import ViewData, collect_view_data, make_mesh
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.run.command import compose_job
-from posefilter.run.method import build_method, recipe
+from posefilter.meshes.builtin import catalog as builtin
 
 SPACE = PoseSpace((0.0, 0.0, 0.105), 0.136)
 CONF = Path(__file__).parents[2] / "conf"
@@ -26,7 +28,9 @@ def second(pixels: bool = False, **changes: torch.Tensor) -> ViewData:
     """Return what is shown of the second image."""
     trace = run(pixels)
     trace = trace._replace(belief=trace.belief._replace(**changes))
-    return collect_view_data(trace, two_images(), box(), PixelSpace() if pixels else SPACE, box().hull, image=1)
+    return collect_view_data(
+        trace, two_images(), box(), PixelSpace() if pixels else SPACE, box().hull, image=1
+    )
 
 
 def test_cloud_is_the_depth_back_projected_in_the_photographs_colors() -> None:
@@ -49,9 +53,14 @@ def test_every_step_is_shown_and_the_belief_after_them() -> None:
     shown, trace = second(), run(pixels=False)
     assert len(shown.moments) == STEPS + 1
     assert [len(m.weights) for m in shown.moments] == [FIRST, N, N, N]
-    assert [m.sigma for m in shown.moments] == [pytest.approx(40.0), pytest.approx(20.0), pytest.approx(10.0), None]
+    assert [m.sigma for m in shown.moments] == [
+        pytest.approx(40.0),
+        pytest.approx(20.0),
+        pytest.approx(10.0),
+        None,
+    ]
     assert shown.unit == "mm"
-    said = [(cloud.log_weights, cloud.state) for cloud in trace.clouds]
+    said = [(particles.log_weights, particles.state) for particles in trace.particles]
     said.append((trace.belief.log_weights, trace.belief.poses))
     for moment, (log_weights, poses) in zip(shown.moments, said, strict=True):
         weights = log_weights[1].exp().double().numpy()
@@ -69,16 +78,19 @@ def test_pixels_are_shown_where_they_are_and_their_poses_too() -> None:
     shown, trace = second(pixels=True), run(pixels=True)
     assert shown.unit == "px"
     assert [m.sigma for m in shown.moments][:STEPS] == pytest.approx([0.04, 0.02, 0.01])
-    for moment, cloud, reading in zip(shown.moments, trace.clouds, trace.readings, strict=False):
-        assert np.allclose(moment.pixels, cloud.state[1])
-        assert np.allclose(moment.poses, reading.pose[1])
-    assert np.allclose(shown.moments[-1].pixels, trace.clouds[-1].state[1])
+    for moment, particles, output in zip(
+        shown.moments, trace.particles, trace.outputs, strict=False
+    ):
+        assert np.allclose(moment.pixels, particles.state[1])
+        assert np.allclose(moment.poses, output.pose[1])
+    assert np.allclose(shown.moments[-1].pixels, trace.particles[-1].state[1])
     assert np.allclose(shown.moments[-1].poses, trace.belief.poses[1])
 
 
 def test_hypotheses_have_their_shares_and_the_estimate_stands_for_its_own() -> None:
     shown, at = second(), hypotheses_of_belief().double()
-    assert np.allclose(shown.estimate.pose, run(False).belief.best[1])  # as refined, not as some particle has it
+    # as refined, not as some particle has it
+    assert np.allclose(shown.estimate.pose, run(False).belief.best[1])
     assert shown.estimate.weight == pytest.approx(SHARES[0], abs=1e-6)
     assert [other.weight for other in shown.others] == pytest.approx(SHARES[1:3], abs=1e-6)
     for other, pose in zip(shown.others, at[1:3], strict=True):
@@ -97,8 +109,9 @@ def test_an_estimate_that_no_particle_is_near_has_no_weight() -> None:
 def test_without_a_mesh_the_hull_is_shown_closed_and_outwards() -> None:
     mesh = second().mesh
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
-    assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.06 * 0.16 * 0.21)  # signed volume: outwards
-    assert ((mesh.corner_normals[:, 0] * (a - mesh.bounds.mean(0))).sum(1) > 0).all()
+    # signed volume: outwards
+    assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.06 * 0.16 * 0.21)
+    assert ((mesh.corner_normals[:, 0] * (a - mesh.box_head.mean(0))).sum(1) > 0).all()
     flat = make_mesh(toy.square().hull, "square")
     assert np.allclose(np.abs(flat.vertices).max(0), [0.1, 0.1, 0])
     mug = builtin.build("mug")
@@ -116,9 +129,13 @@ def test_every_method_that_tells_a_pose_can_be_shown(model: str, tmp_path: Path)
         trace = method.predict_step(batch, 0)
     shown = collect_view_data(trace, batch, method.model, method.space, method.model.hull)
     assert len(shown.moments) == 4
-    for moment, cloud, reading in zip(shown.moments, trace.clouds, trace.readings, strict=False):
-        assert np.allclose(moment.poses, reading.pose[0], atol=1e-6)
-        assert np.allclose(moment.pixels, method.particle_pixels(cloud, batch)[0], atol=1e-2)
+    for moment, particles, output in zip(
+        shown.moments, trace.particles, trace.outputs, strict=False
+    ):
+        assert np.allclose(moment.poses, output.pose[0], atol=1e-6)
+        assert np.allclose(moment.pixels, method.particle_pixels(particles, batch)[0], atol=1e-2)
     assert np.allclose(shown.estimate.pose, trace.belief.best[0])
-    assert shown.estimate.weight + sum(m.weight for m in shown.others) + shown.left_out == pytest.approx(1)
+    assert shown.estimate.weight + sum(
+        m.weight for m in shown.others
+    ) + shown.left_out == pytest.approx(1)
     assert len(shown.points) == toy.H * toy.W

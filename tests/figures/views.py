@@ -6,7 +6,7 @@ import torch
 
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
-from posefilter.types import Batch, Belief, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 H, W, STEPS, FIRST, N = 6, 8, 3, 50, 40
 SHARES = (0.7, 0.25, 0.045, 0.005)  # of the belief's hypotheses
@@ -14,8 +14,12 @@ SHARES = (0.7, 0.25, 0.045, 0.005)  # of the belief's hypotheses
 
 def box() -> ObjectModel:
     """Return a box of 6 x 16 x 21 cm that stands on its frame's origin."""
-    hull = torch.tensor([[x, y, z] for x in (-0.03, 0.03) for y in (-0.08, 0.08) for z in (0.0, 0.21)])
-    return ObjectModel("box", hull, torch.tensor([0.0, 0.0, 0.105]), 0.136, 0.27, torch.eye(4)[None], hull)
+    hull = torch.tensor(
+        [[x, y, z] for x in (-0.03, 0.03) for y in (-0.08, 0.08) for z in (0.0, 0.21)]
+    )
+    return ObjectModel(
+        "box", hull, torch.tensor([0.0, 0.0, 0.105]), 0.136, 0.27, torch.eye(4)[None], hull
+    )
 
 
 def two_images() -> Batch:
@@ -37,17 +41,32 @@ def hypotheses_of_belief() -> torch.Tensor:
 
 
 def run(pixels: bool) -> Trace:
-    """Return a run of three steps, of particles that are pixels or poses; the estimate is 4 mm off the heaviest mode."""
+    """Return a run of three steps, of particles that are pixels or poses; the estimate is 4 mm off
+    the heaviest mode.
+    """
     g = torch.Generator().manual_seed(2)
-    clouds, readings, steps = [], [], []
+    history, outputs, steps = [], [], []
     for number in range(STEPS):
         count = N if number else FIRST
         place = torch.rand(2, count, 3, generator=g) * 0.2 + torch.tensor([0, 0, 0.8])
         poses = make_pose(random_rotation(2, count, generator=g), place)
-        state = torch.rand(2, count, 2, generator=g) * torch.tensor([W - 1.0, H - 1.0]) if pixels else poses
+        state = (
+            torch.rand(2, count, 2, generator=g) * torch.tensor([W - 1.0, H - 1.0])
+            if pixels
+            else poses
+        )
         log_weights = torch.log_softmax(torch.randn(2, count, generator=g), 1)
-        clouds.append(Cloud(state, torch.zeros(2, count, 0), log_weights, torch.zeros(2, count, dtype=torch.int64)))
-        readings.append(Reading(log_weights, torch.zeros(2, count, 2), poses, torch.zeros(2, count, 0)))
+        history.append(
+            Particles(
+                state,
+                torch.zeros(2, count, 0),
+                log_weights,
+                torch.zeros(2, count, dtype=torch.int64),
+            )
+        )
+        outputs.append(
+            ParticleOutput(log_weights, torch.zeros(2, count, 2), poses, torch.zeros(2, count, 0))
+        )
         sigma = torch.tensor(0.04 / 2**number)
         steps.append(Step(number, STEPS, sigma.expand(2) if number == 1 else sigma))
     near = torch.randn(2, N, 6, generator=g) * torch.tensor([0.0005] * 3 + [0.004] * 3)
@@ -55,6 +74,8 @@ def run(pixels: bool) -> Trace:
     which = torch.arange(N) % 4
     poses = move_about(hypotheses_of_belief()[which].expand(2, N, 4, 4), near, center)
     weights = torch.tensor(SHARES)[which] * 4 / N
-    best = move_about(hypotheses_of_belief()[:1].expand(2, 4, 4), torch.tensor([0.004, 0, 0, 0, 0, 0]), center)
+    best = move_about(
+        hypotheses_of_belief()[:1].expand(2, 4, 4), torch.tensor([0.004, 0, 0, 0, 0, 0]), center
+    )
     belief = Belief(poses, weights.log().expand(2, N), best, torch.tensor([0.0, math.pi]))
-    return Trace(tuple(clouds), tuple(readings), tuple(steps), belief)
+    return Trace(tuple(history), tuple(outputs), tuple(steps), belief)

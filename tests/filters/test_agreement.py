@@ -5,10 +5,16 @@ import torch
 from posefilter.filters.agreement import Agreement
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
-from posefilter.types import Cloud, Fragments, ObjectModel, Reading
+from posefilter.types import Fragments, ObjectModel, ParticleOutput, Particles
 
 MODEL = ObjectModel(
-    "cube", torch.zeros(1, 3), torch.tensor([0.0, 0.0, 0.01]), 0.18, 0.3, torch.eye(4)[None], torch.zeros(1, 3)
+    "cube",
+    torch.zeros(1, 3),
+    torch.tensor([0.0, 0.0, 0.01]),
+    0.18,
+    0.3,
+    torch.eye(4)[None],
+    torch.zeros(1, 3),
 )
 
 
@@ -16,14 +22,17 @@ class Points:
     def __init__(self, point: torch.Tensor) -> None:
         self.point, self.model = point, MODEL
 
-    def own_points(self, scene: None, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def surface_points(self, scene: None, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return self.point, torch.ones_like(self.point[..., 0], dtype=torch.bool)
 
 
 def test_agreement_beats_the_best_particle_and_shrugs_off_a_third_of_outliers() -> None:
     g = torch.Generator().manual_seed(0)
     B, N = 6, 120
-    R, t = random_rotation(B, generator=g), torch.rand(B, 3, generator=g) * 0.2 + torch.tensor([0.0, 0.0, 0.8])
+    R, t = (
+        random_rotation(B, generator=g),
+        torch.rand(B, 3, generator=g) * 0.2 + torch.tensor([0.0, 0.0, 0.8]),
+    )
     thing = torch.rand(B, N, 3, generator=g) * 0.2 - 0.1
     point = thing @ R.transpose(-1, -2) + t[:, None]
     told = thing + 0.01 * torch.randn(B, N, 3, generator=g)
@@ -33,9 +42,11 @@ def test_agreement_beats_the_best_particle_and_shrugs_off_a_third_of_outliers() 
     pose = make_pose(Rs, point - (Rs @ told[..., None])[..., 0])
     log_p = torch.full((B, N), -0.1)
     empty = torch.zeros(B, N, 0)
-    cloud = Cloud(torch.zeros(B, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(B, N))
-    reading = Reading(log_p, torch.zeros(B, N, 2), pose, empty)
-    belief = Agreement(scale_m=0.015)(cloud, reading, None, Points(point), g)  # type: ignore[arg-type]
+    particles = Particles(
+        torch.zeros(B, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(B, N)
+    )
+    output = ParticleOutput(log_p, torch.zeros(B, N, 2), pose, empty)
+    belief = Agreement(scale_m=0.015)(particles, output, None, Points(point), g)  # type: ignore[arg-type]
     assert angle_between(belief.best[:, :3, :3], R).max() < 0.05
     assert (belief.best[:, :3, 3] - t).norm(dim=-1).max() < 0.006
     single = angle_between(pose[:, :, :3, :3], R[:, None]).median()
@@ -45,23 +56,36 @@ def test_agreement_beats_the_best_particle_and_shrugs_off_a_third_of_outliers() 
 
 
 def test_particles_that_cannot_tell_two_sides_apart_agree_on_the_one_that_fits_all() -> None:
-    """Six in ten hold the point's mirror image likelier than the point; no particle's own pose is near the truth."""
+    """Six in ten hold the point's mirror image likelier than the point; no particle's own pose is
+    near the truth.
+    """
     g = torch.Generator().manual_seed(1)
     B, N, K = 6, 120, 4
-    R, t = random_rotation(B, generator=g), torch.rand(B, 3, generator=g) * 0.2 + torch.tensor([0.0, 0.0, 0.8])
+    R, t = (
+        random_rotation(B, generator=g),
+        torch.rand(B, 3, generator=g) * 0.2 + torch.tensor([0.0, 0.0, 0.8]),
+    )
     thing = torch.rand(B, N, 3, generator=g) * 0.2 - 0.1
     point = thing @ R.transpose(-1, -2) + t[:, None]
     place = torch.rand(B, N, K, 3, generator=g) * 2 - 1
-    told = ((thing - MODEL.center) / MODEL.radius)[:, :, None] + 0.02 * torch.randn(B, N, 2, 3, generator=g)
+    told = ((thing - MODEL.center) / MODEL.radius)[:, :, None] + 0.02 * torch.randn(
+        B, N, 2, 3, generator=g
+    )
     place[:, :, :2] = told * torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
     fooled = torch.rand(B, N, generator=g) < 0.6
-    share = torch.where(fooled[..., None], torch.tensor([0.35, 0.45, 0.1, 0.1]), torch.tensor([0.45, 0.35, 0.1, 0.1]))
+    share = torch.where(
+        fooled[..., None],
+        torch.tensor([0.35, 0.45, 0.1, 0.1]),
+        torch.tensor([0.45, 0.35, 0.1, 0.1]),
+    )
     log_p, empty = torch.full((B, N), -0.1), torch.zeros(B, N, 0)
-    cloud = Cloud(torch.zeros(B, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(B, N))
+    particles = Particles(
+        torch.zeros(B, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(B, N)
+    )
     own = make_pose(random_rotation(B, N, generator=g), point)
     said = Fragments(share.log(), place, torch.zeros(B, K, 3), torch.tensor(0.1))
-    reading = Reading(log_p, torch.zeros(B, N, 2), own, empty, said)
-    belief = Agreement(hypotheses=128)(cloud, reading, None, Points(point), g)  # type: ignore[arg-type]
+    output = ParticleOutput(log_p, torch.zeros(B, N, 2), own, empty, said)
+    belief = Agreement(hypotheses=128)(particles, output, None, Points(point), g)  # type: ignore[arg-type]
     assert angle_between(belief.best[:, :3, :3], R).max() < 0.03
     assert (belief.best[:, :3, 3] - t).norm(dim=-1).max() < 0.004
     near = angle_between(belief.poses[..., :3, :3], R[:, None]) < 0.3

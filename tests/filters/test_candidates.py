@@ -1,10 +1,12 @@
-"""Candidates are where they are said to be, and persistent particles live on in the object's own frame."""
+"""Candidates are where they are said to be, and persistent particles live on in the object's own
+frame.
+"""
 
 import torch
 from tests.models.toy import scenes, square
 
 from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth, jiggle
-from posefilter.filters.propose import half_turns
+from posefilter.filters.propagate import half_turns
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
@@ -27,10 +29,12 @@ def test_candidates_hold_the_truth_and_every_kind() -> None:
     flipped = angle_between(poses[:, -8:, :3, :3], batch.camera_from_object[:, None, :3, :3])
     assert flipped.median() > 2.8
     placed = poses[:, 25:29]
-    assert (origin_of(placed, MODEL.center) - batch.camera_from_object[:, None, :3, 3]).norm(dim=-1).median() < 0.15
+    assert (origin_of(placed, MODEL.center) - batch.camera_from_object[:, None, :3, 3]).norm(
+        dim=-1
+    ).median() < 0.15
 
 
-def test_half_turns_are_half_turns_about_the_centre() -> None:
+def test_half_turns_are_half_turns_about_the_center() -> None:
     batch = scenes(2)
     center = torch.tensor([0.03, 0.01, -0.02])
     poses = batch.camera_from_object[:, None].expand(-1, 6, -1, -1)

@@ -7,7 +7,7 @@ from posefilter.errors import UserError
 from posefilter.filters.guided import Guided, look_up
 from posefilter.filters.resample import Systematic
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.types import Cloud
+from posefilter.types import Particles
 
 
 class Relevant:
@@ -15,11 +15,11 @@ class Relevant:
         self.relevance = relevance
 
 
-def cloud_of(N: int, seed: int) -> Cloud:
+def cloud_of(N: int, seed: int) -> Particles:
     g = torch.Generator().manual_seed(seed)
     state = torch.rand(2, N, 2, generator=g) * torch.tensor([79.0, 59.0])
     weights = torch.randn(2, N, generator=g).log_softmax(1)
-    return Cloud(state, torch.zeros(2, N, 0), weights, torch.arange(N).expand(2, N))
+    return Particles(state, torch.zeros(2, N, 0), weights, torch.arange(N).expand(2, N))
 
 
 def test_look_up_reads_the_cell_under_the_particle() -> None:
@@ -29,20 +29,23 @@ def test_look_up_reads_the_cell_under_the_particle() -> None:
 
 
 def test_guided_resampling_keeps_the_weighted_mean_and_sends_children_to_the_relevant() -> None:
-    cloud = cloud_of(40, 0)
+    particles = cloud_of(40, 0)
     relevance = torch.full((2, 1, 6, 8), 0.1)
     relevance[..., :4] = 1.0  # the left half
     guided = Guided(Systematic()).bind(Relevant(relevance), 60, 80)
-    truth = (cloud.log_weights.exp()[..., None] * cloud.state).sum(1)
+    truth = (particles.log_weights.exp()[..., None] * particles.state).sum(1)
     g = torch.Generator().manual_seed(1)
-    children = guided(cloud, 20000, PixelSpace(), g)
-    picked = cloud.state.gather(1, children.parents[..., None].expand(-1, -1, 2))
-    mean = (children.log_weights.exp()[..., None] * picked).sum(1)
+    resampled = guided(particles, 20000, PixelSpace(), g)
+    picked = particles.state.gather(1, resampled.ancestors[..., None].expand(-1, -1, 2))
+    mean = (resampled.log_weights.exp()[..., None] * picked).sum(1)
     torch.testing.assert_close(mean, truth, atol=0.05, rtol=0)
     left = picked[..., 0] < 39.5
     assert left.float().mean() > 0.8
-    assert (picked.mean(1) - truth).norm(dim=-1).min() > 5  # the canary: without the weights, the mean is wrong
-    torch.testing.assert_close(children.log_weights.logsumexp(1), torch.zeros(2), atol=1e-4, rtol=0)
+    # the canary: without the weights, the mean is wrong
+    assert (picked.mean(1) - truth).norm(dim=-1).min() > 5
+    torch.testing.assert_close(
+        resampled.log_weights.logsumexp(1), torch.zeros(2), atol=1e-4, rtol=0
+    )
 
 
 def test_guided_resampling_needs_a_map() -> None:

@@ -6,54 +6,60 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.contracts import Resample
 from posefilter.errors import UserError
-from posefilter.filters.estimate import Best, Mean
+from posefilter.filters.estimate import Argmax, Mean
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propose import Chain, Gaussian, LearnedMotion, Still
+from posefilter.filters.propagate import Chain, Gaussian, Identity, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import BelowESS, Never, Soft, Systematic
-from posefilter.filters.reweigh import Annealed, Sequential, TemperedSMC
+from posefilter.filters.resample import BelowESS, NoResampling, Soft, Systematic
+from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.filters.transport import Ensemble, OptimalTransport
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.signs import distinct
-from posefilter.types import Cloud, Reading, Step
+from posefilter.protocols import Resample
+from posefilter.types import ParticleOutput, Particles, Step
 
 EYE = torch.eye(4)
 
 
 class Hill:
-    """A method that likes one place an image; its motion is a learned share of the way there, its memory counts steps."""
+    """A method that likes one place an image; its displacement is a learned share of the way there,
+    its latent counts steps.
+    """
 
     space = PixelSpace()
-    memory_width = 2
+    latent_width = 2
 
     def __init__(self, goal: Tensor, pull: float = 0.0) -> None:
         self.goal = goal
         self.pull = torch.tensor(pull, requires_grad=True)
-        self.seen: list[Cloud] = []
+        self.seen: list[Particles] = []
 
-    def observe(self, batch: None) -> Tensor:
+    def encode(self, batch: None) -> Tensor:
         return self.goal
 
-    def read(self, scene: Tensor, cloud: Cloud, step: Step, generator: Generator) -> Reading:
-        self.seen.append(cloud)
-        way = scene[:, None] - cloud.state
+    def measure(
+        self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        self.seen.append(particles)
+        way = scene[:, None] - particles.state
         pose = EYE.expand(*way.shape[:2], 4, 4).clone()
-        pose[..., :2, 3] = cloud.state
-        memory = torch.stack([cloud.memory[..., 0] + 1, cloud.state[..., 0].detach()], -1)
-        return Reading(-0.5 * way.square().sum(-1), self.pull * way, pose, memory)
+        pose[..., :2, 3] = particles.state
+        latent = torch.stack([particles.latent[..., 0] + 1, particles.state[..., 0].detach()], -1)
+        return ParticleOutput(-0.5 * way.square().sum(-1), self.pull * way, pose, latent)
 
 
 def start(batch: None, scene: Tensor, method: Hill, particles: int, generator: Generator) -> Tensor:
     return 3 * torch.randn(len(scene), particles, 2, generator=generator)
 
 
-def build(resample: Resample | None = None, particles: int = 50, **changes: object) -> ParticleFilter:
+def build(
+    resample: Resample | None = None, particles: int = 50, **changes: object
+) -> ParticleFilter:
     pieces = {
-        "initialise": start, "schedule": Constant(0.5), "reweigh": Sequential(), "resample": resample or Systematic(),
-        "propose": Chain([LearnedMotion(), Gaussian(0.4)]), "estimate": Mean(), "refine": NoRefine(),
+        "initialize": start, "schedule": Constant(0.5), "reweight": Sequential(), "resample": resample or Systematic(),
+        "propagate": Chain([LearnedDisplacement(), Gaussian(0.4)]), "estimate": Mean(), "refine": NoRefine(),
     }  # fmt: skip
     return ParticleFilter(particles, 4, **(pieces | changes))
 
@@ -68,7 +74,10 @@ every = pytest.mark.parametrize(
 
 @every
 def test_same_generator_same_belief(resample: Resample) -> None:
-    a, b, c = (build(resample)(None, Hill(GOALS), Generator().manual_seed(seed)).belief for seed in (1, 1, 2))
+    a, b, c = (
+        build(resample)(None, Hill(GOALS), Generator().manual_seed(seed)).belief
+        for seed in (1, 1, 2)
+    )
     assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
     assert not torch.equal(a.best, c.best)
 
@@ -87,67 +96,83 @@ def test_nothing_is_kept_between_calls(resample: Resample) -> None:
 def test_images_do_not_see_each_other(resample: Resample) -> None:
     other = GOALS.clone()
     other[1] += 7
-    a, b = (build(resample)(None, Hill(goals), Generator().manual_seed(1)).belief for goals in (GOALS, other))
+    a, b = (
+        build(resample)(None, Hill(goals), Generator().manual_seed(1)).belief
+        for goals in (GOALS, other)
+    )
     for x, y in zip(a, b, strict=True):
         torch.testing.assert_close(x[[0, 2]], y[[0, 2]])
         assert not torch.allclose(x[1], y[1])
 
 
 def test_every_step_is_what_its_words_say() -> None:
-    """One run against a loop over images and particles that draws nothing but the same random numbers."""
+    """One run against a loop over images and particles that draws nothing but the same random
+    numbers.
+    """
     method = Hill(GOALS, pull=0.3)
-    filt = build(Soft(0.5), reweigh=TemperedSMC(), propose=LearnedMotion(), schedule=Geometric(2.0, 0.5))
+    filt = build(
+        Soft(0.5),
+        reweight=TemperedSMC(),
+        propagate=LearnedDisplacement(),
+        schedule=Geometric(2.0, 0.5),
+    )
     trace = filt(None, method, Generator().manual_seed(3))
     g = Generator().manual_seed(3)
     state = start(None, GOALS, method, 50, g)
     score = lambda x, b: -0.5 * float((GOALS[b] - x).square().sum())  # noqa: E731
     log_w = [[math.log(score_weight) for score_weight in [1 / 50] * 50] for _ in GOALS]
     before = [[0.0] * 50 for _ in GOALS]
-    for t, cloud in enumerate(trace.clouds):
+    for t, particles in enumerate(trace.particles):
         if t:
             places = Systematic().places(3, 50, g, torch.device("cpu"))
             for b in range(3):
                 q = [0.5 * math.exp(w) + 0.5 / 50 for w in log_w[b]]
-                parents = []
+                ancestors = []
                 for place in places[b].tolist():
                     total, parent = q[0], 0
                     while total < place:
                         parent += 1
                         total += q[parent]
-                    parents.append(parent)
-                assert cloud.ancestors[b].tolist() == parents
-                raw = [math.exp(log_w[b][p]) / q[p] for p in parents]
-                before[b] = [score(state[b, p], b) for p in parents]
+                    ancestors.append(parent)
+                assert particles.ancestors[b].tolist() == ancestors
+                raw = [math.exp(log_w[b][p]) / q[p] for p in ancestors]
+                before[b] = [score(state[b, p], b) for p in ancestors]
                 log_w[b] = [math.log(r / sum(raw)) for r in raw]
-                state[b] = torch.stack([state[b, p] + 0.3 * (GOALS[b] - state[b, p]) for p in parents])
-        torch.testing.assert_close(cloud.state, state)
+                state[b] = torch.stack(
+                    [state[b, p] + 0.3 * (GOALS[b] - state[b, p]) for p in ancestors]
+                )
+        torch.testing.assert_close(particles.state, state)
         for b in range(3):
             log_w[b] = [log_w[b][n] + score(state[b, n], b) - before[b][n] for n in range(50)]
             total = math.log(sum(math.exp(w) for w in log_w[b]))
             assert trace.log_evidence[b, t].item() == pytest.approx(total, abs=1e-4)
             log_w[b] = [w - total for w in log_w[b]]
-        torch.testing.assert_close(cloud.log_weights, torch.tensor(log_w), atol=1e-4, rtol=1e-4)
-    assert [float(step.sigma) for step in trace.steps] == pytest.approx([2.0, 2 ** (1 / 3), 2 ** (-1 / 3), 0.5])
+        torch.testing.assert_close(particles.log_weights, torch.tensor(log_w), atol=1e-4, rtol=1e-4)
+    assert [float(step.sigma) for step in trace.steps] == pytest.approx(
+        [2.0, 2 ** (1 / 3), 2 ** (-1 / 3), 0.5]
+    )
     assert [(step.number, step.steps) for step in trace.steps] == [(t, 4) for t in range(4)]
 
 
 def test_memory_follows_its_particle() -> None:
     method = Hill(GOALS)
-    trace = build(propose=Still())(None, method, Generator().manual_seed(0))
-    for t, cloud in enumerate(trace.clouds):
-        assert (cloud.memory[..., 0] == t).all()
+    trace = build(propagate=Identity())(None, method, Generator().manual_seed(0))
+    for t, particles in enumerate(trace.particles):
+        assert (particles.latent[..., 0] == t).all()
         if t:  # still particles remember where they, or rather their parents, were
-            torch.testing.assert_close(cloud.memory[..., 1], cloud.state[..., 0])
-            parents = trace.clouds[t - 1].state.gather(1, cloud.ancestors[..., None].expand(-1, -1, 2))
-            torch.testing.assert_close(cloud.state, parents)
+            torch.testing.assert_close(particles.latent[..., 1], particles.state[..., 0])
+            ancestors = trace.particles[t - 1].state.gather(
+                1, particles.ancestors[..., None].expand(-1, -1, 2)
+            )
+            torch.testing.assert_close(particles.state, ancestors)
 
 
 def test_a_first_cloud_may_be_larger() -> None:
     trace = build(first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
-    assert [cloud.state.shape[1] for cloud in trace.clouds] == [300, 50, 50, 50]
-    assert trace.clouds[1].ancestors.max() >= 50
+    assert [particles.state.shape[1] for particles in trace.particles] == [300, 50, 50, 50]
+    assert trace.particles[1].ancestors.max() >= 50
     with pytest.raises(UserError, match="first_particles"):
-        build(Never(), first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
+        build(NoResampling(), first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
     with pytest.raises(UserError, match="particles=0"):
         build(particles=0)
 
@@ -159,7 +184,7 @@ def test_gradients_flow_as_far_as_the_pieces_let_them() -> None:
         error = (trace.belief.best[:, :2, 3] - GOALS - 1).square().sum()
         return torch.autograd.grad(error, method.pull)[0]
 
-    for resample in (Systematic(), Soft(), OptimalTransport(), Ensemble(), Never()):
+    for resample in (Systematic(), Soft(), OptimalTransport(), Ensemble(), NoResampling()):
         found = slope(resample)
         assert found.isfinite()
         assert found.abs() > 1e-4
@@ -167,28 +192,38 @@ def test_gradients_flow_as_far_as_the_pieces_let_them() -> None:
     step = 1e-3
     ends = []
     for pull in (0.1 - step, 0.1 + step):
-        best = build(Never())(None, Hill(GOALS, pull), Generator().manual_seed(0)).belief.best
+        best = build(NoResampling())(
+            None, Hill(GOALS, pull), Generator().manual_seed(0)
+        ).belief.best
         ends.append(float((best[:, :2, 3] - GOALS - 1).square().sum().detach()))
-    assert float(slope(Never())) == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=0.02)
+    assert float(slope(NoResampling())) == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=0.02)
 
 
 def test_soft_weights_let_the_likelihood_learn_across_a_resampling() -> None:
     class Guess(Hill):
         """Likes a learned place, the same in every image."""
 
-        def observe(self, batch: None) -> Tensor:
+        def encode(self, batch: None) -> Tensor:
             return self.pull * torch.ones_like(self.goal)
 
-        def read(self, scene: Tensor, cloud: Cloud, step: Step, generator: Generator) -> Reading:
-            reading = super().read(scene if step.number == 0 else scene.detach(), cloud, step, generator)
-            return reading._replace(motion=reading.motion.detach())
+        def measure(
+            self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+        ) -> ParticleOutput:
+            output = super().measure(
+                scene if step.number == 0 else scene.detach(), particles, step, generator
+            )
+            return output._replace(displacement=output.displacement.detach())
 
     found = {}
     for name, resample in (("soft", Soft()), ("systematic", Systematic())):
         method = Guess(GOALS, pull=0.5)
-        trace = build(resample, propose=Still())(None, method, Generator().manual_seed(0))
+        trace = build(resample, propagate=Identity())(None, method, Generator().manual_seed(0))
         goal = trace.belief.best[:, :2, 3].sum()
-        found[name] = torch.autograd.grad(goal, method.pull, allow_unused=True)[0] if goal.requires_grad else None
+        found[name] = (
+            torch.autograd.grad(goal, method.pull, allow_unused=True)[0]
+            if goal.requires_grad
+            else None
+        )
     assert float(found["soft"]) > 0.1  # liking a place further right puts the mean further right
     assert found["systematic"] is None
 
@@ -196,30 +231,39 @@ def test_soft_weights_let_the_likelihood_learn_across_a_resampling() -> None:
 @pytest.mark.parametrize("bad", [math.nan, -math.inf, math.inf])
 def test_a_dead_filter_says_so(bad: float) -> None:
     class Broken(Hill):
-        def read(self, scene: Tensor, cloud: Cloud, step: Step, generator: Generator) -> Reading:
-            reading = super().read(scene, cloud, step, generator)
+        def measure(
+            self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+        ) -> ParticleOutput:
+            output = super().measure(scene, particles, step, generator)
             if step.number == 2:
-                reading.log_likelihood.detach()[1] = bad
-            return reading
+                output.log_likelihood.detach()[1] = bad
+            return output
 
     with pytest.raises(FloatingPointError, match=r"step 2 \(image 1"):
         build()(None, Broken(GOALS), Generator().manual_seed(0))
 
 
 def test_annealed_weights_are_the_last_scores_alone() -> None:
-    trace = build(BelowESS(Systematic(), 0.3), reweigh=Annealed(), estimate=Best())(
+    trace = build(BelowESS(Systematic(), 0.3), reweight=Annealed(), estimate=Argmax())(
         None, Hill(GOALS), Generator().manual_seed(0)
     )
-    torch.testing.assert_close(trace.clouds[-1].log_weights, trace.readings[-1].log_likelihood.log_softmax(1))
-    torch.testing.assert_close(trace.belief.score, trace.readings[-1].log_likelihood.amax(1))
+    torch.testing.assert_close(
+        trace.particles[-1].log_weights, trace.outputs[-1].log_likelihood.log_softmax(1)
+    )
+    torch.testing.assert_close(trace.belief.score, trace.outputs[-1].log_likelihood.amax(1))
 
 
 def test_copies_of_a_particle_stay_together_until_noise_parts_them() -> None:
-    """A deterministic motion sends all copies of a particle to one place: what resampling doubles is one opinion."""
+    """A deterministic displacement sends all copies of a particle to one place: what resampling
+    doubles is one opinion.
+    """
     ends = {}
-    for name, pieces in (("alone", [LearnedMotion()]), ("with noise", [LearnedMotion(), Gaussian(1.0)])):
-        run = build(propose=Chain(pieces), reweigh=Annealed(), schedule=Geometric(6.0, 1.5))
+    for name, pieces in (
+        ("alone", [LearnedDisplacement()]),
+        ("with noise", [LearnedDisplacement(), Gaussian(1.0)]),
+    ):
+        run = build(propagate=Chain(pieces), reweight=Annealed(), schedule=Geometric(6.0, 1.5))
         trace = run(None, Hill(GOALS, pull=0.3), Generator().manual_seed(0))
-        ends[name] = distinct(trace.clouds[-1].state)
+        ends[name] = distinct(trace.particles[-1].state)
     assert (ends["alone"] < 0.5).all()
     assert (ends["with noise"] > 0.9).all()

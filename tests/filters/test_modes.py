@@ -11,9 +11,13 @@ SPACE = PoseSpace((0.0, 0.0, 0.1), 0.15)
 
 
 def spread_about(pose: torch.Tensor, count: int, size: float, seed: int) -> torch.Tensor:
-    noise = torch.randn(count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    noise = torch.randn(
+        count, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     return move_about(
-        pose, noise * SPACE.noise_scale(torch.tensor(size, dtype=torch.float64)), torch.tensor([0, 0, 0.1]).double()
+        pose,
+        noise * SPACE.noise_scale(torch.tensor(size, dtype=torch.float64)),
+        torch.tensor([0, 0, 0.1]).double(),
     )
 
 
@@ -28,8 +32,15 @@ def hypotheses() -> torch.Tensor:
 
 def test_each_hypothesis_is_a_mode_with_its_share() -> None:
     at, shares, counts = hypotheses(), [0.2, 0.7, 0.1], [150, 60, 90]
-    state = torch.cat([spread_about(pose, n, 0.003, i) for i, (pose, n) in enumerate(zip(at, counts, strict=True))])
-    weights = torch.cat([torch.full((n,), share / n) for share, n in zip(shares, counts, strict=True)])
+    state = torch.cat(
+        [
+            spread_about(pose, n, 0.003, i)
+            for i, (pose, n) in enumerate(zip(at, counts, strict=True))
+        ]
+    )
+    weights = torch.cat(
+        [torch.full((n,), share / n) for share, n in zip(shares, counts, strict=True)]
+    )
     shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(5))
     modes = find_modes(state[shuffle], weights[shuffle].log(), SPACE, 0.008)
     assert modes.weights.tolist() == pytest.approx([0.7, 0.2, 0.1], abs=1e-6)

@@ -7,13 +7,13 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.estimate import Best, DensestMode, DensestPose, Mean, kernel_mass
-from posefilter.filters.propose import Chain, Gaussian, HalfTurns, LearnedMotion, Still
+from posefilter.filters.estimate import Argmax, DensestMode, DensestPose, Mean, kernel_mass
+from posefilter.filters.propagate import Chain, Gaussian, HalfTurns, Identity, LearnedDisplacement
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between, random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Cloud, Reading, Step
+from posefilter.types import ParticleOutput, Particles, Step
 
 PIXELS = PixelSpace()
 POSES = PoseSpace((0.02, 0.0, -0.03), 0.1)
@@ -39,8 +39,12 @@ def test_schedules() -> None:
 
 def test_gaussian_moves_have_the_size_of_the_noise_level() -> None:
     g = Generator().manual_seed(0)
-    moved = Gaussian(0.5)(torch.zeros(2, 20000, 2), torch.zeros(2, 20000, 2), step([2.0, 6.0]), PIXELS, g)
-    torch.testing.assert_close(moved.std(1), torch.tensor([[1.0, 1.0], [3.0, 3.0]]), rtol=0.03, atol=0)
+    moved = Gaussian(0.5)(
+        torch.zeros(2, 20000, 2), torch.zeros(2, 20000, 2), step([2.0, 6.0]), PIXELS, g
+    )
+    torch.testing.assert_close(
+        moved.std(1), torch.tensor([[1.0, 1.0], [3.0, 3.0]]), rtol=0.03, atol=0
+    )
     poses = some_poses(1, 1).expand(1, 8000, 4, 4)
     moved = Gaussian(0.5)(poses, torch.zeros(1, 8000, 6), step(0.04), POSES, g)
     shift = origin_of(moved, CENTER) - origin_of(poses, CENTER)
@@ -50,26 +54,47 @@ def test_gaussian_moves_have_the_size_of_the_noise_level() -> None:
 
 
 def test_learned_motion_and_chains() -> None:
-    state, motion, g = torch.zeros(1, 3, 2), torch.tensor([[[1.0, 2.0]] * 3]), Generator().manual_seed(0)
-    assert torch.equal(LearnedMotion()(state, motion, step(1.0), PIXELS, g), motion)
-    assert torch.equal(Still()(state, motion, step(1.0), PIXELS, g), state)
-    assert torch.equal(Chain([LearnedMotion(), LearnedMotion()])(state, motion, step(1.0), PIXELS, g), 2 * motion)
+    state, displacement, g = (
+        torch.zeros(1, 3, 2),
+        torch.tensor([[[1.0, 2.0]] * 3]),
+        Generator().manual_seed(0),
+    )
+    assert torch.equal(
+        LearnedDisplacement()(state, displacement, step(1.0), PIXELS, g), displacement
+    )
+    assert torch.equal(Identity()(state, displacement, step(1.0), PIXELS, g), state)
+    assert torch.equal(
+        Chain([LearnedDisplacement(), LearnedDisplacement()])(
+            state, displacement, step(1.0), PIXELS, g
+        ),
+        2 * displacement,
+    )
     again = Generator().manual_seed(0)
-    noisy = Chain([LearnedMotion(), Gaussian(1.0)])(state, motion, step(1.0), PIXELS, g)
-    torch.testing.assert_close(noisy, motion + Gaussian(1.0)(state, motion, step(1.0), PIXELS, again))
+    noisy = Chain([LearnedDisplacement(), Gaussian(1.0)])(state, displacement, step(1.0), PIXELS, g)
+    torch.testing.assert_close(
+        noisy, displacement + Gaussian(1.0)(state, displacement, step(1.0), PIXELS, again)
+    )
 
 
-def test_half_turns_turn_a_share_about_the_centre() -> None:
+def test_half_turns_turn_a_share_about_the_center() -> None:
     poses = some_poses(2, 5000)
-    moved = HalfTurns(0.3)(poses, torch.zeros(2, 5000, 6), step(0.1), POSES, Generator().manual_seed(0))
+    moved = HalfTurns(0.3)(
+        poses, torch.zeros(2, 5000, 6), step(0.1), POSES, Generator().manual_seed(0)
+    )
     assert is_rigid(moved, 1e-4)
-    torch.testing.assert_close(origin_of(moved, CENTER), origin_of(poses, CENTER), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        origin_of(moved, CENTER), origin_of(poses, CENTER), atol=1e-5, rtol=0
+    )
     angle = angle_between(rotation_of(moved), rotation_of(poses))
     turned = angle > 1
     assert float(turned.float().mean()) == pytest.approx(0.3, abs=0.02)
-    torch.testing.assert_close(angle[turned], torch.full_like(angle[turned], math.pi), atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        angle[turned], torch.full_like(angle[turned], math.pi), atol=2e-3, rtol=0
+    )
     assert angle[~turned].max() < 2e-3
-    relative = (rotation_of(poses).mT @ rotation_of(moved))[turned].diagonal(dim1=-2, dim2=-1).round()
+    relative = (
+        (rotation_of(poses).mT @ rotation_of(moved))[turned].diagonal(dim1=-2, dim2=-1).round()
+    )
     kinds, counts = relative.unique(dim=0, return_counts=True)
     assert len(kinds) == 3  # one axis keeps its sign
     assert counts.min() > 0.28 * counts.sum()
@@ -85,36 +110,43 @@ class Pixels:
     space = PIXELS
 
 
-def two_clusters() -> tuple[Cloud, Reading]:
-    """One image: a tight cluster of three light particles, and a lone one with the most weight and likelihood."""
+def two_clusters() -> tuple[Particles, ParticleOutput]:
+    """One image: a tight cluster of three light particles, and a lone one with the most weight and
+    likelihood.
+    """
     base = some_poses(2, 1).expand(2, 4, 4, 4).clone()
     base[:, 3] = some_poses(2, 1, seed=5)[:, 0]
     base = POSES.move(base, 0.001 * torch.randn(2, 4, 6, generator=Generator().manual_seed(1)))
     weights = torch.tensor([[0.25, 0.2, 0.15, 0.4]] * 2)
-    cloud = Cloud(base, torch.zeros(2, 4, 0), weights.log(), torch.arange(4).expand(2, 4))
-    return cloud, Reading(torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2), torch.zeros(2, 4, 6), base, cloud.memory)
+    particles = Particles(base, torch.zeros(2, 4, 0), weights.log(), torch.arange(4).expand(2, 4))
+    return particles, ParticleOutput(
+        torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2), torch.zeros(2, 4, 6), base, particles.latent
+    )
 
 
 def test_best_and_densest_differ_where_they_should() -> None:
-    cloud, reading = two_clusters()
-    best = Best()(cloud, reading, None, Poses(), Generator())
-    assert torch.equal(best.best, cloud.state[:, 3])
+    particles, output = two_clusters()
+    best = Argmax()(particles, output, None, Poses(), Generator())
+    assert torch.equal(best.best, particles.state[:, 3])
     assert best.score.tolist() == [4.0, 4.0]
     for estimate in (DensestMode(0.01), DensestPose(0.01, 0.1)):
-        belief = estimate(cloud, reading, None, Poses(), Generator())
-        assert (POSES.distance(belief.best, cloud.state[:, 0]) < 0.01).all()
+        belief = estimate(particles, output, None, Poses(), Generator())
+        assert (POSES.distance(belief.best, particles.state[:, 0]) < 0.01).all()
         torch.testing.assert_close(belief.score.exp(), torch.tensor([0.6, 0.6]), atol=0.05, rtol=0)
-        assert torch.equal(belief.poses, cloud.state)
-        assert torch.equal(belief.log_weights, cloud.log_weights)
+        assert torch.equal(belief.poses, particles.state)
+        assert torch.equal(belief.log_weights, particles.log_weights)
 
 
 def test_pixels_agree_in_the_image_or_on_a_pose() -> None:
-    cloud, reading = two_clusters()
-    pixels = torch.tensor([[[0.0, 0.0], [50, 0], [100, 0], [101, 0]]] * 2)  # the heavy one has company here
-    cloud = cloud._replace(state=pixels)
-    assert torch.equal(DensestMode(3.0)(cloud, reading, None, Pixels(), Generator()).best, reading.pose[:, 3])
-    vote = DensestPose(0.01, 0.1)(cloud, reading, None, Pixels(), Generator())
-    assert (POSES.distance(vote.best, reading.pose[:, 0]) < 0.01).all()
+    particles, output = two_clusters()
+    # the heavy one has company here
+    pixels = torch.tensor([[[0.0, 0.0], [50, 0], [100, 0], [101, 0]]] * 2)
+    particles = particles._replace(state=pixels)
+    assert torch.equal(
+        DensestMode(3.0)(particles, output, None, Pixels(), Generator()).best, output.pose[:, 3]
+    )
+    vote = DensestPose(0.01, 0.1)(particles, output, None, Pixels(), Generator())
+    assert (POSES.distance(vote.best, output.pose[:, 0]) < 0.01).all()
 
 
 @pytest.mark.parametrize("chunk", [1 << 20, 20])
@@ -124,14 +156,19 @@ def test_kernel_mass_is_a_double_loop(chunk: int) -> None:
     found = kernel_mass(state, log_w, PIXELS, 0.8, chunk)
     for b in range(2):
         for i in range(7):
-            near = [math.exp(-0.5 * float((state[b, i] - state[b, j]).norm() / 0.8) ** 2) for j in range(7)]
+            near = [
+                math.exp(-0.5 * float((state[b, i] - state[b, j]).norm() / 0.8) ** 2)
+                for j in range(7)
+            ]
             mass = sum(math.exp(log_w[b, j]) * near[j] for j in range(7))
             assert float(found[b, i].exp()) == pytest.approx(mass, rel=1e-4)
 
 
 def test_mean_is_the_spaces() -> None:
-    cloud, reading = two_clusters()
-    belief = Mean()(cloud, reading, None, Poses(), Generator())
-    torch.testing.assert_close(belief.best, POSES.mean(cloud.state, cloud.log_weights.exp()))
+    particles, output = two_clusters()
+    belief = Mean()(particles, output, None, Poses(), Generator())
+    torch.testing.assert_close(
+        belief.best, POSES.mean(particles.state, particles.log_weights.exp())
+    )
     assert belief.score.tolist() == pytest.approx([0.25 + 0.4 + 0.45 + 1.6] * 2)
-    assert is_rigid(Mean()(cloud, reading, None, Pixels(), Generator()).best)
+    assert is_rigid(Mean()(particles, output, None, Pixels(), Generator()).best)

@@ -18,7 +18,9 @@ CENTER = torch.tensor(SPACE.center)
 
 
 class Peak(nn.Module):
-    """Scores a pose by how near it is to the image's own; `weight` stands for a network's parameters."""
+    """Scores a pose by how near it is to the image's own; `weight` stands for a network's
+    parameters.
+    """
 
     space = SPACE
 
@@ -27,7 +29,9 @@ class Peak(nn.Module):
         self.weight = nn.Parameter(torch.ones(()))
         self.asked: list[tuple[int, float, int]] = []
 
-    def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+    def score_poses(
+        self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
         self.asked.append((poses.shape[1], sigma, pixels))
         shift = (origin_of(poses, CENTER) - origin_of(scene, CENTER)[:, None]).square().sum(-1)
         turn = (rotation_of(poses) - rotation_of(scene)[:, None]).square().sum((-1, -2)) / 2
@@ -43,7 +47,9 @@ def truth() -> Tensor:
 def belief_around(sigma: float, count: int = 30) -> Belief:
     g = Generator().manual_seed(1)
     scale = SPACE.noise_scale(torch.tensor(sigma))
-    poses = SPACE.move(truth()[:, None].expand(3, count, 4, 4), scale * torch.randn(3, count, 6, generator=g))
+    poses = SPACE.move(
+        truth()[:, None].expand(3, count, 4, 4), scale * torch.randn(3, count, 6, generator=g)
+    )
     log_w = torch.randn(3, count, generator=g).log_softmax(1)
     return Belief(poses, log_w, poses[:, 0], torch.full((3,), -math.inf))
 
@@ -71,7 +77,9 @@ def test_rescoring_bets_on_the_best_of_the_heaviest() -> None:
 def test_climbing_finds_the_top(starts: int) -> None:
     method, belief = Peak(), belief_around(0.015)
     with torch.no_grad():  # as in validation
-        found = Gradient(steps=60, lr=2e-3, starts=starts)(belief, truth(), method, Generator().manual_seed(0))
+        found = Gradient(steps=60, lr=2e-3, starts=starts)(
+            belief, truth(), method, Generator().manual_seed(0)
+        )
     assert off(belief).min() > 0.005
     assert off(found).max() < 0.002
     assert is_rigid(found.best, 1e-4)
@@ -86,7 +94,9 @@ def test_a_climb_that_ends_lower_is_not_followed() -> None:
     class Slope(Peak):
         """A gradient that leads away."""
 
-        def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+        def score_poses(
+            self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        ) -> Tensor:
             right = super().score_poses(scene, poses, sigma, generator, pixels)
             return right if pixels == 1024 else -right
 
@@ -100,13 +110,17 @@ def test_images_climb_apart_and_alike() -> None:
     whole = Gradient(steps=20)(belief, truth(), method, Generator().manual_seed(0))
     again = Gradient(steps=20)(belief, truth(), method, Generator().manual_seed(0))
     assert torch.equal(whole.best, again.best)
-    single = Gradient(steps=20)(Belief(*(x[1:2] for x in belief)), truth()[1:2], method, Generator().manual_seed(0))
+    single = Gradient(steps=20)(
+        Belief(*(x[1:2] for x in belief)), truth()[1:2], method, Generator().manual_seed(0)
+    )
     torch.testing.assert_close(single.best, whole.best[1:2], atol=1e-5, rtol=0)
 
 
 def test_a_mean_shift_finds_the_top() -> None:
     method, belief = Peak(), belief_around(0.015)
-    found = MeanShift(rounds=12, pairs=200, start=0.02, end=0.01)(belief, truth(), method, Generator().manual_seed(0))
+    found = MeanShift(rounds=12, pairs=200, start=0.02, end=0.01)(
+        belief, truth(), method, Generator().manual_seed(0)
+    )
     assert off(belief).min() > 0.005
     assert off(found).max() < 0.002
     assert is_rigid(found.best, 1e-4)
@@ -118,22 +132,30 @@ def test_a_mean_shift_finds_the_top() -> None:
 class Bumpy(Peak):
     """A peak with bumps of 3 mm on it, steep enough to hold whatever climbs."""
 
-    def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+    def score_poses(
+        self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
         smooth = super().score_poses(scene, poses, sigma, generator, pixels)
         return smooth + (origin_of(poses, CENTER) * (2 * math.pi / 0.003)).sin().sum(-1)
 
 
 def test_a_mean_shift_walks_over_the_bumps_that_hold_a_climb() -> None:
     belief = belief_around(0.015)
-    shifted = MeanShift(rounds=12, pairs=500, start=0.02, end=0.01)(belief, truth(), Bumpy(), Generator().manual_seed(0))
-    climbed = Gradient(steps=60, lr=1e-3, sigma=0.004)(belief, truth(), Bumpy(), Generator().manual_seed(0))
+    shifted = MeanShift(rounds=12, pairs=500, start=0.02, end=0.01)(
+        belief, truth(), Bumpy(), Generator().manual_seed(0)
+    )
+    climbed = Gradient(steps=60, lr=1e-3, sigma=0.004)(
+        belief, truth(), Bumpy(), Generator().manual_seed(0)
+    )
     assert off(shifted).max() < 0.003
     assert off(climbed).mean() > 2 * off(shifted).mean()
 
 
 def test_a_mean_shift_on_even_ground_stays() -> None:
     class Flat(Peak):
-        def score_poses(self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+        def score_poses(
+            self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        ) -> Tensor:
             return torch.zeros(poses.shape[:2])
 
     belief = belief_around(0.015)
@@ -151,7 +173,9 @@ def test_a_mean_shift_to_nowhere_is_refused(wrong: dict[str, float]) -> None:
 def test_chains_and_nothing() -> None:
     belief = belief_around(0.02)
     assert NoRefine()(belief, truth(), Peak(), Generator()) is belief
-    found = Chain([Rescore(), Gradient(steps=60)])(belief, truth(), Peak(), Generator().manual_seed(0))
+    found = Chain([Rescore(), Gradient(steps=60)])(
+        belief, truth(), Peak(), Generator().manual_seed(0)
+    )
     assert off(found).max() < 0.002
 
 

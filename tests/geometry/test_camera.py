@@ -20,9 +20,9 @@ K = intrinsics(500.0, 480.0, 320.5, 238.0)
 
 def scattered(*shape: int) -> torch.Tensor:
     g = Generator().manual_seed(0)
-    return torch.rand(*shape, 3, generator=g, dtype=torch.float64) * torch.tensor([2.0, 2.0, 1.5]) + torch.tensor(
-        [-1.0, -1.0, 0.3]
-    )
+    return torch.rand(*shape, 3, generator=g, dtype=torch.float64) * torch.tensor(
+        [2.0, 2.0, 1.5]
+    ) + torch.tensor([-1.0, -1.0, 0.3])
 
 
 def test_projecting_then_lifting_is_the_identity() -> None:
@@ -31,7 +31,8 @@ def test_projecting_then_lifting_is_the_identity() -> None:
         camera = K.double().expand(*shape[:-1], 3, 3)
         pixels = project(points, camera)
         torch.testing.assert_close(back_project(pixels, points[..., 2], camera), points)
-        again = project(back_project(pixels, points[..., 2] * 2, camera), camera)  # depth along a ray moves no pixel
+        # depth along a ray moves no pixel
+        again = project(back_project(pixels, points[..., 2] * 2, camera), camera)
         torch.testing.assert_close(again, pixels)
         shifted = back_project(pixels + 0.5, points[..., 2], camera)  # the classic half pixel
         assert (shifted - points).abs().max() > 1e-4
@@ -48,7 +49,9 @@ def test_points_behind_the_camera_stay_finite() -> None:
 
 
 def test_the_middle_ray_looks_ahead() -> None:
-    torch.testing.assert_close(rays(torch.tensor([[320.5, 238.0]]), K), torch.tensor([[0.0, 0.0, 1.0]]))
+    torch.testing.assert_close(
+        rays(torch.tensor([[320.5, 238.0]]), K), torch.tensor([[0.0, 0.0, 1.0]])
+    )
 
 
 def test_resizing_and_cropping_move_pixels_as_they_move_the_image() -> None:
@@ -56,13 +59,18 @@ def test_resizing_and_cropping_move_pixels_as_they_move_the_image() -> None:
     pixels = project(points, K)
     small = project(points, resize_intrinsics(K, 0.5, 0.25))
     # A pixel's outer edges, half a pixel out, scale with the image.
-    torch.testing.assert_close(small + 0.5, (pixels + 0.5) * torch.tensor([0.5, 0.25]), atol=1e-4, rtol=0)
     torch.testing.assert_close(
-        project(points, crop_intrinsics(K, 12, 7)), pixels - torch.tensor([12.0, 7.0]), atol=1e-3, rtol=0
+        small + 0.5, (pixels + 0.5) * torch.tensor([0.5, 0.25]), atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(
+        project(points, crop_intrinsics(K, 12, 7)),
+        pixels - torch.tensor([12.0, 7.0]),
+        atol=1e-3,
+        rtol=0,
     )
 
 
-def test_the_grid_lies_on_the_cells_centres() -> None:
+def test_the_grid_lies_on_the_cells_centers() -> None:
     grid = pixel_grid(8, 12, 4)
     assert grid.shape == (2, 3, 2)
     assert grid[1, 2].tolist() == [9.5, 5.5]
@@ -72,5 +80,8 @@ def test_the_grid_lies_on_the_cells_centres() -> None:
 def test_gradients() -> None:
     points = scattered(6).requires_grad_()
     assert torch.autograd.gradcheck(lambda p: project(p, K.double()), points)
-    pixels, depth = project(points, K.double()).detach().requires_grad_(), points[:, 2].detach().requires_grad_()
+    pixels, depth = (
+        project(points, K.double()).detach().requires_grad_(),
+        points[:, 2].detach().requires_grad_(),
+    )
     assert torch.autograd.gradcheck(lambda u, z: back_project(u, z, K.double()), (pixels, depth))

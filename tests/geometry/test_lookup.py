@@ -16,7 +16,8 @@ def blobs(seed: int) -> torch.Tensor:
 def test_nearest_true_is_the_nearest_of_all_mask_pixels(seed: int) -> None:
     mask = blobs(seed)
     g = torch.Generator().manual_seed(seed)
-    places = torch.rand(3, 200, 2, generator=g) * torch.tensor([60.0, 50.0]) - 14  # in and out of the frame
+    # in and out of the frame
+    places = torch.rand(3, 200, 2, generator=g) * torch.tensor([60.0, 50.0]) - 14
     found = nearest_true(mask, places, chunk=500)
     for b in range(3):
         every = mask[b, 0].nonzero().flip(-1).float()
@@ -26,7 +27,9 @@ def test_nearest_true_is_the_nearest_of_all_mask_pixels(seed: int) -> None:
 
 
 def test_of_equal_values_the_first_is_the_least() -> None:
-    values = torch.tensor([[[2.0, 1.0, 1.0], [0.0, 0.0, 0.0]], [[3.0, 2.0, -torch.inf], [torch.inf, 5.0, 5.0]]])
+    values = torch.tensor(
+        [[[2.0, 1.0, 1.0], [0.0, 0.0, 0.0]], [[3.0, 2.0, -torch.inf], [torch.inf, 5.0, 5.0]]]
+    )
     assert least(values).tolist() == [[1, 0], [2, 1]]
     assert torch.equal(least(values), values.argmin(-1))
 
@@ -43,7 +46,10 @@ def test_an_empty_mask_pulls_nowhere() -> None:
 def test_touches_is_what_a_loop_over_the_glimpse_finds(size: int) -> None:
     mask = blobs(2)
     g = torch.Generator().manual_seed(1)
-    places = torch.stack([torch.randint(-6, 38, (3, 80), generator=g), torch.randint(-6, 30, (3, 80), generator=g)], -1)
+    places = torch.stack(
+        [torch.randint(-6, 38, (3, 80), generator=g), torch.randint(-6, 30, (3, 80), generator=g)],
+        -1,
+    )
     met = touches(mask, places.float(), size)
     for b in range(3):
         for n in range(80):
@@ -63,7 +69,7 @@ def test_shrink_leaves_the_pixels_whose_surroundings_are_all_mask() -> None:
     assert torch.equal(small[1], mask[1])
 
 
-def test_lists_and_centres() -> None:
+def test_lists_and_centers() -> None:
     mask = torch.zeros(2, 1, 9, 9, dtype=torch.bool)
     mask[0, 0, 2:4, 5:8] = True
     mask[1, 0, 8, 0] = True

@@ -23,8 +23,15 @@ from posefilter.geometry.rotation import (
     random_rotation,
 )
 
-V = torch.cat([torch.randn(60, 3, dtype=torch.float64, generator=Generator().manual_seed(0)), torch.zeros(1, 3).double()])
-HALF_TURNS = math.pi * torch.nn.functional.normalize(torch.cat([torch.eye(3).double(), V[:5]]), dim=-1)
+V = torch.cat(
+    [
+        torch.randn(60, 3, dtype=torch.float64, generator=Generator().manual_seed(0)),
+        torch.zeros(1, 3).double(),
+    ]
+)
+HALF_TURNS = math.pi * torch.nn.functional.normalize(
+    torch.cat([torch.eye(3).double(), V[:5]]), dim=-1
+)
 
 
 def test_conversions_are_scipys_and_romas() -> None:
@@ -38,7 +45,9 @@ def test_conversions_are_scipys_and_romas() -> None:
     found = quat_xyzw_from_matrix(R)
     torch.testing.assert_close(found * found[:, 3:].sign(), quat * quat[:, 3:].sign())
     torch.testing.assert_close(log_so3(R), roma.rotmat_to_rotvec(R))
-    torch.testing.assert_close(angle_between(R[:30], R[30:60]), roma.rotmat_geodesic_distance(R[:30], R[30:60]))
+    torch.testing.assert_close(
+        angle_between(R[:30], R[30:60]), roma.rotmat_geodesic_distance(R[:30], R[30:60])
+    )
 
 
 def test_a_wrong_quaternion_order_would_be_seen() -> None:
@@ -53,7 +62,9 @@ def test_half_turns_come_back_as_half_turns() -> None:
 
 
 def test_hat_is_the_cross_product() -> None:
-    torch.testing.assert_close((hat(V[:30]) @ V[30:60, :, None])[..., 0], torch.linalg.cross(V[:30], V[30:60]))
+    torch.testing.assert_close(
+        (hat(V[:30]) @ V[30:60, :, None])[..., 0], torch.linalg.cross(V[:30], V[30:60])
+    )
 
 
 def test_nearest_rotation_is_romas_and_never_a_reflection() -> None:
@@ -91,23 +102,34 @@ def test_gradients(angle: float) -> None:
 
 
 def test_gradients_of_fits_and_projections() -> None:
-    M = torch.randn(4, 3, 3, dtype=torch.float64, generator=Generator().manual_seed(3), requires_grad=True)
+    M = torch.randn(
+        4, 3, 3, dtype=torch.float64, generator=Generator().manual_seed(3), requires_grad=True
+    )
     assert torch.autograd.gradcheck(project_to_so3, M)
-    exact = exp_so3(V[:5]).requires_grad_()  # three singular values alike, where the SVD itself has no derivative
+    # three singular values alike, where the SVD itself has no derivative
+    exact = exp_so3(V[:5]).requires_grad_()
     assert torch.autograd.gradcheck(project_to_so3, exact)
     assert torch.autograd.gradcheck(matrix_from_6d, V[:12].reshape(6, 6).clone().requires_grad_())
-    assert torch.autograd.gradcheck(matrix_from_quat_xyzw, V[:12].reshape(9, 4).clone().requires_grad_())
+    assert torch.autograd.gradcheck(
+        matrix_from_quat_xyzw, V[:12].reshape(9, 4).clone().requires_grad_()
+    )
     source, target = V[:10], V[10:20].clone().requires_grad_()
     weights = V[20:30, 0].abs().clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda t, w: fit_rigid(source, t, w), (target, weights))
 
 
-@pytest.mark.parametrize(("level", "farthest", "average"), [(0, 57, 29), (1, 28, 14.5), (2, 14, 7.3)])
+@pytest.mark.parametrize(
+    ("level", "farthest", "average"), [(0, 57, 29), (1, 28, 14.5), (2, 14, 7.3)]
+)
 def test_the_grid_is_even(level: int, farthest: float, average: float) -> None:
     grid = so3_grid(level)
     assert grid.shape == (72 * 8**level, 3, 3)
-    torch.testing.assert_close(grid @ grid.transpose(1, 2), torch.eye(3).expand_as(grid), atol=1e-5, rtol=0)
-    trace = random_rotation(5000, generator=Generator().manual_seed(0)).flatten(1) @ grid.flatten(1).T
+    torch.testing.assert_close(
+        grid @ grid.transpose(1, 2), torch.eye(3).expand_as(grid), atol=1e-5, rtol=0
+    )
+    trace = (
+        random_rotation(5000, generator=Generator().manual_seed(0)).flatten(1) @ grid.flatten(1).T
+    )
     angle = torch.rad2deg(torch.acos(((trace.max(1).values - 1) / 2).clamp(-1, 1)))
     assert angle.max() < farthest
     assert angle.mean() < average
@@ -119,8 +141,8 @@ def test_the_grid_is_even(level: int, farthest: float, average: float) -> None:
 
 
 def test_the_grid_is_nested() -> None:
-    parents, children = so3_grid(1), so3_grid(2)
-    angle = angle_between(parents.repeat_interleave(8, 0), children)
+    ancestors, resampled = so3_grid(1), so3_grid(2)
+    angle = angle_between(ancestors.repeat_interleave(8, 0), resampled)
     assert angle.rad2deg().median() < 16
-    shuffled = angle_between(parents.repeat(8, 1, 1), children)  # the order of another nesting
+    shuffled = angle_between(ancestors.repeat(8, 1, 1), resampled)  # the order of another nesting
     assert shuffled.rad2deg().median() > 60

@@ -35,29 +35,37 @@ def test_a_move_of_sigma_shifts_the_surface_by_sigma_either_way() -> None:
     for axis in range(6):
         tangent = torch.zeros(100, 6)
         tangent[:, axis] = scale[axis]
-        torch.testing.assert_close(POSES.distance(POSES.move(T, tangent), T), torch.full((100,), 0.02), atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            POSES.distance(POSES.move(T, tangent), T), torch.full((100,), 0.02), atol=1e-4, rtol=0
+        )
 
 
 def test_the_mean_of_symmetric_moves_is_the_middle() -> None:
     T = scattered(5)
     tangent = 0.3 * torch.randn(5, 1, 8, 6, generator=Generator().manual_seed(0))
     tangent = torch.cat([tangent, -tangent], 1).flatten(1, 2)
-    cloud = POSES.move(T[:, None].expand(5, 16, 4, 4), tangent)
-    mean = POSES.mean(cloud, torch.full((5, 16), 1 / 16))
+    particles = POSES.move(T[:, None].expand(5, 16, 4, 4), tangent)
+    mean = POSES.mean(particles, torch.full((5, 16), 1 / 16))
     assert is_rigid(mean, 1e-4)
     torch.testing.assert_close(mean, T, atol=1e-4, rtol=0)
-    lopsided = POSES.mean(cloud, torch.softmax(3 * torch.randn(5, 16), 1))
+    lopsided = POSES.mean(particles, torch.softmax(3 * torch.randn(5, 16), 1))
     assert (lopsided - T).abs().max() > 0.01
 
 
-def test_the_mean_minimises_the_weighted_squared_chord() -> None:
-    cloud, w = (
+def test_the_mean_minimizes_the_weighted_squared_chord() -> None:
+    particles, w = (
         POSES.move(scattered(1, 1).expand(1, 9, 4, 4), 0.4 * torch.randn(1, 9, 6)),
         torch.softmax(torch.randn(1, 9), 1),
     )
-    mean = POSES.mean(cloud, w)
-    torch.testing.assert_close(origin_of(mean, CENTER), (w[..., None] * origin_of(cloud, CENTER)).sum(1))
-    cost = lambda T: (w * (rotation_of(cloud) - rotation_of(T)[:, None]).square().sum((-1, -2))).sum()  # noqa: E731
+    mean = POSES.mean(particles, w)
+    torch.testing.assert_close(
+        origin_of(mean, CENTER), (w[..., None] * origin_of(particles, CENTER)).sum(1)
+    )
+
+    def cost(T: torch.Tensor) -> torch.Tensor:
+        chord = (rotation_of(particles) - rotation_of(T)[:, None]).square().sum((-1, -2))
+        return (w * chord).sum()
+
     for _ in range(20):
         near = POSES.move(mean, torch.cat([torch.zeros(1, 3), 0.05 * torch.randn(1, 3)], -1))
         assert cost(near) > cost(mean)
@@ -68,5 +76,7 @@ def test_distances() -> None:
     shift = (origin_of(a, CENTER) - origin_of(b, CENTER)).norm(dim=-1)
     turn = angle_between(rotation_of(a), rotation_of(b)) * POSES.radius
     for i in range(20):
-        assert POSES.distance(a, b)[i] == pytest.approx(math.hypot(float(shift[i]), float(turn[i])), rel=1e-5)
+        assert POSES.distance(a, b)[i] == pytest.approx(
+            math.hypot(float(shift[i]), float(turn[i])), rel=1e-5
+        )
     assert PIXELS.distance(torch.tensor([3.0, 0.0]), torch.tensor([0.0, 4.0])) == 5.0

@@ -1,4 +1,6 @@
-"""The filter against the exact answer where there is one: a linear system with Gaussian noise (Kalman 1960)."""
+"""The filter against the exact answer where there is one: a linear system with Gaussian noise
+(Kalman 1960).
+"""
 
 import math
 
@@ -6,35 +8,52 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.contracts import Propose, Resample, Reweigh
 from posefilter.filters.estimate import Mean
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propose import Chain, Gaussian, LearnedMotion
+from posefilter.filters.propagate import Chain, Gaussian, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import BelowESS, Multinomial, Never, Soft, Stratified, Systematic
-from posefilter.filters.reweigh import Annealed, Sequential
+from posefilter.filters.resample import (
+    BelowESS,
+    Multinomial,
+    NoResampling,
+    Soft,
+    Stratified,
+    Systematic,
+)
+from posefilter.filters.reweight import Annealed, Sequential
 from posefilter.filters.schedule import Constant
 from posefilter.filters.transport import Ensemble, OptimalTransport
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.types import Children, Cloud, Reading, Step, Trace
+from posefilter.protocols import Propagate, Resample, Reweight
+from posefilter.types import ParticleOutput, Particles, Resampled, Step, Trace
 
-DRIFT, MOVE, SEEN, START = 0.9, 0.5, 0.7, 2.0  # x' = DRIFT x + MOVE n, y = x + SEEN n, x_0 ~ START n
+# x' = DRIFT x + MOVE n, y = x + SEEN n, x_0 ~ START n
+DRIFT, MOVE, SEEN, START = 0.9, 0.5, 0.7, 2.0
 OBSERVED = torch.tensor([0.5, 1.0, -0.3, 0.8, 1.9, 2.2])
 
 
 class LinearGaussian:
-    """A method whose likelihood and motion are the toy system's; each axis of the pixel is one system."""
+    """A method whose likelihood and displacement are the toy system's; each axis of the pixel is
+    one system.
+    """
 
     space = PixelSpace()
-    memory_width = 0
+    latent_width = 0
 
-    def observe(self, batch: None) -> None:
+    def encode(self, batch: None) -> None:
         return None
 
-    def read(self, scene: None, cloud: Cloud, step: Step, generator: Generator) -> Reading:
-        off = (OBSERVED[step.number] - cloud.state) / SEEN
+    def measure(
+        self, scene: None, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        off = (OBSERVED[step.number] - particles.state) / SEEN
         log_p = (-0.5 * off.square() - math.log(SEEN) - 0.5 * math.log(2 * math.pi)).sum(-1)
-        return Reading(log_p, (DRIFT - 1) * cloud.state, torch.eye(4).expand(*log_p.shape, 4, 4), cloud.memory)
+        return ParticleOutput(
+            log_p,
+            (DRIFT - 1) * particles.state,
+            torch.eye(4).expand(*log_p.shape, 4, 4),
+            particles.latent,
+        )
 
 
 class Start:
@@ -43,7 +62,9 @@ class Start:
     def __init__(self, runs: int) -> None:
         self.runs = runs
 
-    def __call__(self, batch: None, scene: None, method: LinearGaussian, particles: int, generator: Generator) -> Tensor:
+    def __call__(
+        self, batch: None, scene: None, method: LinearGaussian, particles: int, generator: Generator
+    ) -> Tensor:
         return START * torch.randn(self.runs, particles, 2, generator=generator)
 
 
@@ -60,19 +81,35 @@ def kalman() -> tuple[float, float, float]:
 
 
 def run(
-    resample: Resample, particles: int, runs: int = 32, reweigh: Reweigh | None = None, propose: Propose | None = None
+    resample: Resample,
+    particles: int,
+    runs: int = 32,
+    reweight: Reweight | None = None,
+    propagate: Propagate | None = None,
 ) -> Trace:
-    move = propose or Chain([LearnedMotion(), Gaussian(factor=1.0)])
-    pieces = (Start(runs), Constant(MOVE), reweigh or Sequential(), resample, move, Mean(), NoRefine())
-    return ParticleFilter(particles, len(OBSERVED), *pieces)(None, LinearGaussian(), Generator().manual_seed(0))
+    move = propagate or Chain([LearnedDisplacement(), Gaussian(factor=1.0)])
+    pieces = (
+        Start(runs),
+        Constant(MOVE),
+        reweight or Sequential(),
+        resample,
+        move,
+        Mean(),
+        NoRefine(),
+    )
+    return ParticleFilter(particles, len(OBSERVED), *pieces)(
+        None, LinearGaussian(), Generator().manual_seed(0)
+    )
 
 
 def errors(trace: Trace) -> Tensor:
-    """Return how far mean, spread and evidence are from exact, each over what is random in them at this many particles."""
-    cloud = trace.clouds[-1]
-    weights = cloud.log_weights.exp()[..., None]
-    mean = (weights * cloud.state).sum(1)
-    var = (weights * (cloud.state - mean[:, None]).square()).sum(1)
+    """Return how far mean, spread and evidence are from exact, each over what is random in them at
+    this many particles.
+    """
+    particles = trace.particles[-1]
+    weights = particles.log_weights.exp()[..., None]
+    mean = (weights * particles.state).sum(1)
+    var = (weights * (particles.state - mean[:, None]).square()).sum(1)
     evidence = trace.log_evidence.sum(1)
     m, s, e = kalman()
     runs = len(mean) ** 0.5
@@ -94,21 +131,23 @@ def errors(trace: Trace) -> Tensor:
         (Soft(0.7), 3000, 32),
         (BelowESS(Systematic(), 0.5), 1500, 32),
         (BelowESS(Soft(0.5), 0.5), 3000, 32),
-        (Never(), 20000, 8),
+        (NoResampling(), 20000, 8),
         (OptimalTransport(0.02, 25), 80, 16),
     ],
     ids=lambda x: type(x).__name__ if not isinstance(x, int) else str(x),
 )
-def test_mean_spread_and_evidence_are_kalmans(resample: Resample, particles: int, runs: int) -> None:
+def test_mean_spread_and_evidence_are_kalmans(
+    resample: Resample, particles: int, runs: int
+) -> None:
     assert (errors(run(resample, particles, runs)) < 3.5).all()
 
 
 def test_a_transported_ensemble_follows_kalman_a_little_too_sure() -> None:
-    cloud = run(Ensemble(0.01, 25), 150, 8).clouds[-1]
+    particles = run(Ensemble(0.01, 25), 150, 8).particles[-1]
     m, s, _ = kalman()
-    weights = cloud.log_weights.exp()[..., None]
-    mean = (weights * cloud.state).sum(1, keepdim=True)
-    spread = (weights * (cloud.state - mean).square()).sum(1).mean().sqrt()
+    weights = particles.log_weights.exp()[..., None]
+    mean = (weights * particles.state).sum(1, keepdim=True)
+    spread = (weights * (particles.state - mean).square()).sum(1).mean().sqrt()
     assert (mean.mean() - m).abs() < 0.5 * s
     assert 0.75 * s < spread < 1.05 * s
 
@@ -116,16 +155,22 @@ def test_a_transported_ensemble_follows_kalman_a_little_too_sure() -> None:
 class ForgetsWeights:
     """Planted defect: draw from the soft mixture, but let the children start alike."""
 
-    def __call__(self, cloud: Cloud, *rest: object) -> Children:
-        children = Soft(0.5)(cloud, *rest)
-        return children._replace(log_weights=torch.full_like(children.log_weights, -math.log(children.parents.shape[1])))
+    def __call__(self, particles: Particles, *rest: object) -> Resampled:
+        resampled = Soft(0.5)(particles, *rest)
+        return resampled._replace(
+            log_weights=torch.full_like(
+                resampled.log_weights, -math.log(resampled.ancestors.shape[1])
+            )
+        )
 
 
 class Greedy(Systematic):
     """Planted defect: draw by the squared weights."""
 
-    def __call__(self, cloud: Cloud, *rest: object) -> Children:
-        return super().__call__(cloud._replace(log_weights=torch.log_softmax(2 * cloud.log_weights, 1)), *rest)
+    def __call__(self, particles: Particles, *rest: object) -> Resampled:
+        return super().__call__(
+            particles._replace(log_weights=torch.log_softmax(2 * particles.log_weights, 1)), *rest
+        )
 
 
 @pytest.mark.parametrize(
@@ -133,9 +178,9 @@ class Greedy(Systematic):
     [
         {"resample": ForgetsWeights()},
         {"resample": Greedy()},
-        {"resample": Systematic(), "propose": LearnedMotion()},
-        {"resample": Systematic(), "propose": Gaussian(1.0)},
-        {"resample": BelowESS(Systematic(), 0.05), "reweigh": Annealed()},
+        {"resample": Systematic(), "propagate": LearnedDisplacement()},
+        {"resample": Systematic(), "propagate": Gaussian(1.0)},
+        {"resample": BelowESS(Systematic(), 0.05), "reweight": Annealed()},
     ],
     ids=["weights forgotten", "greedy draw", "no noise", "no drift", "weights replaced"],
 )

@@ -1,4 +1,4 @@
-"""Every resampler keeps the weighted mean and hands out normalised weights."""
+"""Every resampler keeps the weighted mean and hands out normalized weights."""
 
 import math
 
@@ -6,14 +6,13 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.contracts import Resample
 from posefilter.errors import UserError
-from posefilter.filters.loop import first_cloud, inherit
+from posefilter.filters.loop import inherit, make_particles
 from posefilter.filters.resample import (
     BelowESS,
     Fair,
     Multinomial,
-    Never,
+    NoResampling,
     Soft,
     Stratified,
     Systematic,
@@ -24,7 +23,8 @@ from posefilter.filters.transport import Ensemble, OptimalTransport, sinkhorn
 from posefilter.geometry.pose import is_rigid, make_pose
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Children, Cloud
+from posefilter.protocols import Resample
+from posefilter.types import Particles, Resampled
 
 SPACE = PixelSpace()
 RESAMPLERS = {
@@ -39,75 +39,85 @@ RESAMPLERS = {
 every = pytest.mark.parametrize("resampler", RESAMPLERS.values(), ids=RESAMPLERS.keys())
 
 
-def cloud_of(rows: int, count: int, seed: int = 0, sharpness: float = 1.5) -> Cloud:
+def cloud_of(rows: int, count: int, seed: int = 0, sharpness: float = 1.5) -> Particles:
     g = Generator().manual_seed(seed)
     state = torch.randn(1, count, 2, generator=g).expand(rows, -1, -1)
     log_w = torch.log_softmax(sharpness * torch.randn(1, count, generator=g), 1).expand(rows, -1)
-    return first_cloud(state, 0)._replace(log_weights=log_w)
+    return make_particles(state, 0)._replace(log_weights=log_w)
 
 
-def parents_share(children: Children, count: int) -> Tensor:
+def parents_share(resampled: Resampled, count: int) -> Tensor:
     """Return each parent's share of the children's weight, mean over the rows.  -> (M,)."""
-    weights = children.log_weights.exp()
-    if children.shares is not None:
-        return (weights[..., None] * children.shares).sum(1).mean(0)
-    return torch.zeros(len(weights), count).scatter_add(1, children.parents, weights).mean(0)
+    weights = resampled.log_weights.exp()
+    if resampled.shares is not None:
+        return (weights[..., None] * resampled.shares).sum(1).mean(0)
+    return torch.zeros(len(weights), count).scatter_add(1, resampled.ancestors, weights).mean(0)
 
 
 @every
-@pytest.mark.parametrize("particles", [40, 25, 90])
-def test_weights_are_kept_in_expectation(resampler: Resample, particles: int) -> None:
+@pytest.mark.parametrize("count", [40, 25, 90])
+def test_weights_are_kept_in_expectation(resampler: Resample, count: int) -> None:
     rows, noise = (200, 0.015) if isinstance(resampler, OptimalTransport) else (4000, 0.004)
-    cloud = cloud_of(rows, 40)
-    children = resampler(cloud, particles, SPACE, Generator().manual_seed(1))
-    assert children.parents.shape == children.log_weights.shape == (rows, particles)
-    assert children.parents.dtype == torch.int64
-    torch.testing.assert_close(children.log_weights.logsumexp(1), torch.zeros(rows), atol=1e-4, rtol=0)
+    particles = cloud_of(rows, 40)
+    resampled = resampler(particles, count, SPACE, Generator().manual_seed(1))
+    assert resampled.ancestors.shape == resampled.log_weights.shape == (rows, count)
+    assert resampled.ancestors.dtype == torch.int64
+    torch.testing.assert_close(
+        resampled.log_weights.logsumexp(1), torch.zeros(rows), atol=1e-4, rtol=0
+    )
     # Soft divides by the sum of its weights, which is right up to 1 / N.
-    slack = 0.3 / particles if isinstance(resampler, Soft) else 0.0
-    torch.testing.assert_close(parents_share(children, 40), cloud.log_weights[0].exp(), atol=noise + slack, rtol=0.02)
+    slack = 0.3 / count if isinstance(resampler, Soft) else 0.0
+    torch.testing.assert_close(
+        parents_share(resampled, 40), particles.log_weights[0].exp(), atol=noise + slack, rtol=0.02
+    )
 
 
 def test_the_law_catches_a_resampler_that_ignores_weights() -> None:
     class Blind(Fair):
-        def __call__(self, cloud: Cloud, *rest: object) -> Children:
-            return super().__call__(cloud._replace(log_weights=torch.zeros_like(cloud.log_weights)), *rest)
+        def __call__(self, particles: Particles, *rest: object) -> Resampled:
+            return super().__call__(
+                particles._replace(log_weights=torch.zeros_like(particles.log_weights)), *rest
+            )
 
-        def places(self, rows: int, particles: int, generator: Generator, device: torch.device) -> Tensor:
-            return torch.rand(rows, particles, generator=generator)
+        def places(
+            self, rows: int, count: int, generator: Generator, device: torch.device
+        ) -> Tensor:
+            return torch.rand(rows, count, generator=generator)
 
-    cloud = cloud_of(4000, 40)
-    share = parents_share(Blind()(cloud, 40, SPACE, Generator().manual_seed(0)), 40)
-    assert (share - cloud.log_weights[0].exp()).abs().max() > 0.02
+    particles = cloud_of(4000, 40)
+    share = parents_share(Blind()(particles, 40, SPACE, Generator().manual_seed(0)), 40)
+    assert (share - particles.log_weights[0].exp()).abs().max() > 0.02
 
 
 @every
 def test_the_same_generator_gives_the_same_children(resampler: Resample) -> None:
-    cloud = cloud_of(3, 30)
-    a = resampler(cloud, 30, SPACE, Generator().manual_seed(5))
-    b = resampler(cloud, 30, SPACE, Generator().manual_seed(5))
-    assert torch.equal(a.parents, b.parents)
+    particles = cloud_of(3, 30)
+    a = resampler(particles, 30, SPACE, Generator().manual_seed(5))
+    b = resampler(particles, 30, SPACE, Generator().manual_seed(5))
+    assert torch.equal(a.ancestors, b.ancestors)
     assert torch.equal(a.log_weights, b.log_weights)
 
 
-@pytest.mark.parametrize("scheme", [Systematic(), Stratified(), Multinomial()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "scheme", [Systematic(), Stratified(), Multinomial()], ids=lambda x: type(x).__name__
+)
 def test_places_are_looked_up_as_a_loop_would(scheme: Fair) -> None:
-    cloud = cloud_of(3, 20)
-    children = scheme(cloud, 30, SPACE, Generator().manual_seed(2))
+    particles = cloud_of(3, 20)
+    resampled = scheme(particles, 30, SPACE, Generator().manual_seed(2))
     places = scheme.places(3, 30, Generator().manual_seed(2), torch.device("cpu"))
     for row in range(3):
         for n in range(30):
             left, parent = float(places[row, n]), 0
-            while left >= (w := float(cloud.log_weights[row, parent].double().exp())):
+            while left >= (w := float(particles.log_weights[row, parent].double().exp())):
                 left, parent = left - w, parent + 1
-            assert children.parents[row, n] == parent
+            assert resampled.ancestors[row, n] == parent
 
 
 def test_systematic_rounds_each_share_up_or_down() -> None:
-    cloud = cloud_of(200, 40)
-    parents = Systematic()(cloud, 100, SPACE, Generator().manual_seed(0)).parents
-    counts = torch.zeros(200, 40).scatter_add(1, parents, torch.ones(200, 100))
-    assert ((counts - 100 * cloud.log_weights.exp()).abs() < 1).all()
+    particles = cloud_of(200, 40)
+    ancestors = Systematic()(particles, 100, SPACE, Generator().manual_seed(0)).ancestors
+    counts = torch.zeros(200, 40).scatter_add(1, ancestors, torch.ones(200, 100))
+    assert ((counts - 100 * particles.log_weights.exp()).abs() < 1).all()
 
 
 def test_a_particle_of_no_weight_has_no_children() -> None:
@@ -126,34 +136,42 @@ def test_effective_size_at_both_ends() -> None:
 
 def test_below_ess_decides_for_each_image() -> None:
     rich, poor = torch.zeros(1, 20), torch.cat([torch.full((1, 1), 6.0), torch.zeros(1, 19)], 1)
-    cloud = cloud_of(2, 20)._replace(log_weights=torch.log_softmax(torch.cat([rich, poor]) + 0.1 * torch.randn(2, 20), 1))
+    particles = cloud_of(2, 20)._replace(
+        log_weights=torch.log_softmax(torch.cat([rich, poor]) + 0.1 * torch.randn(2, 20), 1)
+    )
     for inner in (Systematic(), Ensemble()):
-        children = BelowESS(inner, 0.5)(cloud, 20, SPACE, Generator().manual_seed(0))
-        assert torch.equal(children.parents[0], torch.arange(20))
-        assert torch.equal(children.log_weights[0], cloud.log_weights[0])
-        assert torch.equal(inherit(cloud.state, children, SPACE)[0], cloud.state[0])
-        assert effective_size(children.log_weights)[1] > 19
-        assert effective_size(cloud.log_weights)[1] < 10
+        resampled = BelowESS(inner, 0.5)(particles, 20, SPACE, Generator().manual_seed(0))
+        assert torch.equal(resampled.ancestors[0], torch.arange(20))
+        assert torch.equal(resampled.log_weights[0], particles.log_weights[0])
+        assert torch.equal(inherit(particles.state, resampled, SPACE)[0], particles.state[0])
+        assert effective_size(resampled.log_weights)[1] > 19
+        assert effective_size(particles.log_weights)[1] < 10
 
 
 def test_never_keeps_all_and_refuses_another_size() -> None:
-    cloud = cloud_of(2, 20)
-    children = Never()(cloud, 20, SPACE, Generator())
-    assert torch.equal(children.parents, torch.arange(20).expand(2, 20))
-    assert torch.equal(children.log_weights, cloud.log_weights)
+    particles = cloud_of(2, 20)
+    resampled = NoResampling()(particles, 20, SPACE, Generator())
+    assert torch.equal(resampled.ancestors, torch.arange(20).expand(2, 20))
+    assert torch.equal(resampled.log_weights, particles.log_weights)
     with pytest.raises(UserError, match="first_particles"):
-        Never()(cloud, 10, SPACE, Generator())
+        NoResampling()(particles, 10, SPACE, Generator())
 
 
 def test_soft_weights_carry_the_gradient_of_the_weighted_mean() -> None:
-    cloud = cloud_of(1, 400)
-    logits = cloud.log_weights[:1].clone().requires_grad_()
+    particles = cloud_of(1, 400)
+    logits = particles.log_weights[:1].clone().requires_grad_()
     log_w = torch.log_softmax(logits, 1)
-    (exact,) = torch.autograd.grad((log_w.exp() * cloud.state[..., 0]).sum(), logits, retain_graph=True)
+    (exact,) = torch.autograd.grad(
+        (log_w.exp() * particles.state[..., 0]).sum(), logits, retain_graph=True
+    )
     total = torch.zeros_like(exact)
     for seed in range(200):
-        children = Soft(0.5)(cloud._replace(log_weights=log_w), 400, SPACE, Generator().manual_seed(seed))
-        mean = (children.log_weights.exp() * inherit(cloud.state[..., :1], children)[..., 0]).sum()
+        resampled = Soft(0.5)(
+            particles._replace(log_weights=log_w), 400, SPACE, Generator().manual_seed(seed)
+        )
+        mean = (
+            resampled.log_weights.exp() * inherit(particles.state[..., :1], resampled)[..., 0]
+        ).sum()
         total += torch.autograd.grad(mean, logits, retain_graph=True)[0] / 200
     assert (total - exact).norm() < 0.1 * exact.norm()
 
@@ -177,14 +195,16 @@ def test_sinkhorn_meets_both_marginals_and_nears_the_exact_plan() -> None:
 
 
 def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
-    cloud = cloud_of(2, 30)
-    logits = cloud.log_weights.clone().requires_grad_()
-    state = cloud.state.clone().requires_grad_()
+    particles = cloud_of(2, 30)
+    logits = particles.log_weights.clone().requires_grad_()
+    state = particles.state.clone().requires_grad_()
     log_w = torch.log_softmax(logits, 1)
-    children = Ensemble(0.1, 5)(cloud._replace(log_weights=log_w, state=state), 30, SPACE, Generator())
-    moved = inherit(state, children, SPACE)
+    resampled = Ensemble(0.1, 5)(
+        particles._replace(log_weights=log_w, state=state), 30, SPACE, Generator()
+    )
+    moved = inherit(state, resampled, SPACE)
     before = (log_w.exp()[..., None] * state).sum(1)
-    torch.testing.assert_close((children.log_weights.exp()[..., None] * moved).sum(1), before)
+    torch.testing.assert_close((resampled.log_weights.exp()[..., None] * moved).sum(1), before)
     moved[..., 0].square().sum().backward()
     assert logits.grad.isfinite().all()
     assert logits.grad.abs().sum() > 1e-3
@@ -192,11 +212,11 @@ def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
 
 
 def test_transport_moves_particles_less_than_a_shuffle() -> None:
-    cloud = cloud_of(8, 100)
+    particles = cloud_of(8, 100)
     moved = {}
     for name in ("multinomial", "transport"):
-        children = RESAMPLERS[name](cloud, 100, SPACE, Generator().manual_seed(0))
-        moved[name] = (inherit(cloud.state, children) - cloud.state).norm(dim=-1).mean()
+        resampled = RESAMPLERS[name](particles, 100, SPACE, Generator().manual_seed(0))
+        moved[name] = (inherit(particles.state, resampled) - particles.state).norm(dim=-1).mean()
     assert moved["transport"] < 0.6 * moved["multinomial"]
 
 
@@ -204,6 +224,8 @@ def test_transport_moves_particles_less_than_a_shuffle() -> None:
 def test_poses_stay_poses(resampler: Resample) -> None:
     g = Generator().manual_seed(0)
     poses = make_pose(random_rotation(2, 20, generator=g), torch.randn(2, 20, 3, generator=g))
-    cloud = first_cloud(poses, 3)._replace(log_weights=torch.log_softmax(torch.randn(2, 20, generator=g), 1))
+    particles = make_particles(poses, 3)._replace(
+        log_weights=torch.log_softmax(torch.randn(2, 20, generator=g), 1)
+    )
     space = PoseSpace((0.01, 0.0, 0.02), 0.1)
-    assert is_rigid(inherit(cloud.state, resampler(cloud, 30, space, g), space), 1e-4)
+    assert is_rigid(inherit(particles.state, resampler(particles, 30, space, g), space), 1e-4)

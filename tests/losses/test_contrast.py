@@ -12,16 +12,16 @@ from posefilter.labels.paper_points import PaperPoints
 from posefilter.losses.contrast import Contrast, pose_distance
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
-from posefilter.models.lessons import even_cloud, one_step_trace
-from posefilter.types import Batch, ObjectModel, Reading, Trace
+from posefilter.models.candidate_samplers import make_even_particles, one_step_trace
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Trace
 
 MODEL = square()
 
 
 def trace(poses: torch.Tensor, scores: torch.Tensor, sigma: float) -> Trace:
-    cloud = even_cloud(poses)
-    reading = Reading(scores, torch.zeros(*scores.shape, 6), poses, cloud.memory)
-    return one_step_trace(cloud, reading, torch.full((len(poses),), sigma))
+    particles = make_even_particles(poses)
+    output = ParticleOutput(scores, torch.zeros(*scores.shape, 6), poses, particles.latent)
+    return one_step_trace(particles, output, torch.full((len(poses),), sigma))
 
 
 def candidates(batch: Batch, shifts: list[float]) -> torch.Tensor:
@@ -36,7 +36,9 @@ def test_two_candidates_by_hand() -> None:
     p = 1 / (1 + math.exp(-0.5 * (0.02 / 0.01) ** 2))  # target on the truth
     q = 1 / (1 + math.exp(-0.5))
     by_hand = p * math.log(p / q) + (1 - p) * math.log((1 - p) / (1 - q))
-    assert Contrast()(trace(poses, scores, 0.01), batch, MODEL).item() == pytest.approx(by_hand, rel=1e-4)
+    assert Contrast()(trace(poses, scores, 0.01), batch, MODEL).item() == pytest.approx(
+        by_hand, rel=1e-4
+    )
 
 
 def test_the_divergence_vanishes_at_the_target_alone() -> None:
@@ -51,7 +53,11 @@ def test_the_divergence_vanishes_at_the_target_alone() -> None:
 def test_images_without_the_object_teach_nothing() -> None:
     batch = scenes(2)
     batch.mask[0] = False
-    value = Contrast()(trace(candidates(batch, [0.0, 0.1]), torch.tensor([[0.0, 9.0], [0.0, 9.0]]), 0.01), batch, MODEL)
+    value = Contrast()(
+        trace(candidates(batch, [0.0, 0.1]), torch.tensor([[0.0, 9.0], [0.0, 9.0]]), 0.01),
+        batch,
+        MODEL,
+    )
     assert value[0] == 0
     assert value[1] > 1
 
@@ -61,7 +67,10 @@ def test_distance_is_add_and_minds_symmetries() -> None:
     poses = candidates(batch, [0.0, 0.015])
     plain = pose_distance(poses, batch.camera_from_object, MODEL)
     torch.testing.assert_close(
-        plain[:, 1], add(poses[:, 1], batch.camera_from_object, MODEL.points).float(), atol=1e-5, rtol=0
+        plain[:, 1],
+        add(poses[:, 1], batch.camera_from_object, MODEL.points).float(),
+        atol=1e-5,
+        rtol=0,
     )
     half = make_pose(exp_so3(torch.tensor([0.0, 0.0, math.pi])), torch.zeros(3))
     turned = (batch.camera_from_object @ half)[:, None]
@@ -74,10 +83,18 @@ def test_the_papers_labels() -> None:
     offset = torch.tensor([-0.5, -0.011, -0.009, 0.009, 0.011, -0.009, 0.009, 0.02])
     own = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     state = torch.stack([torch.zeros(8), torch.zeros(8), offset, own], -1)[None]
-    cloud = even_cloud(state)
-    reading = Reading(torch.zeros(1, 8), torch.zeros(1, 8, 6), torch.eye(4).expand(1, 8, 4, 4), cloud.memory)
-    run = one_step_trace(cloud, reading, torch.tensor([0.01]))
+    particles = make_even_particles(state)
+    output = ParticleOutput(
+        torch.zeros(1, 8), torch.zeros(1, 8, 6), torch.eye(4).expand(1, 8, 4, 4), particles.latent
+    )
+    run = one_step_trace(particles, output, torch.tensor([0.01]))
     label = PaperPoints()(run, scenes(1), MODEL)
     assert label[0, 0].tolist() == [0, 0, 100, 100, -100, 0, 0, -100]
-    weighted = run._replace(clouds=(cloud._replace(log_weights=torch.log(torch.tensor([[1.0] + [0.0] * 6 + [1.0]]) / 2)),))
+    weighted = run._replace(
+        particles=(
+            particles._replace(
+                log_weights=torch.log(torch.tensor([[1.0] + [0.0] * 6 + [1.0]]) / 2)
+            ),
+        )
+    )
     assert Regression(PaperPoints())(weighted, scenes(1), MODEL).item() == pytest.approx(0.5)

@@ -60,16 +60,22 @@ def test_patch_label_counts_a_patch_that_meets_the_mask(batch, model, make_trace
     assert OnObject(9)(trace, batch, model).tolist() == [[[1, 1, 0]]]
 
 
-def test_quality_falls_with_the_pose_error_and_is_nothing_off_the_object(batch, model, make_trace) -> None:
+def test_quality_falls_with_the_pose_error_and_is_nothing_off_the_object(
+    batch, model, make_trace
+) -> None:
     pose = batch.camera_from_object[:, None].repeat(1, 3, 1, 1)
     pose[0, 1, 0, 3] += 0.02  # one tenth of the diameter
     trace = make_trace(places(ON, ON, OFF), pose=pose)
     label = Quality(scale=0.1)(trace, batch, model)[0, 0]
-    torch.testing.assert_close(label, torch.tensor([1.0, math.exp(-1.0), 0.0], dtype=label.dtype), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        label, torch.tensor([1.0, math.exp(-1.0), 0.0], dtype=label.dtype), atol=1e-4, rtol=0
+    )
 
 
 def test_log_not_is_exact_and_its_slope_finite_at_both_ends() -> None:
-    logit = torch.tensor([-40.0, -3.0, 0.0, 5.0, 15.0, 28.0, 75.0], dtype=torch.float32, requires_grad=True)
+    logit = torch.tensor(
+        [-40.0, -3.0, 0.0, 5.0, 15.0, 28.0, 75.0], dtype=torch.float32, requires_grad=True
+    )
     out = log_not(torch.nn.functional.logsigmoid(logit))
     torch.testing.assert_close(out, torch.nn.functional.logsigmoid(-logit), rtol=1e-5, atol=1e-7)
     out.sum().backward()
@@ -80,13 +86,17 @@ def test_log_not_is_exact_and_its_slope_finite_at_both_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    "loss", [Bce(OnObject()), BalancedBce(OnObject()), Focal(OnObject())], ids=lambda x: type(x).__name__
+    "loss",
+    [Bce(OnObject()), BalancedBce(OnObject()), Focal(OnObject())],
+    ids=lambda x: type(x).__name__,
 )
 def test_gradients(loss: Bce, batch, model, make_trace) -> None:
     logit = torch.tensor([[0.3, -1.2, 2.0]], dtype=torch.float64, requires_grad=True)
 
     def value(x: torch.Tensor) -> torch.Tensor:
-        return loss(make_trace(places(ON, OFF, OFF), torch.nn.functional.logsigmoid(x)), batch, model)
+        return loss(
+            make_trace(places(ON, OFF, OFF), torch.nn.functional.logsigmoid(x)), batch, model
+        )
 
     detached = type(loss).weigh is Focal.weigh
     assert torch.autograd.gradcheck(value, (logit,)), detached

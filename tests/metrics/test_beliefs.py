@@ -1,4 +1,6 @@
-"""Beliefs: entropy, spread and mass by hand; ranks of the truth are uniform where beliefs are right, and only there."""
+"""Beliefs: entropy, spread and mass by hand; ranks of the truth are uniform where beliefs are
+right, and only there.
+"""
 
 import math
 
@@ -21,7 +23,10 @@ MODEL = ObjectModel("thing", POINTS, CENTER, 0.1, 0.2, torch.eye(4)[None], POINT
 
 def around(poses: torch.Tensor, sigma: float, count: int, g: Generator) -> torch.Tensor:
     scale = SPACE.noise_scale(torch.tensor(sigma))
-    return SPACE.move(poses[:, None].expand(-1, count, 4, 4), scale * torch.randn(len(poses), count, 6, generator=g))
+    return SPACE.move(
+        poses[:, None].expand(-1, count, 4, 4),
+        scale * torch.randn(len(poses), count, 6, generator=g),
+    )
 
 
 def truths(count: int, g: Generator) -> torch.Tensor:
@@ -52,7 +57,7 @@ def test_mass_counts_weight_not_particles() -> None:
 
 
 def ranks(believed: float, real: float, images: int = 1500) -> torch.Tensor:
-    """Ranks where the belief says that its centre is off by `believed`, while it is off by `real`."""
+    """Ranks where the belief says that its center is off by `believed`, while it is off by `real`."""
     g = Generator().manual_seed(0)
     middle = truths(images, g)
     truth = around(middle, real, 1, g)[:, 0]

@@ -14,7 +14,9 @@ POINTS = torch.randn(40, 3, generator=Generator().manual_seed(9)) * 0.1
 
 def scattered(*shape: int, seed: int = 0) -> Tensor:
     g = Generator().manual_seed(seed)
-    return make_pose(random_rotation(*shape, generator=g), 0.1 * torch.randn(*shape, 3, generator=g))
+    return make_pose(
+        random_rotation(*shape, generator=g), 0.1 * torch.randn(*shape, 3, generator=g)
+    )
 
 
 def naive(pose: Tensor, truth: Tensor) -> tuple[float, float]:
@@ -32,7 +34,9 @@ def test_against_naive_loops(monkeypatch: pytest.MonkeyPatch, chunk: int) -> Non
     assert a.shape == s.shape == (2, 4)
     for b in range(2):
         for n in range(4):
-            assert (float(a[b, n]), float(s[b, n])) == pytest.approx(naive(guess[b, n], truth[b, 0]), abs=1e-5)
+            assert (float(a[b, n]), float(s[b, n])) == pytest.approx(
+                naive(guess[b, n], truth[b, 0]), abs=1e-5
+            )
 
 
 def test_what_is_known_by_hand() -> None:
@@ -44,7 +48,8 @@ def test_what_is_known_by_hand() -> None:
     square = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     quarter = make_pose(exp_so3(torch.tensor([0.0, 0.0, torch.pi / 2])), torch.zeros(3))
     assert float(add(quarter, eye, square)) == pytest.approx(2**0.5, rel=1e-5)
-    assert float(add_s(quarter, eye, square)) == pytest.approx(0, abs=1e-6)  # a symmetry costs nothing
+    # a symmetry costs nothing
+    assert float(add_s(quarter, eye, square)) == pytest.approx(0, abs=1e-6)
 
 
 def test_the_direction_of_add_s_matters() -> None:
@@ -62,4 +67,6 @@ def test_no_poses_give_no_errors() -> None:
 
 def test_add_has_a_gradient() -> None:
     guess = scattered(3).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda T: add(T, scattered(3, seed=1).double(), POINTS.double()), guess)
+    assert torch.autograd.gradcheck(
+        lambda T: add(T, scattered(3, seed=1).double(), POINTS.double()), guess
+    )

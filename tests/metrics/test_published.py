@@ -17,7 +17,9 @@ from posefilter.types import ObjectModel
 
 def poses_of(folder: Path) -> Tensor:
     """Read rows of qw qx qy qz tx ty tz [m]."""
-    rows = torch.from_numpy(np.concatenate([np.loadtxt(file, ndmin=2) for file in sorted(folder.glob("*.txt"))]))
+    rows = torch.from_numpy(
+        np.concatenate([np.loadtxt(file, ndmin=2) for file in sorted(folder.glob("*.txt"))])
+    )
     return make_pose(matrix_from_quat_xyzw(rows[:, [1, 2, 3, 0]]), rows[:, 4:])
 
 
@@ -27,8 +29,14 @@ def published(real_data: Path) -> tuple[Tensor, Tensor, ObjectModel]:
     if not (root / "published").is_dir():
         pytest.skip(f"no published poses at {root / 'published'}")
     points = torch.from_numpy(np.loadtxt(root / "models" / "003_cracker_box" / "points.xyz"))
-    model = ObjectModel("003_cracker_box", points, torch.zeros(3), 0.135, 0.2694, torch.eye(4)[None], points)
-    return poses_of(root / "published" / "posecnn_rss2018"), poses_of(root / "published" / "ground_truth"), model
+    model = ObjectModel(
+        "003_cracker_box", points, torch.zeros(3), 0.135, 0.2694, torch.eye(4)[None], points
+    )
+    return (
+        poses_of(root / "published" / "posecnn_rss2018"),
+        poses_of(root / "published" / "ground_truth"),
+        model,
+    )
 
 
 def test_posecnn_scores_what_was_published(published: tuple[Tensor, Tensor, ObjectModel]) -> None:
@@ -43,7 +51,9 @@ def test_posecnn_scores_what_was_published(published: tuple[Tensor, Tensor, Obje
     assert found["add_s"]["auc"] == pytest.approx(76.86, abs=0.01)
 
 
-def test_add_s_the_other_way_round_would_not_reproduce_it(published: tuple[Tensor, Tensor, ObjectModel]) -> None:
+def test_add_s_the_other_way_round_would_not_reproduce_it(
+    published: tuple[Tensor, Tensor, ObjectModel],
+) -> None:
     guess, truth, model = published
     metric = PoseErrors([model])
     metric.update(truth, guess)
@@ -63,7 +73,9 @@ def test_truth_fed_back_scores_full_marks(published: tuple[Tensor, Tensor, Objec
 
 
 @pytest.mark.slow
-def test_a_thousand_poses_take_less_than_two_seconds_of_two_cores(published: tuple[Tensor, Tensor, ObjectModel]) -> None:
+def test_a_thousand_poses_take_less_than_two_seconds_of_two_cores(
+    published: tuple[Tensor, Tensor, ObjectModel],
+) -> None:
     guess, truth, model = published
     guess, truth = guess.repeat(2, 1, 1)[:1000], truth.repeat(2, 1, 1)[:1000]
     took = []

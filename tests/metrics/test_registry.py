@@ -1,4 +1,6 @@
-"""The registry of metrics: it knows every number that a run writes down, and writes each as it should be read."""
+"""The registry of metrics: it knows every number that a run writes down, and writes each as it
+should be read.
+"""
 
 import re
 from pathlib import Path
@@ -12,7 +14,10 @@ HOME = Path(__file__).parents[2]
 
 
 def test_keys_are_unique_and_labels_tell_metrics_of_a_table_apart() -> None:
-    tables = [[key for key in METRICS if key.startswith(prefix)] for prefix in ("add", "belief/", "signs/")]
+    tables = [
+        [key for key in METRICS if key.startswith(prefix)]
+        for prefix in ("add", "belief/", "signs/")
+    ]
     for keys in tables:
         labels = [METRICS[key].title for key in keys]
         assert len(set(labels)) == len(labels)
@@ -64,7 +69,9 @@ def test_numbers_are_read_where_they_are() -> None:
 
 
 def test_better_is_the_way_that_a_better_filter_goes() -> None:
-    """An error, a time and what is lost should be small; a share that is found, an area and a score should be large."""
+    """An error, a time and what is lost should be small; a share that is found, an area and a score
+    should be large.
+    """
     for key, info in METRICS.items():
         if re.search(r"median|seconds|missed|off_frame|outscored", key):
             assert info.direction == LOWER, key
@@ -73,7 +80,9 @@ def test_better_is_the_way_that_a_better_filter_goes() -> None:
 
 
 def test_documents_name_the_same_columns() -> None:
-    """The tables of runs are asked for by the columns' names: each name that a document asks for is a metric's."""
+    """The tables of runs are asked for by the columns' names: each name that a document asks for is
+    a metric's.
+    """
     asked = {
         name.strip()
         for page in (HOME / "docs").rglob("*.md")

@@ -1,4 +1,6 @@
-"""Areas, recalls and medians by hand; boxes; and what the collecting classes make of misses and batches."""
+"""Areas, recalls and medians by hand; boxes; and what the collecting classes make of misses and
+batches.
+"""
 
 import math
 
@@ -23,7 +25,9 @@ def shifted(*distances: float) -> torch.Tensor:
 
 
 def voc(errors: list[float]) -> float:
-    """The toolbox's steps, one by one: d(d > 0.1) = inf; sort; accuracy; VOCap with a monotone precision; times ten."""
+    """The toolbox's steps, one by one: d(d > 0.1) = inf; sort; accuracy; VOCap with a monotone
+    precision; times ten.
+    """
     d = np.sort([e if e <= 0.1 else math.inf for e in errors])
     accuracy = np.arange(1, len(d) + 1) / len(d)
     keep = d < 0.1
@@ -32,7 +36,11 @@ def voc(errors: list[float]) -> float:
     rec, prec = [0.0, *d[keep], 0.1], [0.0, *accuracy[keep], accuracy[keep][-1]]
     for i in range(1, len(prec)):
         prec[i] = max(prec[i], prec[i - 1])
-    return 100 * 10 * sum((rec[i] - rec[i - 1]) * prec[i] for i in range(1, len(rec)) if rec[i] != rec[i - 1])
+    return (
+        100
+        * 10
+        * sum((rec[i] - rec[i - 1]) * prec[i] for i in range(1, len(rec)) if rec[i] != rec[i - 1])
+    )
 
 
 def test_the_area_is_the_toolboxs() -> None:
@@ -42,7 +50,9 @@ def test_the_area_is_the_toolboxs() -> None:
         errors[:5] = math.inf
         assert auc(errors) == pytest.approx(voc(errors.tolist()), abs=1e-9)
     # By the right endpoint: at the first of two errors, 0.02, accuracy 1/2 counts from 0 on.
-    assert auc(torch.tensor([0.02, 0.06]).double()) == pytest.approx(100 * (0.02 * 0.5 + 0.04 + 0.04) / 0.1)
+    assert auc(torch.tensor([0.02, 0.06]).double()) == pytest.approx(
+        100 * (0.02 * 0.5 + 0.04 + 0.04) / 0.1
+    )
     assert auc(torch.tensor([0.02, math.inf]).double()) == pytest.approx(50)
 
 
@@ -103,7 +113,9 @@ def test_boxes() -> None:
     face = POINTS * torch.tensor([1.0, 1.0, 0.0])
     poses = make_pose(torch.eye(3), torch.tensor([[0.0, 0, 1], [0.4, 0, 1], [5, 0, 1], [0, 0, -1]]))
     boxes = box_of_pose(poses, face, K, 80, 100)
-    expected = torch.tensor([[39.5, 29.5, 59.5, 49.5], [79.5, 29.5, 99.5, 49.5], [0, 0, 0, 0], [0, 0, 0, 0]])
+    expected = torch.tensor(
+        [[39.5, 29.5, 59.5, 49.5], [79.5, 29.5, 99.5, 49.5], [0, 0, 0, 0], [0, 0, 0, 0]]
+    )
     torch.testing.assert_close(boxes, expected)
     a = torch.tensor([[0.0, 0, 2, 2], [0, 0, 2, 2], [0, 0, 2, 2], [0, 0, 0, 0]])
     b = torch.tensor([[0.0, 0, 2, 2], [1, 1, 3, 3], [2, 0, 4, 2], [0, 0, 0, 0]])
@@ -117,7 +129,9 @@ def test_boxes() -> None:
 def test_particles_on_the_object() -> None:
     mask = torch.zeros(2, 1, 10, 12, dtype=torch.bool)
     mask[:, :, 2:5, 6:9] = True
-    pixels = torch.tensor([[6.0, 2.0], [8.4, 4.4], [8.6, 4.0], [-3.0, 2.0], [2.0, 6.0]]).expand(2, 5, 2)
+    pixels = torch.tensor([[6.0, 2.0], [8.4, 4.4], [8.6, 4.0], [-3.0, 2.0], [2.0, 6.0]]).expand(
+        2, 5, 2
+    )
     metric = ParticlesOnObject()
     metric.update(mask, pixels)
     assert float(metric.compute()) == pytest.approx(0.4)

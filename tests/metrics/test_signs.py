@@ -15,17 +15,19 @@ from posefilter.metrics.signs import (
     off_frame,
     pairwise_cosine,
 )
-from posefilter.types import Batch, Belief, Cloud, Reading, Step, Trace
+from posefilter.types import Batch, Belief, ParticleOutput, Particles, Step, Trace
 
 
 def test_pairwise_cosine_equals_the_double_loop() -> None:
     g = torch.Generator().manual_seed(0)
-    motion = torch.randn(2, 9, 2, generator=g)
-    motion[0, 3] = 0
+    displacement = torch.randn(2, 9, 2, generator=g)
+    displacement[0, 3] = 0
     for b, keep in ((0, [0, 1, 2, 4, 5, 6, 7, 8]), (1, list(range(9)))):
-        unit = torch.nn.functional.normalize(motion[b, keep], dim=-1)
+        unit = torch.nn.functional.normalize(displacement[b, keep], dim=-1)
         pairs = [unit[i] @ unit[j] for i in range(len(keep)) for j in range(len(keep)) if i != j]
-        assert pairwise_cosine(motion)[b].item() == pytest.approx(torch.stack(pairs).mean().item(), abs=1e-5)
+        assert pairwise_cosine(displacement)[b].item() == pytest.approx(
+            torch.stack(pairs).mean().item(), abs=1e-5
+        )
     assert pairwise_cosine(torch.ones(1, 5, 2))[0].item() == pytest.approx(1.0)
     assert math.isnan(pairwise_cosine(torch.zeros(1, 5, 2))[0].item())
 
@@ -39,7 +41,9 @@ def test_explained_is_one_for_the_truth_nought_for_the_mean_and_negative_for_dri
 
 def test_heading_ignores_particles_that_are_there() -> None:
     true = torch.tensor([[10.0, 0.0], [0.0, 10.0], [0.0, 0.0]])
-    assert heading(torch.tensor([[1.0, 0.0], [1.0, 0.0], [-9.0, 1.0]]), true).item() == pytest.approx(0.5)
+    assert heading(
+        torch.tensor([[1.0, 0.0], [1.0, 0.0], [-9.0, 1.0]]), true
+    ).item() == pytest.approx(0.5)
 
 
 def test_auroc_equals_counting_pairs() -> None:
@@ -61,7 +65,10 @@ def test_shares_of_places() -> None:
 
 def test_copies_count_once() -> None:
     state = torch.tensor(
-        [[[3.0, 4.0], [3.0, 4.0], [3.04, 4.0], [3.2, 4.0]], [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0], [9.0, 9.0]]]
+        [
+            [[3.0, 4.0], [3.0, 4.0], [3.04, 4.0], [3.2, 4.0]],
+            [[1.0, 1.0], [2.0, 1.0], [1.0, 2.0], [9.0, 9.0]],
+        ]
     )
     assert distinct(state).tolist() == [0.5, 1.0]
 
@@ -70,19 +77,29 @@ def test_to_tell_who_left_the_frame_is_no_skill() -> None:
     """A likelihood that is high wherever there is a picture tells nothing of the object."""
     mask = torch.zeros(1, 1, 50, 100, dtype=torch.bool)
     mask[..., 20:30, 40:60] = True
-    state = torch.tensor([[[45.0, 25.0], [55.0, 22.0], [5.0, 5.0], [90.0, 40.0], [-30.0, 9.0], [140.0, 9.0]]])
+    state = torch.tensor(
+        [[[45.0, 25.0], [55.0, 22.0], [5.0, 5.0], [90.0, 40.0], [-30.0, 9.0], [140.0, 9.0]]]
+    )
     seen = torch.tensor([[-0.1, -0.1, -0.1, -0.1, -9.0, -9.0]])
-    for log_likelihood, wanted in ((seen, 0.5), (torch.where(state[..., 0] > 60, -1.0, seen), 0.75)):
+    for log_likelihood, wanted in (
+        (seen, 0.5),
+        (torch.where(state[..., 0] > 60, -1.0, seen), 0.75),
+    ):
         signs = SignsOfFailure()
-        signs.update(make_trace(state, log_likelihood), Batch(mask, mask, mask, *[torch.zeros(1)] * 5))
+        signs.update(
+            make_trace(state, log_likelihood), Batch(mask, mask, mask, *[torch.zeros(1)] * 5)
+        )
         assert signs.compute()["auroc"] == pytest.approx(wanted)
 
 
 def make_trace(state: torch.Tensor, log_likelihood: torch.Tensor) -> Trace:
     B, N = log_likelihood.shape
-    cloud = Cloud(state, torch.zeros(B, N, 0), log_likelihood, torch.arange(N).expand(B, N))
+    particles = Particles(state, torch.zeros(B, N, 0), log_likelihood, torch.arange(N).expand(B, N))
     pose = torch.eye(4).expand(B, N, 4, 4)
-    reading = Reading(log_likelihood, torch.zeros_like(state), pose, torch.zeros(B, N, 0))
+    output = ParticleOutput(log_likelihood, torch.zeros_like(state), pose, torch.zeros(B, N, 0))
     return Trace(
-        (cloud,), (reading,), (Step(0, 1, torch.tensor(0.0)),), Belief(pose, log_likelihood, pose[:, 0], pose[:, 0, 0])
+        (particles,),
+        (output,),
+        (Step(0, 1, torch.tensor(0.0)),),
+        Belief(pose, log_likelihood, pose[:, 0], pose[:, 0, 0]),
     )

@@ -10,7 +10,9 @@ from posefilter.metrics.visibility import ErrorsByVisibility
 def test_each_range_has_its_own_instances() -> None:
     truth = torch.eye(4).expand(5, 4, 4)
     shifts = torch.tensor([0.0, 0.15, 0.0, 0.2, 0.3])
-    poses = make_pose(torch.eye(3).expand(5, 3, 3), torch.stack([shifts, shifts * 0, shifts * 0], -1))
+    poses = make_pose(
+        torch.eye(3).expand(5, 3, 3), torch.stack([shifts, shifts * 0, shifts * 0], -1)
+    )
     metric = ErrorsByVisibility([square()])
     metric.collect(poses[:3], truth[:3], torch.tensor([1.0, 0.4, 0.3]))
     metric.collect(poses[3:], truth[3:], torch.tensor([0.7, float("nan")]))

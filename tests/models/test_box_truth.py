@@ -1,4 +1,6 @@
-"""A detector's box is taught, told and judged about one truth: the whole object's, hidden parts too."""
+"""A detector's box is taught, told and judged about one truth: the whole object's, hidden parts
+too.
+"""
 
 import sys
 from pathlib import Path
@@ -12,7 +14,7 @@ from toy import W, scenes
 
 from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.labels.membership import OnObject
-from posefilter.losses.motion import Sides
+from posefilter.losses.displacement import Sides
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.types import Batch, Trace
 
@@ -39,23 +41,30 @@ def telling(method: CnnPatch, batch: Batch, box: torch.Tensor) -> Trace:
     """Return a run whose particles all tell this box, (B, 4) [px]."""
     with torch.no_grad():
         trace: Trace = method.predict_step(batch, 0)
-    readings = tuple(
-        reading._replace(memory=torch.cat([cloud.state - box[:, None, :2], box[:, None, 2:] - cloud.state], -1) / W)
-        for cloud, reading in zip(trace.clouds, trace.readings, strict=True)
+    outputs = tuple(
+        output._replace(
+            latent=torch.cat(
+                [particles.state - box[:, None, :2], box[:, None, 2:] - particles.state], -1
+            )
+            / W
+        )
+        for particles, output in zip(trace.particles, trace.outputs, strict=True)
     )
-    return trace._replace(readings=readings)
+    return trace._replace(outputs=outputs)
 
 
 def test_what_the_lesson_asks_for_scores_full_marks() -> None:
     method, batch = working(CnnPatch, 9).eval(), half_hidden()
     height, width = batch.rgb.shape[-2:]
-    whole = box_of_pose(batch.camera_from_object, method.model.hull, batch.intrinsics, height, width)
+    whole = box_of_pose(
+        batch.camera_from_object, method.model.hull, batch.intrinsics, height, width
+    )
     seen = torch.stack([visible_box(mask) for mask in batch.mask])
     assert box_iou(seen, whole).max() < 0.75  # the two truths differ, or nothing is tested
-    lesson = Sides(OnObject())
+    candidate_sampler = Sides(OnObject())
     for box, iou in ((whole, 1.0), (seen, box_iou(seen, whole).mean().item())):
         trace = telling(method, batch, box)
-        lost = lesson(trace, batch, method.model).mean().item()
+        lost = candidate_sampler(trace, batch, method.model).mean().item()
         assert lost == pytest.approx(0.0, abs=1e-4) if iou == 1.0 else lost > 0.2
         method._reset()
         method.score(trace, batch)

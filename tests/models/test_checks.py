@@ -1,4 +1,6 @@
-"""Choices that do not fit together are refused in one line that names the key and the cure; their neighbours are not."""
+"""Choices that do not fit together are refused in one line that names the key and the cure; their
+neighbors are not.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -7,16 +9,16 @@ import pytest
 import torch
 from tests.models.toy import scenes, square
 
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
-from posefilter.filters.estimate import Best
+from posefilter.filters.estimate import Argmax
 from posefilter.filters.resample import Systematic
 from posefilter.models.base import PoseEstimator
 from posefilter.models.checks import check_estimate, check_training_clouds, check_votes
 from posefilter.models.image_space import ImageSpace
 from posefilter.nets.mlp import PatchNet
-from posefilter.run.command import compose_job
-from posefilter.run.method import build_method, recipe
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -38,11 +40,15 @@ def one_line(refusal: pytest.ExceptionInfo[UserError], *words: str) -> None:
         assert word in said
 
 
-@pytest.mark.parametrize("choice", ["model=pose_pf", "model=pose_pf variant=paper", "model=cnn_patch", "model=downsized"])
-def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_object(choice: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "choice", ["model=pose_pf", "model=pose_pf variant=paper", "model=cnn_patch", "model=downsized"]
+)
+def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_object(
+    choice: str, tmp_path: Path
+) -> None:
     with pytest.raises(UserError) as refusal:
         check_estimate(build(tmp_path, *choice.split(), "estimate=agreement"))
-    one_line(refusal, "estimate=agreement", "estimate=best")
+    one_line(refusal, "estimate=agreement", "estimate=argmax")
     check_estimate(build(tmp_path, *choice.split()))
 
 
@@ -51,7 +57,12 @@ def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_objec
 def test_agreement_serves_both_pose_methods_before_they_know_their_object(
     model: str, train_filter: str, tmp_path: Path
 ) -> None:
-    job = compose_job("train", CONF, [f"model={model}", "estimate=agreement", f"train_filter={train_filter}"], tmp_path)
+    job = compose_job(
+        "train",
+        CONF,
+        [f"model={model}", "estimate=agreement", f"train_filter={train_filter}"],
+        tmp_path,
+    )
     method = build_method(recipe(job))
     assert isinstance(method.filter.estimate, Agreement)
     check_estimate(method)
@@ -59,34 +70,42 @@ def test_agreement_serves_both_pose_methods_before_they_know_their_object(
 
 def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: Path) -> None:
     small = ["filter.particles=8", "filter.first_particles=null", "filter.steps=1", "refine=none"]
-    method = build(tmp_path, "initialise=from_depth", "proposals=none", "likelihood=contrastive", *small).eval()
-    assert isinstance(method.filter.estimate, Best)
+    method = build(
+        tmp_path, "initialize=from_depth", "proposals=none", "likelihood=contrastive", *small
+    ).eval()
+    assert isinstance(method.filter.estimate, Argmax)
     with torch.no_grad():
         assert method.predict_step(scenes(1), 0).belief.best.isfinite().all()
         method.filter.estimate = Agreement()
         with pytest.raises(UserError) as refusal:
             method.predict_step(scenes(1), 0)
-    one_line(refusal, "estimate=agreement", "PosePF", "estimate=best")
+    one_line(refusal, "estimate=agreement", "PosePF", "estimate=argmax")
 
 
 @pytest.mark.parametrize("variant", ["paper", "working"])
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
-def test_votes_are_refused_where_the_memory_is_a_latent(model: str, variant: str, tmp_path: Path) -> None:
+def test_votes_are_refused_where_the_memory_is_a_latent(
+    model: str, variant: str, tmp_path: Path
+) -> None:
     with pytest.raises(UserError) as refusal:
-        check_votes(images(tmp_path, f"model={model}", f"variant={variant}", "bounds=votes"))
-    one_line(refusal, "bounds=votes", "bounds=pose", "bounds=spread")
-    for bounds in ("pose", "spread"):
-        check_votes(images(tmp_path, f"model={model}", f"variant={variant}", f"bounds={bounds}"))
+        check_votes(images(tmp_path, f"model={model}", f"variant={variant}", "box_head=votes"))
+    one_line(refusal, "box_head=votes", "box_head=pose", "box_head=spread")
+    for box_head in ("pose", "spread"):
+        check_votes(
+            images(tmp_path, f"model={model}", f"variant={variant}", f"box_head={box_head}")
+        )
 
 
 def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
-    for legal in ("bounds=votes", "bounds=spread"):
+    for legal in ("box_head=votes", "box_head=spread"):
         check_votes(images(tmp_path, "model=cnn_patch", legal))
-    check_votes(images(tmp_path, "model=cnn_patch", "bounds=spread", "net.memory_width=0"))
+    check_votes(images(tmp_path, "model=cnn_patch", "box_head=spread", "net.latent_width=0"))
     for width in (0, 3):
         with pytest.raises(UserError) as refusal:
-            check_votes(images(tmp_path, "model=cnn_patch", "bounds=votes", f"net.memory_width={width}"))
-        one_line(refusal, f"net.memory_width={width}", "bounds=votes needs 4")
+            check_votes(
+                images(tmp_path, "model=cnn_patch", "box_head=votes", f"net.latent_width={width}")
+            )
+        one_line(refusal, f"net.latent_width={width}", "box_head=votes needs 4")
 
 
 WIDE = ["filter.particles=8", "filter.first_particles=20", "filter.steps=2"]
@@ -94,7 +113,8 @@ LEGAL = [
     "train_filter=short filter.first_particles=20 filter.steps=2",
     "train_filter=same filter.first_particles=null filter.steps=2",
     "train_filter=same filter.first_particles=8 filter.steps=2",
-    "train_filter=same filter.first_particles=20 filter.steps=1",  # one cloud is of one size, whatever it is
+    # one cloud is of one size, whatever it is
+    "train_filter=same filter.first_particles=20 filter.steps=1",
 ]
 
 
@@ -104,10 +124,12 @@ def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> 
     method = images(tmp_path, f"model={model}", "train_filter=same", *WIDE)
     with pytest.raises(UserError) as refusal:
         check_training_clouds(method)
-    one_line(refusal, "filter.first_particles=20", "filter.first_particles=null", "train_filter=short")
+    one_line(
+        refusal, "filter.first_particles=20", "filter.first_particles=null", "train_filter=short"
+    )
     with torch.no_grad():  # a wide search is fine where nothing is taught
         trace = method.eval().predict_step(batch, 0)
-    assert [cloud.state.shape[1] for cloud in trace.clouds] == [20, 8]
+    assert [particles.state.shape[1] for particles in trace.particles] == [20, 8]
     for legal in LEGAL:
         method = images(tmp_path, f"model={model}", "filter.particles=8", *legal.split()).train()
         check_training_clouds(method)
@@ -116,7 +138,10 @@ def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> 
 
 
 def test_a_short_filters_own_first_cloud_is_named_as_it_is_typed(tmp_path: Path) -> None:
-    wide = ["train_filter.first_particles=200", "train_filter.resample._target_=posefilter.filters.resample.Systematic"]
+    wide = [
+        "train_filter.first_particles=200",
+        "train_filter.resample._target_=posefilter.filters.resample.Systematic",
+    ]
     method = images(tmp_path, "model=patch_pf", *wide)
     assert isinstance(method.train_filter.resample, Systematic)
     with pytest.raises(UserError) as refusal:
@@ -132,9 +157,9 @@ NUMBERS = {
     "model=patch_pf estimate.options=0": ["estimate", "options=0", "1 or more"],
     "model=patch_pf estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
     "model=patch_pf estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
-    "lesson.levels=1": ["lesson", "levels=1", "2 or more"],
-    "lesson.particles=-1": ["lesson", "particles=-1", "0 for none"],
-    "model=patch_pf net.memory_width=0": ["net", "memory_width=0", "1 or more"],
+    "candidate_sampler.levels=1": ["lesson", "levels=1", "2 or more"],
+    "candidate_sampler.particles=-1": ["lesson", "particles=-1", "0 for none"],
+    "model=patch_pf net.latent_width=0": ["net", "latent_width=0", "1 or more"],
     "model=patch_pf net.layers=0": ["net", "layers=0", "1 or more"],
     "model=cnn_patch net.width=0": ["net", "width=0", "1 or more"],
     "model=cnn_patch net.hidden=-1": ["net", "hidden=-1", "0 or more"],
@@ -142,7 +167,9 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("typed", NUMBERS)
-def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(typed: str, tmp_path: Path) -> None:
+def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(
+    typed: str, tmp_path: Path
+) -> None:
     with pytest.raises(UserError) as refusal:
         build(tmp_path, *typed.split())
     one_line(refusal, *NUMBERS[typed])
@@ -153,22 +180,39 @@ def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(typed: 
     [
         "model=pixel_pf patch=1", "model=patch_pf patch=6", "model=cnn_patch patch=1", "model=patch_pf estimate.options=1",
         "model=patch_pf estimate.hypotheses=1", "model=patch_pf estimate.options=100", "model=patch_pf estimate.rounds=0",
-        "model=patch_pf net.layers=1", "model=cnn_patch net.hidden=0", "model=patch_pf glimpse.spacing=2",
+        "model=patch_pf net.layers=1", "model=cnn_patch net.hidden=0", "model=patch_pf "
+                                                                       "glimpse.spacing=2",
     ],
 )  # fmt: skip
 def test_the_least_that_is_legal_takes_a_step(typed: str, tmp_path: Path) -> None:
     batch = scenes(2)
-    method = images(tmp_path, *typed.split(), "context=none", "train_filter=same", "filter.particles=8", "filter.steps=2")
+    method = images(
+        tmp_path,
+        *typed.split(),
+        "encoder=none",
+        "train_filter=same",
+        "filter.particles=8",
+        "filter.steps=2",
+    )
     losses = method.train().training_losses(batch, method.generator("train", 0))
     assert all(loss.isfinite().all() for loss in losses.values())
     with torch.no_grad():
         assert method.eval().predict_step(batch, 0).belief.best.isfinite().all()
 
 
-@pytest.mark.parametrize("typed", ["lesson.levels=2", "lesson.particles=0", "lesson.particles=1"])
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "candidate_sampler.levels=2",
+        "candidate_sampler.particles=0",
+        "candidate_sampler.particles=1",
+    ],
+)
 def test_the_fewest_persistent_particles_and_levels_teach(typed: str, tmp_path: Path) -> None:
     batch = scenes(2)
-    method = build(tmp_path, typed, "proposals=none", "initialise=from_depth", "likelihood=contrastive").train()
+    method = build(
+        tmp_path, typed, "proposals=none", "initialize=from_depth", "likelihood=contrastive"
+    ).train()
     for visit in range(3):
         losses = method.training_losses(batch, method.generator("train", visit))
         assert all(loss.isfinite().all() for loss in losses.values())
@@ -176,8 +220,12 @@ def test_the_fewest_persistent_particles_and_levels_teach(typed: str, tmp_path: 
 
 def test_hidden_puts_two_layers_before_the_outputs() -> None:
     net = partial(PatchNet, extra=64, size=9)
-    linear = [m for m in net(hidden=128, memory_width=4).tell if isinstance(m, torch.nn.Linear)]
-    assert [(m.in_features, m.out_features) for m in linear] == [(32 * 81 + 64, 128), (128, 128), (128, 7)]
+    linear = [m for m in net(hidden=128, latent_width=4).tell if isinstance(m, torch.nn.Linear)]
+    assert [(m.in_features, m.out_features) for m in linear] == [
+        (32 * 81 + 64, 128),
+        (128, 128),
+        (128, 7),
+    ]
     plain = net(hidden=0).tell
     assert (plain.in_features, plain.out_features) == (32 * 81 + 64, 3)
 
@@ -185,13 +233,21 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("model=cnn_patch bounds=pose", ("bounds=pose", "CnnPatch", "bounds=votes")),
-        ("model=patch_pf pose_code=none pose_lesson=none", ("pose_code=none", "PatchPF", "own_point")),
-        ("model=cnn_patch likelihood_lesson=quality", ("likelihood_lesson=quality", "CnnPatch", "balanced")),
-        ("model=downsized pose_lesson=own_point", ("pose_lesson=own_point", "Downsized", "pose_lesson=none")),
+        ("model=cnn_patch box_head=pose", ("box_head=pose", "CnnPatch", "box_head=votes")),
+        ("model=patch_pf pose_head=none aux_pose=none", ("pose_head=none", "PatchPF", "own_point")),
+        (
+            "model=cnn_patch aux_likelihood=quality",
+            ("aux_likelihood=quality", "CnnPatch", "balanced"),
+        ),
+        (
+            "model=downsized aux_pose=own_point",
+            ("aux_pose=own_point", "Downsized", "aux_pose=none"),
+        ),
     ],
 )
-def test_a_pose_that_nobody_tells_is_not_judged(choice: str, words: tuple[str, ...], tmp_path: Path) -> None:
+def test_a_pose_that_nobody_tells_is_not_judged(
+    choice: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
     with pytest.raises(UserError) as refusal:
         build(tmp_path, *choice.split())
     one_line(refusal, *words)

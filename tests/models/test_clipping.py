@@ -16,8 +16,12 @@ from posefilter.models.image_space import ImageSpace
 from posefilter.models.muon import Muon
 
 
-def taught(method: ImageSpace, optimizer: torch.optim.Optimizer, wild: float, limit: float | None = 1.0) -> Tensor:
-    """Return how far the networks' parameters move by a gradient of ones, of which one entry is `wild`."""
+def taught(
+    method: ImageSpace, optimizer: torch.optim.Optimizer, wild: float, limit: float | None = 1.0
+) -> Tensor:
+    """Return how far the networks' parameters move by a gradient of ones, of which one entry is
+    `wild`.
+    """
     before = torch.cat([p.detach().flatten() for p in method.net.parameters()])
     for parameter in method.net.parameters():
         parameter.grad = torch.ones_like(parameter)
@@ -31,13 +35,18 @@ def taught(method: ImageSpace, optimizer: torch.optim.Optimizer, wild: float, li
 
 @pytest.mark.parametrize("limit", [1.0, None])
 @pytest.mark.parametrize("kind", ["sgd", "muon"])
-@pytest.mark.parametrize("wild", [math.inf, math.nan, 1e30])  # the last: finite, but its square is not
+# the last: finite, but its square is not
+@pytest.mark.parametrize("wild", [math.inf, math.nan, 1e30])
 def test_a_gradient_that_is_not_finite_teaches_nothing(
     wild: float, kind: str, limit: float | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     method = working(CnnPatch, 9)
     named = list(method.net.named_parameters())
-    optimizer = Muon(named) if kind == "muon" else torch.optim.SGD([p for _, p in named], lr=1.0, momentum=0.9)
+    optimizer = (
+        Muon(named)
+        if kind == "muon"
+        else torch.optim.SGD([p for _, p in named], lr=1.0, momentum=0.9)
+    )
     moved = taught(method, optimizer, 5.0, limit)
     if kind == "sgd":
         assert moved.norm().item() == pytest.approx(limit or (len(moved) + 24) ** 0.5, rel=1e-3)
@@ -46,7 +55,9 @@ def test_a_gradient_that_is_not_finite_teaches_nothing(
     for _ in range(12):
         assert (taught(method, optimizer, wild, limit) == 0).all(), "not by momentum either"
     said = [record.getMessage() for record in caplog.records]
-    assert said == [f"step 0 does not teach net, the {n}. so far: its gradient is not finite" for n in (1, 10)]
+    assert said == [
+        f"step 0 does not teach net, the {n}. so far: its gradient is not finite" for n in (1, 10)
+    ]
 
 
 def test_a_training_that_only_loses_its_gradients_ends() -> None:
@@ -54,5 +65,7 @@ def test_a_training_that_only_loses_its_gradients_ends() -> None:
     optimizer = torch.optim.SGD(method.parameters(), lr=1e-3)
     for wild in [math.nan] * 19 + [1.0] + [math.nan] * 19:  # never twenty in a row
         taught(method, optimizer, wild)
-    with pytest.raises(FloatingPointError, match="gradient of net was not finite in 20 steps in a row"):
+    with pytest.raises(
+        FloatingPointError, match="gradient of net was not finite in 20 steps in a row"
+    ):
         taught(method, optimizer, math.nan)

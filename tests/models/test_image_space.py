@@ -12,68 +12,89 @@ from torch import nn
 sys.path.insert(0, str(Path(__file__).parent))
 from toy import H, W, scenes, square
 
-from posefilter.contracts import Estimate, Initialise, Loss, Resample
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
-from posefilter.filters.estimate import Best
+from posefilter.filters.estimate import Argmax
 from posefilter.filters.guided import Guided
-from posefilter.filters.initialise import FromRelevance, Informed, UniformPixels
+from posefilter.filters.initialize import FromRelevance, Informed, UniformPixels
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propose import LearnedMotion
+from posefilter.filters.propagate import LearnedDisplacement
 from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import Never, Systematic
-from posefilter.filters.reweigh import Annealed
+from posefilter.filters.resample import NoResampling, Systematic
+from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Constant
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject, Quality
-from posefilter.losses.deviation import Add, Confidence, OwnPoint
+from posefilter.losses.displacement import Chamfer, DirectDisplacement, Sides
 from posefilter.losses.likelihood import BalancedBce, Bce
-from posefilter.losses.motion import Chamfer, Lesson, Sides
-from posefilter.models.box import PoseBox, SpreadBox, VotedBox
+from posefilter.losses.pose_loss import Add, Confidence, SurfacePointLoss
+from posefilter.models.box_heads import PoseBox, SpreadBox, VotedBox
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.downsized import Downsized
 from posefilter.models.image_space import ImageSpace
+from posefilter.models.loss_schedule import Auxiliary, Stage, factors_at
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
-from posefilter.models.stages import Auxiliary, Stage, factors_at
 from posefilter.nets.context import ConvEncoder, NoContext
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
-from posefilter.nets.heads import AbsoluteQuaternion, Bounded, NoPose, OwnPointFragments, OwnPointSixD, Unbounded
+from posefilter.nets.heads import (
+    AbsoluteQuaternion,
+    Bounded,
+    NoPose,
+    SurfacePointFragments,
+    SurfacePointSixD,
+    Unbounded,
+)
 from posefilter.nets.mlp import LatentNet, PatchNet
+from posefilter.protocols import Estimate, Initialize, Loss, Resample
 
 
 def run_filter(
     particles: int,
     steps: int,
-    initialise: Initialise | None = None,
+    initialize: Initialize | None = None,
     resample: Resample | None = None,
     estimate: Estimate | None = None,
 ) -> ParticleFilter:
-    pieces = (Constant(0.0), Annealed(), resample or Never(), LearnedMotion(), estimate or Best(), NoRefine())
-    return ParticleFilter(particles, steps, initialise or UniformPixels(), *pieces)
+    pieces = (
+        Constant(0.0),
+        Annealed(),
+        resample or NoResampling(),
+        LearnedDisplacement(),
+        estimate or Argmax(),
+        NoRefine(),
+    )
+    return ParticleFilter(particles, steps, initialize or UniformPixels(), *pieces)
 
 
 def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
     detects = not kind.tells_pose
     label = OnObject(size) if detects else Quality(size)
-    lessons = {"likelihood": Auxiliary(BalancedBce(label)), "motion": Auxiliary(Lesson(TowardsObject("nearest", 1)), 2.0)}
-    lessons["sides" if detects else "own_point"] = Auxiliary(Sides(OnObject()) if detects else OwnPoint(), 2.0)
+    aux_losses = {
+        "likelihood": Auxiliary(BalancedBce(label)),
+        "displacement": Auxiliary(DirectDisplacement(TowardsObject("nearest", 1)), 2.0),
+    }
+    aux_losses["sides" if detects else "own_point"] = Auxiliary(
+        Sides(OnObject()) if detects else SurfacePointLoss(), 2.0
+    )
     net: Any
     if detects:
-        net = partial(PatchNet, width=8, hidden=64, memory_width=4, normalisation="layer")
+        net = partial(PatchNet, width=8, hidden=64, latent_width=4, normalization="layer")
     else:
-        net = partial(LatentNet, memory_width=16, width=64, layers=3, normalisation="layer")
+        net = partial(LatentNet, latent_width=16, width=64, layers=3, normalization="layer")
 
     parts: dict[str, Any] = {
         "net": net,
         "glimpse": SmoothGlimpse(size),
         "context": ConvEncoder((16, 24, 32, 32), 32),
-        "pose_code": NoPose() if detects else OwnPointSixD(),
-        "motion": Bounded(0.3),
+        "pose_head": NoPose() if detects else SurfacePointSixD(),
+        "displacement": Bounded(0.3),
         "bounds": VotedBox() if detects else PoseBox(),
-        "lessons": lessons,
+        "lessons": aux_losses,
         "place_gradient": False,
-        "filter": run_filter(64, 4, resample=Systematic(), estimate=Best() if detects else Agreement()),
+        "filter": run_filter(
+            64, 4, resample=Systematic(), estimate=Argmax() if detects else Agreement()
+        ),
         "train_filter": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
         "loss": Chamfer(size) if detects else Confidence(OnObject(size)),
         "optimizer": partial(torch.optim.AdamW, lr=3e-3),
@@ -88,8 +109,8 @@ def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> 
         "net": PatchNet if detects else LatentNet,
         "glimpse": IntegerCut(size),
         "context": NoContext(),
-        "pose_code": NoPose() if detects else AbsoluteQuaternion(),
-        "motion": Unbounded(),
+        "pose_head": NoPose() if detects else AbsoluteQuaternion(),
+        "displacement": Unbounded(),
         "bounds": SpreadBox(size) if detects else PoseBox(),
         "filter": run_filter(50, steps),
         "loss": Chamfer(size) if detects else Add(),
@@ -113,7 +134,9 @@ def teach(method: ImageSpace, steps: int, seed: int = 0) -> None:
 
 
 @pytest.mark.parametrize(("kind", "size"), [(PixelPF, 1), (PatchPF, 3), (Downsized, 9)])
-def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(kind: type[ImageSpace], size: int) -> None:
+def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
+    kind: type[ImageSpace], size: int
+) -> None:
     torch.manual_seed(0)
     method = working(kind, size)
     with torch.no_grad():
@@ -135,9 +158,12 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(kind: t
 
 
 @pytest.mark.parametrize(
-    ("kind", "size", "loss"), [(PixelPF, 1, Add()), (PatchPF, 3, Bce(OnObject(3))), (CnnPatch, 9, Chamfer(9))]
+    ("kind", "size", "loss"),
+    [(PixelPF, 1, Add()), (PatchPF, 3, Bce(OnObject(3))), (CnnPatch, 9, Chamfer(9))],
 )
-def test_the_papers_recipe_runs_and_its_loss_falls(kind: type[ImageSpace], size: int, loss: Loss) -> None:
+def test_the_papers_recipe_runs_and_its_loss_falls(
+    kind: type[ImageSpace], size: int, loss: Loss
+) -> None:
     torch.manual_seed(0)
     method = paper(kind, size, loss=loss)
     batch = scenes(4)
@@ -146,30 +172,38 @@ def test_the_papers_recipe_runs_and_its_loss_falls(kind: type[ImageSpace], size:
     assert list(first) == ["loss"]  # nothing but the chosen loss: every remedy is off
     teach(method, 25)
     method.train()
-    assert method.training_losses(batch, method.generator("train", 0))["loss"].mean() < first["loss"].mean()
+    assert (
+        method.training_losses(batch, method.generator("train", 0))["loss"].mean()
+        < first["loss"].mean()
+    )
 
 
 def test_the_papers_sizes() -> None:
     method = paper(PatchPF, 6)
-    assert method.memory_width == 256
+    assert method.latent_width == 256
     assert method.net.latent[0].in_features == 4 * 36 + 2 + 256  # patch, location, latent
     assert paper(PixelPF, 1).net.latent[0].in_features == 4 + 256
-    assert method.net.motion[0].in_features == 7 + 1 + 256
+    assert method.net.displacement[0].in_features == 7 + 1 + 256
 
 
 def test_no_gradient_of_what_is_seen_reaches_the_motion_through_an_integer_cut() -> None:
-    """The paper's likelihood cannot teach method 1 where to go: only a place that is told can, or a smooth glimpse."""
+    """The paper's likelihood cannot teach method 1 where to go: only a place that is told can, or a
+    smooth glimpse.
+    """
     batch = scenes(2)
 
     def reaches(method: ImageSpace) -> bool:
         losses = method.train().training_losses(batch, method.generator("train", 0))
-        gradient = torch.autograd.grad(losses["loss"].sum(), method.net.motion[0].weight, allow_unused=True)[0]
+        gradient = torch.autograd.grad(
+            losses["loss"].sum(), method.net.displacement[0].weight, allow_unused=True
+        )[0]
         return gradient is not None and bool(gradient.abs().sum() > 0)
 
     bce = Bce(OnObject())
     assert not reaches(paper(PixelPF, 1, loss=bce))
     assert reaches(paper(PixelPF, 1, loss=bce, glimpse=SmoothGlimpse(1)))
-    assert reaches(paper(PatchPF, 3, loss=bce))  # it is told its location, and can learn to flee to where the answer is no
+    # it is told its location, and can learn to flee to where the answer is no
+    assert reaches(paper(PatchPF, 3, loss=bce))
     assert not reaches(paper(PatchPF, 3, loss=bce, truncate=1))
 
 
@@ -181,7 +215,7 @@ def test_neither_mask_nor_pose_is_looked_at_in_evaluation() -> None:
     with torch.no_grad():
         a, b = (method.predict_step(x, 0) for x in (batch, lie))
     assert torch.equal(a.belief.best, b.belief.best)
-    assert torch.equal(a.clouds[-1].state, b.clouds[-1].state)
+    assert torch.equal(a.particles[-1].state, b.particles[-1].state)
 
 
 def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
@@ -190,15 +224,15 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
     teach(method, 40)
     batch = scenes(4)
 
-    def share(initialise: Initialise, resample: Resample) -> list[float]:
+    def share(initialize: Initialize, resample: Resample) -> list[float]:
         method._reset()
-        method.filter = run_filter(64, 3, initialise, resample)
+        method.filter = run_filter(64, 3, initialize, resample)
         with torch.no_grad():
             method.test_step(batch, 0)
         return method.results()["signs"]["on_object"]
 
-    uniform = share(UniformPixels(), Never())
-    assert share(FromRelevance(), Never())[0] > uniform[0] + 0.3
+    uniform = share(UniformPixels(), NoResampling())
+    assert share(FromRelevance(), NoResampling())[0] > uniform[0] + 0.3
     assert share(UniformPixels(), Guided(Systematic()))[1] > uniform[1]
     blind = paper(PatchPF, 3, filter=run_filter(8, 2, FromRelevance())).eval()
     with pytest.raises(UserError, match="relevance"):
@@ -206,25 +240,29 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
 
 
 def test_stages_change_the_weights_as_training_proceeds() -> None:
-    stages = (Stage(0.4, {"motion": 0.0}), Stage(0.7, {"own_point": 0.0, "likelihood": 0.0}), Stage(1.0, {}))
-    assert factors_at(stages, 0.2) == {"motion": 0.0}
-    assert factors_at(stages, 0.5) == {"own_point": 0.0, "likelihood": 0.0}
-    assert factors_at(stages, 1.0) == {}
+    loss_schedule = (
+        Stage(0.4, {"displacement": 0.0}),
+        Stage(0.7, {"own_point": 0.0, "likelihood": 0.0}),
+        Stage(1.0, {}),
+    )
+    assert factors_at(loss_schedule, 0.2) == {"displacement": 0.0}
+    assert factors_at(loss_schedule, 0.5) == {"own_point": 0.0, "likelihood": 0.0}
+    assert factors_at(loss_schedule, 1.0) == {}
     assert factors_at((), 0.5) == {}
-    method, batch = working(PatchPF, 3, stages=stages), scenes(2)
+    method, batch = working(PatchPF, 3, loss_schedule=loss_schedule), scenes(2)
     losses = method.training_losses(batch, method.generator("train", 0))
-    assert losses["motion"].sum() == 0
+    assert losses["displacement"].sum() == 0
     assert losses["own_point"].sum() > 0
     with pytest.raises(UserError, match="names the loss 'moton'"):
-        working(PatchPF, 3, stages=(Stage(1.0, {"moton": 0.0}),))
+        working(PatchPF, 3, loss_schedule=(Stage(1.0, {"moton": 0.0}),))
     with pytest.raises(UserError, match="the ends must rise"):
-        working(PatchPF, 3, stages=(Stage(0.5, {}),))
+        working(PatchPF, 3, loss_schedule=(Stage(0.5, {}),))
 
 
 def test_own_points_are_where_the_truth_puts_them() -> None:
     method, batch = working(PixelPF, 1), scenes(3)
     pixel = torch.tensor([[[W / 2, H / 2]]]).expand(3, 1, 2)
-    point, known = method.own_points(method.observe(batch), pixel)
+    point, known = method.surface_points(method.encode(batch), pixel)
     assert known.all()
     depth = batch.depth[:, 0, H // 2, W // 2]
     torch.testing.assert_close(point[:, 0, 2], depth)
@@ -232,12 +270,12 @@ def test_own_points_are_where_the_truth_puts_them() -> None:
 
 
 def test_what_fragments_have_learned_survives_a_checkpoint_and_other_points_to_judge_by() -> None:
-    method = working(PatchPF, 3, pose_code=OwnPointFragments(16))
+    method = working(PatchPF, 3, pose_head=SurfacePointFragments(16))
     teach(method, 10)
-    again = working(PatchPF, 3, pose_code=OwnPointFragments(16))
+    again = working(PatchPF, 3, pose_head=SurfacePointFragments(16))
     model = square()
     again.load_state_dict(method.state_dict())
-    again.eval().adopt(model._replace(points=model.points.flip(0)[::2]))
+    again.eval().set_object(model._replace(points=model.points.flip(0)[::2]))
     with torch.no_grad():
         before, after = (m.predict_step(scenes(2), 0).belief for m in (method, again))
     torch.testing.assert_close(before.best, after.best)
@@ -245,7 +283,7 @@ def test_what_fragments_have_learned_survives_a_checkpoint_and_other_points_to_j
 
 
 def test_an_image_without_depth_gets_a_finite_belief() -> None:
-    method = working(PatchPF, 3, pose_code=OwnPointFragments(16)).eval()
+    method = working(PatchPF, 3, pose_head=SurfacePointFragments(16)).eval()
     batch = scenes(2)
     batch.depth[1] = 0
     with torch.no_grad():

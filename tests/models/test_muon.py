@@ -27,12 +27,17 @@ def test_a_step_has_the_size_it_is_told_whatever_the_gradient() -> None:
         weight.grad = scale * torch.randn_like(weight)
         Muon([("net.conv.weight", weight)], lr=0.01, weight_decay=0.0).step()
         moved = (weight.detach() - before).square().mean().sqrt().item()
-        assert 0.8 * 0.2 * 0.01 < moved < 1.1 * 0.2 * 0.01  # root mean square, as AdamW's usually is
+        # root mean square, as AdamW's usually is
+        assert 0.8 * 0.2 * 0.01 < moved < 1.1 * 0.2 * 0.01
 
 
 def test_vectors_and_spared_layers_take_adamws_step() -> None:
     torch.manual_seed(0)
-    start = {"a.bias": torch.randn(7), "a.out.weight": torch.randn(5, 7), "a.mid.weight": torch.randn(5, 7)}
+    start = {
+        "a.bias": torch.randn(7),
+        "a.out.weight": torch.randn(5, 7),
+        "a.mid.weight": torch.randn(5, 7),
+    }
     ours = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     theirs = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     muon = Muon(ours.items(), lr=0.02, adam_lr=0.01, weight_decay=0.1, spared=["out"])
@@ -48,7 +53,9 @@ def test_vectors_and_spared_layers_take_adamws_step() -> None:
 
 
 def test_it_resumes_where_it_stopped() -> None:
-    def run(steps: int, state: dict | None = None, weight: torch.Tensor | None = None) -> tuple[torch.Tensor, dict]:
+    def run(
+        steps: int, state: dict | None = None, weight: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, dict]:
         p = torch.nn.Parameter(torch.ones(8, 9) if weight is None else weight.clone())
         b = torch.nn.Parameter(torch.zeros(8))
         optimizer = Muon([("w", p), ("b", b)], lr=0.1)
@@ -63,4 +70,6 @@ def test_it_resumes_where_it_stopped() -> None:
     half, state = run(3)
     again, _ = run(3, state, half)
     torch.testing.assert_close(again, whole)
-    assert (run(200)[0] - 3 * torch.eye(8, 9)).norm() < 0.3 * (torch.ones(8, 9) - 3 * torch.eye(8, 9)).norm()
+    assert (run(200)[0] - 3 * torch.eye(8, 9)).norm() < 0.3 * (
+        torch.ones(8, 9) - 3 * torch.eye(8, 9)
+    ).norm()

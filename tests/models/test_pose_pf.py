@@ -9,20 +9,20 @@ from torch.nn.functional import pad
 
 from posefilter.errors import UserError
 from posefilter.filters.candidates import jiggle
-from posefilter.filters.estimate import Best
-from posefilter.filters.initialise import FromDepth, FromProposals
+from posefilter.filters.estimate import Argmax
+from posefilter.filters.initialize import FromDepth, FromProposals
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propose import Gaussian
+from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import Chain, Gradient, NoRefine, Rescore
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweigh import Annealed
+from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose import invert
 from posefilter.labels.paper_points import PaperPoints
 from posefilter.losses.contrast import Contrast
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
-from posefilter.models.lessons import CandidatePoses, LabelledRays
+from posefilter.models.candidate_samplers import CandidatePoses, LabeledRays
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.nets.paper_likelihood import PaperLikelihood
@@ -32,10 +32,18 @@ from posefilter.types import Batch, Belief
 SIGMA = (0.01, 0.2)
 
 
-def working(initialise: object = None) -> PosePF:
+def working(initialize: object = None) -> PosePF:
     torch.manual_seed(0)
-    start = initialise or FromProposals()
-    pieces = (start, Geometric(0.05, SIGMA[0]), Annealed(), Systematic(), Gaussian(0.4), Best(), NoRefine())
+    start = initialize or FromProposals()
+    pieces = (
+        start,
+        Geometric(0.05, SIGMA[0]),
+        Annealed(),
+        Systematic(),
+        Gaussian(0.4),
+        Argmax(),
+        NoRefine(),
+    )
     method = PosePF(
         PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
         CandidatePoses(each=6, proposed=4, particles=6, sigma=SIGMA),
@@ -44,12 +52,14 @@ def working(initialise: object = None) -> PosePF:
         loss=Contrast(),
         optimizer=partial(torch.optim.AdamW, lr=3e-3),
     )
-    method.adopt(square())
+    method.set_object(square())
     return method
 
 
 def error(method: PosePF, count: int = 16, more: tuple[int, int] = (0, 0)) -> torch.Tensor:
-    """Return the filter's ADD on scenes that no training saw, with so many more columns and rows of background [m]."""
+    """Return the filter's ADD on scenes that no training saw, with so many more columns and rows of
+    background [m].
+    """
     method.eval()
     batch = widened(scenes(count, seed=10_000), *more)
     with torch.no_grad():
@@ -59,7 +69,10 @@ def error(method: PosePF, count: int = 16, more: tuple[int, int] = (0, 0)) -> to
 
 def widened(batch: Batch, columns: int, rows: int) -> Batch:
     """Return the batch with background on the right and below; what was to be seen keeps its place."""
-    rgb, depth, mask = (pad(x, (0, columns, 0, rows), value=v) for x, v in zip(batch[:3], (0.5, 1.5, 0), strict=True))
+    rgb, depth, mask = (
+        pad(x, (0, columns, 0, rows), value=v)
+        for x, v in zip(batch[:3], (0.5, 1.5, 0), strict=True)
+    )
     return batch._replace(rgb=rgb, depth=depth, mask=mask)
 
 
@@ -94,7 +107,9 @@ def test_sides_that_are_no_whole_cells_are_as_good(more: tuple[int, int], traine
 
 
 def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
-    """From places a few centimetres off, so that the gain does not drown in what so short a training leaves open."""
+    """From places a few centimeters off, so that the gain does not drown in what so short a
+    training leaves open.
+    """
     trained.eval()
     batch = scenes(32, seed=40_000)
     g = torch.Generator().manual_seed(0)
@@ -102,10 +117,12 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
     start = jiggle(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
     belief = Belief(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
     with torch.no_grad():
-        scene = trained.observe(batch)
+        scene = trained.encode(batch)
         climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])
         refined = Chain([Rescore(1, 256, SIGMA[0]), climb])(belief, scene, trained, g)
-    before, after = (add(x, truth, trained.model.points).median() for x in (belief.best, refined.best))
+    before, after = (
+        add(x, truth, trained.model.points).median() for x in (belief.best, refined.best)
+    )
     assert before > 0.05
     assert after < 0.6 * before
 
@@ -113,7 +130,7 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
 def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
     trained.eval()
     batch = scenes(16, seed=20_000)
-    scene = trained.observe(batch)
+    scene = trained.encode(batch)
     g = torch.Generator().manual_seed(0)
     truth = batch.camera_from_object[:, None]
     others = FromDepth()(batch, scene, trained, 60, g)
@@ -125,9 +142,14 @@ def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
 def test_neither_mask_nor_truth_is_looked_at(trained: PosePF) -> None:
     trained.eval()
     batch = scenes(3, seed=30_000)
-    blind = batch._replace(mask=torch.zeros_like(batch.mask), camera_from_object=torch.eye(4).expand(3, 4, 4))
+    blind = batch._replace(
+        mask=torch.zeros_like(batch.mask), camera_from_object=torch.eye(4).expand(3, 4, 4)
+    )
     with torch.no_grad():
-        a, b = (trained.filter(x, trained, torch.Generator().manual_seed(0)).belief for x in (batch, blind))
+        a, b = (
+            trained.filter(x, trained, torch.Generator().manual_seed(0)).belief
+            for x in (batch, blind)
+        )
     assert torch.equal(a.best, b.best)
 
 
@@ -141,17 +163,20 @@ def test_without_proposals_the_start_must_be_another(trained: PosePF) -> None:
 def test_the_papers_samples_lie_where_they_are_said_to() -> None:
     method = PosePF(
         PaperLikelihood(),
-        LabelledRays(rays=8),
+        LabeledRays(rays=8),
         filter=working().filter,
         loss=Regression(PaperPoints()),
         optimizer=torch.optim.Adam,
     )
-    method.adopt(square())
+    method.set_object(square())
     batch = scenes(2)
-    trace = method.lesson(method, method.observe(batch), batch, torch.Generator().manual_seed(0))
-    state, weight = trace.clouds[0].state, trace.clouds[0].log_weights.exp()
+    trace = method.candidate_sampler(
+        method, method.encode(batch), batch, torch.Generator().manual_seed(0)
+    )
+    state, weight = trace.particles[0].state, trace.particles[0].log_weights.exp()
     assert state.shape == (2, 8 * 30 * 2, 4)
-    first = state[0, :30]  # one ray, colours random: from 10 cm before the camera to 5 cm behind the surface
+    # one ray, colors random: from 10 cm before the camera to 5 cm behind the surface
+    first = state[0, :30]
     assert torch.equal(first[:, :2], first[:1, :2].expand(30, 2))
     assert first[:, 2].diff().min() > 0
     assert first[-1, 2] == pytest.approx(0.05, rel=0.2)
@@ -166,7 +191,7 @@ def test_the_papers_samples_lie_where_they_are_said_to() -> None:
 
 def test_the_papers_lesson_refuses_another_likelihood() -> None:
     method = working()
-    method.lesson = LabelledRays()
+    method.candidate_sampler = LabeledRays()
     with pytest.raises(UserError, match="likelihood=paper"):
         method.training_losses(scenes(1), torch.Generator().manual_seed(0))
 
@@ -174,6 +199,8 @@ def test_the_papers_lesson_refuses_another_likelihood() -> None:
 def test_candidates_hold_the_truth_whatever_the_camera() -> None:
     method = working()
     batch = scenes(2)
-    trace = method.lesson(method, method.observe(batch), batch, torch.Generator().manual_seed(0))
-    relative = invert(batch.camera_from_object)[:, None] @ trace.clouds[0].state
+    trace = method.candidate_sampler(
+        method, method.encode(batch), batch, torch.Generator().manual_seed(0)
+    )
+    relative = invert(batch.camera_from_object)[:, None] @ trace.particles[0].state
     assert (relative[:, 0] - torch.eye(4)).abs().max() < 1e-5

@@ -1,4 +1,6 @@
-"""Parts of a training, by hand: the loss on the context's map, the stages' walk, and where a long gradient is cut."""
+"""Parts of a training, by hand: the loss on the context's map, the stages' walk, and where a long
+gradient is cut.
+"""
 
 import math
 import sys
@@ -18,19 +20,19 @@ sys.path.insert(0, str(Path(__file__).parent))
 from test_image_space import run_filter, working
 from toy import scenes
 
-from posefilter.filters.propose import Still
+from posefilter.filters.propagate import Identity
 from posefilter.filters.resample import Systematic
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace, relevance_loss
+from posefilter.models.loss_schedule import Stage
 from posefilter.models.patch_pf import PatchPF
-from posefilter.models.stages import Stage
 from posefilter.nets.context import ContextMap
 from posefilter.types import Trace
 
 CONF = Path(__file__).parents[2] / "conf"
 LOG2 = math.log(2)
 
-# -- the loss on the context's map -------------------------------------------------------------------------------------
+# -- the loss on the context's map ----------------------------------------------------------------
 
 
 def told(chance: Tensor) -> ContextMap:
@@ -58,8 +60,12 @@ def test_the_relevances_loss_is_the_mean_of_both_kinds_of_cells_means() -> None:
     want = torch.tensor([(2 + 8 / 7) / 2, (7 / 6 + 3 / 2) / 2]) * LOG2
     torch.testing.assert_close(loss, want)
     # half of (chance - truth) over the cells of its kind
-    torch.testing.assert_close(gradient[0], torch.tensor([[0.5, -0.75 * 7, 0.5, 0.5], [0.5, 0.5, 0.5, 0.75]]) / 14)
-    torch.testing.assert_close(gradient[1], torch.tensor([[1.5, -0.5, -0.5, -0.75], [2.25, -0.5, -0.5, -0.5]]) / 12)
+    torch.testing.assert_close(
+        gradient[0], torch.tensor([[0.5, -0.75 * 7, 0.5, 0.5], [0.5, 0.5, 0.5, 0.75]]) / 14
+    )
+    torch.testing.assert_close(
+        gradient[1], torch.tensor([[1.5, -0.5, -0.5, -0.75], [2.25, -0.5, -0.5, -0.5]]) / 12
+    )
 
 
 @pytest.mark.parametrize("count", [1, 4, 7])
@@ -81,22 +87,26 @@ def test_where_one_kind_of_cell_is_missing_the_other_still_counts_half() -> None
 
 
 def test_the_relevances_loss_and_gradient_stay_finite_however_sure_it_is() -> None:
-    mask = torch.stack([torch.zeros(1, 4, 8), torch.ones(1, 4, 8), torch.eye(4).repeat(1, 1, 2)]).bool()
+    mask = torch.stack(
+        [torch.zeros(1, 4, 8), torch.ones(1, 4, 8), torch.eye(4).repeat(1, 1, 2)]
+    ).bool()
     for logit in (-300.0, 300.0):
-        loss, gradient = loss_and_gradient(ContextMap((), (), torch.full((3, 2, 4), logit, requires_grad=True)), mask)
+        loss, gradient = loss_and_gradient(
+            ContextMap((), (), torch.full((3, 2, 4), logit, requires_grad=True)), mask
+        )
         assert loss.isfinite().all()
         assert gradient.isfinite().all()
         assert loss[int(logit < 0)] == 150.0  # wholly wrong: half of 300
 
 
-# -- stages ------------------------------------------------------------------------------------------------------------
+# -- stages --------------------------------------------------------------------------------------
 
 
 def tiny(kind: type[ImageSpace], **changes: Any) -> ImageSpace:
     """Return a tiny method whose lessons are called as in conf/."""
     method = working(kind, 3, **changes)
     if kind.tells_pose:
-        method.lessons["pose"] = method.lessons.pop("own_point")
+        method.aux_losses["pose"] = method.aux_losses.pop("own_point")
     return method
 
 
@@ -108,7 +118,9 @@ def stages_of(name: str) -> tuple[Stage, ...]:
 
 def at(method: ImageSpace, step: int, steps: int) -> None:
     """Have the method believe that so many of a training's steps are done."""
-    trainer: Any = SimpleNamespace(global_step=step, estimated_stepping_batches=steps, current_epoch=0)
+    trainer: Any = SimpleNamespace(
+        global_step=step, estimated_stepping_batches=steps, current_epoch=0
+    )
     method.trainer = trainer
 
 
@@ -117,12 +129,14 @@ def losses_of(method: ImageSpace) -> dict[str, Tensor]:
 
 
 def teaches(loss: Tensor, method: ImageSpace) -> bool:
-    gradients = torch.autograd.grad(loss.sum(), list(method.parameters()), retain_graph=True, allow_unused=True)
+    gradients = torch.autograd.grad(
+        loss.sum(), list(method.parameters()), retain_graph=True, allow_unused=True
+    )
     return any(bool(gradient.any()) for gradient in gradients if gradient is not None)
 
 
 def test_progress_is_the_share_of_the_steps_that_are_done() -> None:
-    method = tiny(CnnPatch, stages=stages_of("three_motion"))
+    method = tiny(CnnPatch, loss_schedule=stages_of("three_motion"))
     assert method.progress() == 0.0  # no trainer counts
     for step, share in ((0, 0.0), (5, 0.25), (19, 0.95), (20, 1.0)):
         at(method, step, 20)
@@ -130,13 +144,15 @@ def test_progress_is_the_share_of_the_steps_that_are_done() -> None:
 
 
 # twenty steps: stages end at 0.4 and 0.6 of them, so that steps 8 and 12 are the first of the next
-THREE = {0: {"motion"}, 7: {"motion"}, 8: {"loss", "likelihood", "pose", "relevance"},
+THREE = {0: {"displacement"}, 7: {"displacement"}, 8: {"loss", "likelihood", "pose", "relevance"},
          11: {"loss", "likelihood", "pose", "relevance"}, 12: set(), 19: set()}  # fmt: skip
-THREE_MOTION = {0: {"loss", "motion"}, 7: {"loss", "motion"}, 8: {"likelihood", "sides", "relevance"},
+THREE_MOTION = {0: {"loss", "displacement"}, 7: {"loss", "displacement"}, 8: {"likelihood", "sides", "relevance"},
                 11: {"likelihood", "sides", "relevance"}, 12: set(), 19: set()}  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "kind", "off"), [("three", PatchPF, THREE), ("three_motion", CnnPatch, THREE_MOTION)])
+@pytest.mark.parametrize(
+    ("name", "kind", "off"), [("three", PatchPF, THREE), ("three_motion", CnnPatch, THREE_MOTION)]
+)
 def test_what_a_stage_switches_off_is_zero_and_teaches_nothing_until_its_turn_comes(
     name: str, kind: type[ImageSpace], off: Mapping[int, set[str]]
 ) -> None:
@@ -144,13 +160,16 @@ def test_what_a_stage_switches_off_is_zero_and_teaches_nothing_until_its_turn_co
     method = tiny(kind)
     whole = losses_of(method)
     assert all(bool((value > 0).all()) and teaches(value, method) for value in whole.values())
-    method.stages = stages_of(name)
+    method.loss_schedule = stages_of(name)
     for step, silent in off.items():
         at(method, step, 20)
         now = losses_of(method)
         assert now.keys() == whole.keys()
         for loss, value in now.items():
-            assert torch.equal(value, torch.zeros(2) if loss in silent else whole[loss]), (step, loss)
+            assert torch.equal(value, torch.zeros(2) if loss in silent else whole[loss]), (
+                step,
+                loss,
+            )
             assert teaches(value, method) == (loss not in silent), (step, loss)
 
 
@@ -158,11 +177,11 @@ def test_a_factor_between_weakens_a_loss() -> None:
     torch.manual_seed(0)
     method = tiny(CnnPatch)
     whole = losses_of(method)
-    method.stages = (Stage(0.5, {"motion": 0.25}), Stage(1.0, {"motion": 2.0}))
+    method.loss_schedule = (Stage(0.5, {"displacement": 0.25}), Stage(1.0, {"displacement": 2.0}))
     for step, factor in ((1, 0.25), (2, 2.0)):
         at(method, step, 4)
         now = losses_of(method)
-        torch.testing.assert_close(now["motion"], factor * whole["motion"])
+        torch.testing.assert_close(now["displacement"], factor * whole["displacement"])
         assert torch.equal(now["sides"], whole["sides"])
 
 
@@ -172,13 +191,17 @@ class Watch(Callback):
     def __init__(self) -> None:
         self.seen: list[tuple[float, set[str]]] = []
 
-    def on_train_batch_start(self, trainer: Trainer, method: LightningModule, batch: Any, number: int) -> None:
+    def on_train_batch_start(
+        self, trainer: Trainer, method: LightningModule, batch: Any, number: int
+    ) -> None:
         assert isinstance(method, ImageSpace)
         self.share = method.progress()
 
-    def on_train_batch_end(self, trainer: Trainer, method: LightningModule, out: Any, batch: Any, number: int) -> None:
+    def on_train_batch_end(
+        self, trainer: Trainer, method: LightningModule, out: Any, batch: Any, number: int
+    ) -> None:
         logged = trainer.callback_metrics
-        names = ("loss", "motion", "likelihood", "sides", "relevance")
+        names = ("loss", "displacement", "likelihood", "sides", "relevance")
         self.seen.append((self.share, {name for name in names if not logged[f"train/{name}"]}))
 
 
@@ -190,13 +213,13 @@ def test_a_training_walks_through_its_stages() -> None:
     trainer = Trainer(max_steps=5, accumulate_grad_batches=2, callbacks=[watch], accelerator="cpu", logger=False,
                       enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
-    trainer.fit(tiny(CnnPatch, stages=stages_of("three_motion")), data)
-    first, second = {"loss", "motion"}, {"likelihood", "sides", "relevance"}
+    trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_motion")), data)
+    first, second = {"loss", "displacement"}, {"likelihood", "sides", "relevance"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]
     assert watch.seen == [one for one in want for _ in range(2)]
 
 
-# -- where a long gradient is cut --------------------------------------------------------------------------------------
+# -- where a long gradient is cut ----------------------------------------------------------------
 
 
 def roll(method: ImageSpace, truncate: int | None) -> Trace:
@@ -211,53 +234,63 @@ def flows(of: Tensor, into: Tensor) -> bool:
 
 
 def pairs(trace: Trace, what: str) -> set[tuple[int, int]]:
-    """Return (later, earlier): to which earlier steps' `what` the gradient of a later step's likelihood flows."""
-    readings = trace.readings
+    """Return (later, earlier): to which earlier steps' `what` the gradient of a later step's
+    likelihood flows.
+    """
+    outputs = trace.outputs
     return {
         (later, earlier)
-        for later in range(len(readings))
+        for later in range(len(outputs))
         for earlier in range(later)
-        if flows(readings[later].log_likelihood, getattr(readings[earlier], what))
+        if flows(outputs[later].log_likelihood, getattr(outputs[earlier], what))
     }
 
 
 def parts(trace: Trace) -> list[Tensor]:
     """Return every tensor of a run."""
     assert trace.log_evidence is not None
-    tuples = (*trace.clouds, *trace.readings, trace.belief)
-    return [trace.log_evidence, *(part for one in tuples for part in one if isinstance(part, Tensor))]
+    tuples = (*trace.particles, *trace.outputs, trace.belief)
+    return [
+        trace.log_evidence,
+        *(part for one in tuples for part in one if isinstance(part, Tensor)),
+    ]
 
 
 @pytest.mark.parametrize("truncate", [1, 2, 5])
 @pytest.mark.parametrize("kind", [PatchPF, CnnPatch])
 def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) -> None:
     torch.manual_seed(0)
-    method = working(kind, 3, place_gradient=True, train_filter=run_filter(12, 6, resample=Systematic()))
+    method = working(
+        kind, 3, place_gradient=True, train_filter=run_filter(12, 6, resample=Systematic())
+    )
     whole, cut = roll(method, None), roll(method, truncate)
     for a, b in zip(parts(whole), parts(cut), strict=True):
         assert torch.equal(a, b)
     # they went somewhere and remember something that changes, or nothing is tested
-    assert (whole.clouds[-1].state - whole.clouds[0].state).abs().max() > 1
-    assert (whole.readings[-1].memory - whole.readings[0].memory).abs().max() > 0.01
+    assert (whole.particles[-1].state - whole.particles[0].state).abs().max() > 1
+    assert (whole.outputs[-1].latent - whole.outputs[0].latent).abs().max() > 0.01
 
 
 def test_a_step_that_is_cut_looks_back_at_none() -> None:
     torch.manual_seed(0)
-    method = working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 6))  # reads patch, context and place
+    # reads patch, context and place
+    method = working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 6))
     every = {(later, earlier) for later in range(6) for earlier in range(later)}
     whole = roll(method, None)
-    assert pairs(whole, "motion") == pairs(whole, "memory") == every
+    assert pairs(whole, "displacement") == pairs(whole, "memory") == every
     for truncate in (1, 2, 3):
         trace = roll(method, truncate)
-        for found in (pairs(trace, "motion"), pairs(trace, "memory")):
+        for found in (pairs(trace, "displacement"), pairs(trace, "memory")):
             assert not {later for later, _ in found if later % truncate == 0}
-            assert {(later, later - 1) for later in range(1, 6) if later % truncate} <= found  # the others are not cut
+            # the others are not cut
+            assert {(later, later - 1) for later in range(1, 6) if later % truncate} <= found
 
 
 def test_a_memory_is_cut_into_stretches() -> None:
     torch.manual_seed(0)
     method = working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 6))
-    method.train_filter.propose = Still()  # no particle moves, so that memory is all that a step hands on
+    # no particle moves, so that latent is all that a step hands on
+    method.train_filter.propagate = Identity()
     assert pairs(roll(method, 2), "memory") == {(1, 0), (3, 2), (5, 4)}
     assert pairs(roll(method, 3), "memory") == {(1, 0), (2, 0), (2, 1), (4, 3), (5, 3), (5, 4)}
     assert not pairs(roll(method, 1), "memory")
@@ -265,9 +298,13 @@ def test_a_memory_is_cut_into_stretches() -> None:
 
 
 def test_places_that_are_judged_are_not_cut() -> None:
-    """A loss on where particles went teaches every displacement that led there: only what was looked at is cut."""
+    """A loss on where particles went teaches every displacement that led there: only what was
+    looked at is cut.
+    """
     torch.manual_seed(0)
     trace = roll(working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 4)), 1)
     for earlier in range(3):
-        (gradient,) = torch.autograd.grad(trace.clouds[3].state.sum(), trace.readings[earlier].motion, retain_graph=True)
+        (gradient,) = torch.autograd.grad(
+            trace.particles[3].state.sum(), trace.outputs[earlier].displacement, retain_graph=True
+        )
         assert torch.equal(gradient, torch.ones_like(gradient))

@@ -40,14 +40,15 @@ def test_only_the_smooth_glimpse_has_a_gradient_towards_its_place() -> None:
     ramp = torch.arange(30.0).expand(1, 1, 20, 30) * 2
     pixels = torch.tensor([[[10.3, 8.6]]], requires_grad=True)
     SmoothGlimpse(3)(ramp, pixels).sum().backward()
-    torch.testing.assert_close(pixels.grad, torch.tensor([[[18.0, 0.0]]]), atol=1e-3, rtol=0)  # 9 samples x slope 2
+    # 9 samples x slope 2
+    torch.testing.assert_close(pixels.grad, torch.tensor([[[18.0, 0.0]]]), atol=1e-3, rtol=0)
     assert not IntegerCut(3)(ramp, pixels).requires_grad
 
 
-def test_sampling_a_coarse_map_finds_cell_centres() -> None:
+def test_sampling_a_coarse_map_finds_cell_centers() -> None:
     cells = torch.arange(12.0).view(1, 1, 3, 4)
-    centre = torch.tensor([[[2 * 4 + 1.5, 1 * 4 + 1.5]]])
-    assert sample(cells, centre, stride=4).item() == pytest.approx(6.0, abs=1e-5)
+    center = torch.tensor([[[2 * 4 + 1.5, 1 * 4 + 1.5]]])
+    assert sample(cells, center, stride=4).item() == pytest.approx(6.0, abs=1e-5)
     off = torch.tensor([[[500.0, 500.0]]])
     assert sample(cells, off, stride=4).item() == 0.0
     assert sample(cells, off, stride=4, padding="border").item() == pytest.approx(11.0)

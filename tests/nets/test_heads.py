@@ -7,10 +7,10 @@ from posefilter.geometry.rotation import matrix_from_quat_xyzw
 from posefilter.nets.heads import (
     AbsoluteQuaternion,
     Bounded,
-    Held,
+    Gated,
     NoPose,
-    OwnPointFragments,
-    OwnPointSixD,
+    SurfacePointFragments,
+    SurfacePointSixD,
     Unbounded,
     fill_depth,
 )
@@ -37,10 +37,11 @@ def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
 
 def test_a_particle_pushed_onto_an_edge_can_be_taught_back() -> None:
     state = torch.tensor([[[5.0, 20.0], [99.0, 49.0]]])
-    raw = torch.tensor([[[-1.0, 0.0], [2.0, 2.0]]], requires_grad=True)  # both are led off the frame, and kept on its edge
-    motion = Bounded(0.3)(raw, torch.zeros(1, 2), state, 100, 50)
-    torch.testing.assert_close(state + motion, torch.tensor([[[0.0, 20.0], [99.0, 49.0]]]))
-    (motion - torch.tensor([[[30.0, 0.0], [-50.0, -20.0]]])).square().sum().backward()
+    # both are led off the frame, and kept on its edge
+    raw = torch.tensor([[[-1.0, 0.0], [2.0, 2.0]]], requires_grad=True)
+    displacement = Bounded(0.3)(raw, torch.zeros(1, 2), state, 100, 50)
+    torch.testing.assert_close(state + displacement, torch.tensor([[[0.0, 20.0], [99.0, 49.0]]]))
+    (displacement - torch.tensor([[[30.0, 0.0], [-50.0, -20.0]]])).square().sum().backward()
     assert raw.grad[0, 0, 0] < 0, "descent leads it inwards"
     assert (raw.grad[0, 1] > 0).all()
 
@@ -48,8 +49,13 @@ def test_a_particle_pushed_onto_an_edge_can_be_taught_back() -> None:
 def test_who_is_there_stays_there() -> None:
     raw, state = torch.ones(1, 3, 2), torch.full((1, 3, 2), 20.0)
     logit = torch.tensor([[-9.0, 0.0, 9.0]]).requires_grad_()
-    free, held = Bounded(0.1)(raw, logit, state, 100, 80), Held(Bounded(0.1))(raw.requires_grad_(), logit, state, 100, 80)
-    torch.testing.assert_close(held / free, torch.tensor([1.0, 0.5, 0.0])[None, :, None].expand(1, 3, 2), atol=2e-4, rtol=0)
+    free, held = (
+        Bounded(0.1)(raw, logit, state, 100, 80),
+        Gated(Bounded(0.1))(raw.requires_grad_(), logit, state, 100, 80),
+    )
+    torch.testing.assert_close(
+        held / free, torch.tensor([1.0, 0.5, 0.0])[None, :, None].expand(1, 3, 2), atol=2e-4, rtol=0
+    )
     held.sum().backward()
     assert logit.grad is None
     assert raw.grad is not None
@@ -59,20 +65,22 @@ def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> No
     g = torch.Generator().manual_seed(1)
     center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
     raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
-    code = OwnPointSixD()
+    code = SurfacePointSixD()
     code.about(thing(center, radius))
     pose = code(raw, point).pose
     assert is_rigid(pose)
     back = transform(invert(pose), point[:, :, None])[:, :, 0]
     torch.testing.assert_close(back, center + radius * raw[..., 6:], atol=1e-5, rtol=0)
     moved = code(raw, point + torch.tensor([0.0, 0.0, 0.3])).pose  # the same outputs, farther away
-    torch.testing.assert_close(moved[..., :3, 3] - pose[..., :3, 3], torch.tensor([0.0, 0.0, 0.3]).expand(2, 6, 3))
+    torch.testing.assert_close(
+        moved[..., :3, 3] - pose[..., :3, 3], torch.tensor([0.0, 0.0, 0.3]).expand(2, 6, 3)
+    )
 
 
 def test_a_pose_of_fragments_is_that_of_the_likeliest() -> None:
     g = torch.Generator().manual_seed(2)
     center, radius, K = torch.tensor([0.01, 0.02, -0.03]), 0.1, 8
-    code = OwnPointFragments(K)
+    code = SurfacePointFragments(K)
     code.about(thing(center, radius))
     raw, point = torch.randn(2, 6, code.width, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
     pose, said = code(raw, point)
@@ -94,7 +102,9 @@ def test_absolute_pose_is_its_seven_outputs() -> None:
     raw = torch.tensor([[[0.0, 0.0, 2.0, 0.0, 0.1, 0.2, 0.9]]])
     pose = AbsoluteQuaternion()(raw, torch.rand(1, 1, 3)).pose
     torch.testing.assert_close(pose[0, 0, :3, 3], torch.tensor([0.1, 0.2, 0.9]))
-    torch.testing.assert_close(pose[0, 0, :3, :3], matrix_from_quat_xyzw(torch.tensor([0.0, 0.0, 1.0, 0.0])))
+    torch.testing.assert_close(
+        pose[0, 0, :3, :3], matrix_from_quat_xyzw(torch.tensor([0.0, 0.0, 1.0, 0.0]))
+    )
     assert NoPose()(raw[..., :0], torch.rand(1, 1, 3)).pose.shape == (1, 1, 4, 4)
 
 

@@ -10,33 +10,43 @@ from posefilter.nets.mlp import LatentNet, PatchNet, mlp
 def test_layers_are_as_the_paper_counts_them() -> None:
     net = mlp(260, 256, 512, 4, "batch")
     linear = [m for m in net.modules() if isinstance(m, torch.nn.Linear)]
-    assert [(m.in_features, m.out_features) for m in linear] == [(260, 512), (512, 512), (512, 512), (512, 256)]
+    assert [(m.in_features, m.out_features) for m in linear] == [
+        (260, 512),
+        (512, 512),
+        (512, 512),
+        (512, 256),
+    ]
     assert sum(isinstance(m, torch.nn.BatchNorm1d) for m in net.modules()) == 3
     with pytest.raises(UserError, match="batch or layer"):
         mlp(4, 4, 8, 2, "group")
 
 
-@pytest.mark.parametrize(("normalisation", "mixes"), [("batch", True), ("layer", False)])
-def test_batch_statistics_mix_particles_and_layer_statistics_do_not(normalisation: str, mixes: bool) -> None:
+@pytest.mark.parametrize(("normalization", "mixes"), [("batch", True), ("layer", False)])
+def test_batch_statistics_mix_particles_and_layer_statistics_do_not(
+    normalization: str, mixes: bool
+) -> None:
     torch.manual_seed(0)
-    latent = LatentNet(0, 1, memory_width=8, width=16, normalisation=normalisation).train()
-    patch = PatchNet(0, 3, width=8, memory_width=4, normalisation=normalisation).train()
+    latent = LatentNet(0, 1, latent_width=8, width=16, normalization=normalization).train()
+    patch = PatchNet(0, 3, width=8, latent_width=4, normalization=normalization).train()
     g = torch.Generator().manual_seed(1)
     pixel = torch.rand(2, 5, 4, 1, 1, generator=g)
     window = torch.rand(2, 5, 4, 3, 3, generator=g)
     for net, seen in ((latent, pixel), (patch, window)):
-        memory = torch.zeros(2, 5, net.memory_width)
+        latent = torch.zeros(2, 5, net.latent_width)
         other = seen.clone()
         other[1, 4] += 3.0  # another particle, of another image
-        before, after = (net(x, seen[..., 0, 0, :0].flatten(2)[..., :0], memory).motion[0] for x in (seen, other))
+        before, after = (
+            net(x, seen[..., 0, 0, :0].flatten(2)[..., :0], latent).displacement[0]
+            for x in (seen, other)
+        )
         assert (not torch.allclose(before, after, atol=1e-6)) == mixes
 
 
 def test_latent_net_remembers() -> None:
     torch.manual_seed(0)
-    net = LatentNet(0, 1, memory_width=8, pose_width=9, width=16, normalisation="layer")
+    net = LatentNet(0, 1, latent_width=8, pose_width=9, width=16, normalization="layer")
     seen, extra = torch.rand(1, 3, 4, 1, 1), torch.zeros(1, 3, 0)
     first = net(seen, extra, torch.zeros(1, 3, 8))
-    second = net(seen, extra, first.memory)
+    second = net(seen, extra, first.latent)
     assert first.pose.shape == (1, 3, 9)
-    assert (first.motion - second.motion).abs().min() > 1e-6
+    assert (first.displacement - second.displacement).abs().min() > 1e-6

@@ -22,7 +22,9 @@ def image() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def pose() -> torch.Tensor:
-    return make_pose(exp_so3(torch.tensor([0.4, -0.7, 0.2])), torch.tensor([0.02, 0.01, 0.8]))[None, None]
+    return make_pose(exp_so3(torch.tensor([0.4, -0.7, 0.2])), torch.tensor([0.02, 0.01, 0.8]))[
+        None, None
+    ]
 
 
 def test_points_are_the_pixels_lifted_into_the_object_frame() -> None:
@@ -39,7 +41,9 @@ def test_points_are_the_pixels_lifted_into_the_object_frame() -> None:
         there = transform(invert(pose()[0, 0]), (ray * depth[0, 0, v, u])[None])[0] - CENTER
         torch.testing.assert_close(points.position[0, 0, k], there, atol=1e-6, rtol=0)
         torch.testing.assert_close(points.color[0, 0, k], rgb[0, :, v, u])
-        torch.testing.assert_close(points.ray[0, 0, k], pose()[0, 0, :3, :3].T @ (ray / ray.norm()), atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            points.ray[0, 0, k], pose()[0, 0, :3, :3].T @ (ray / ray.norm()), atol=1e-6, rtol=0
+        )
     assert points.known.all()
     assert points.inside.all()
 
@@ -49,7 +53,8 @@ def test_a_pixel_without_depth_gives_the_rays_nearest_point() -> None:
     noise = torch.randn(1, 1, 50, 2, generator=torch.Generator().manual_seed(1))
     points = look(lay_out(rgb, torch.zeros_like(depth), K), pose(), CENTER, RADIUS, noise)
     assert not points.known.any()
-    assert (points.position * points.ray).sum(-1).abs().max() < 1e-5  # the nearest point is square to the ray
+    # the nearest point is square to the ray
+    assert (points.position * points.ray).sum(-1).abs().max() < 1e-5
 
 
 def test_pixels_outside_the_frame_are_known_to_be_so() -> None:
@@ -60,7 +65,9 @@ def test_pixels_outside_the_frame_are_known_to_be_so() -> None:
 
 
 def test_a_score_does_not_change_with_the_frame() -> None:
-    """Turning camera and object together about the optical axis must not matter, nor what other poses are asked."""
+    """Turning camera and object together about the optical axis must not matter, nor what other
+    poses are asked.
+    """
     rgb, depth = image()
     net = PoseLikelihood(width=32, blocks=1)
     scene = lay_out(rgb, depth, K)
@@ -79,7 +86,9 @@ def test_the_noise_level_changes_the_score() -> None:
     broad = net(scene, pose(), torch.tensor(0.2), CENTER, RADIUS, 64, g())
     sharp = net(scene, pose(), torch.tensor(0.005), CENTER, RADIUS, 64, g())
     assert (broad - sharp).abs().item() > 1e-4
-    assert net.level(torch.tensor([0.003, 0.25]))[:, 0].tolist() == pytest.approx([-1.0, 1.0], abs=1e-5)
+    assert net.level(torch.tensor([0.003, 0.25]))[:, 0].tolist() == pytest.approx(
+        [-1.0, 1.0], abs=1e-5
+    )
 
 
 def test_gradients_reach_the_pose() -> None:
@@ -87,25 +96,32 @@ def test_gradients_reach_the_pose() -> None:
     shift = torch.zeros(3, requires_grad=True)
     moved = make_pose(pose()[..., :3, :3], pose()[..., :3, 3] + shift)
     net = PoseLikelihood(width=32, blocks=1)
-    net(scene, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)).sum().backward()
+    net(
+        scene, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
+    ).sum().backward()
     assert shift.grad is not None
     assert shift.grad.abs().max() > 0
 
 
 def said(features: int = 2, wrong: float = 0.0) -> Coordinates:
-    """Return what a network might say of a wall at 0.8 m: coordinates true at the pose above but for a shift, in radii.
+    """Return what a network might say of a wall at 0.8 m: coordinates true at the pose above but
+    for a shift, in radii.
 
     Two fragments, of equal share; the second's place is nonsense.
     """
     g = torch.Generator().manual_seed(2)
     h, w = H // 8, W // 8
-    pixel = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1) * 8.0 + 3.5
+    pixel = (
+        torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1) * 8.0 + 3.5
+    )
     ray = rays(pixel.reshape(1, -1, 2), K)
     there = (transform(invert(pose()[0, 0]), (ray * 0.8)[0]) - CENTER).reshape(1, h, w, 1, 3)
     place = torch.cat([there / RADIUS + wrong, torch.full((1, h, w, 1, 3), 99.0)], dim=3)
     centers = torch.tensor([[[0.0, 0.0, 0.0], [50.0, 50.0, 50.0]]])
     chatter = torch.randn(1, h, w, features, generator=g)
-    return Coordinates(torch.zeros(1, h, w), torch.full((1, h, w, 2), 0.5).log(), place, centers, chatter)
+    return Coordinates(
+        torch.zeros(1, h, w), torch.full((1, h, w, 2), 0.5).log(), place, centers, chatter
+    )
 
 
 def test_context_is_read_where_the_point_is() -> None:
@@ -116,7 +132,8 @@ def test_context_is_read_where_the_point_is() -> None:
     assert points.context is not None
     assert points.context.shape == (1, 1, 40, 5 + 2)
     torch.testing.assert_close(points.context[..., 0].exp(), torch.full((1, 1, 40), 0.5))
-    middle = (points.position / RADIUS).norm(dim=-1) < 1.2  # away from the border, where interpolation has to hold
+    # away from the border, where interpolation has to hold
+    middle = (points.position / RADIUS).norm(dim=-1) < 1.2
     assert middle.sum() > 10
     off = (points.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle]
     assert off.max() < 1e-3  # on a wall the true coordinates are linear in the pixel
@@ -129,7 +146,9 @@ def test_gradients_reach_the_features_but_not_what_is_said_of_the_object() -> No
     told = Coordinates(*(x.requires_grad_() for x in said()))
     net = PoseLikelihood(width=32, blocks=1, context=2)
     scene = lay_out(*image(), K, told)
-    net(scene, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)).sum().backward()
+    net(
+        scene, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
+    ).sum().backward()
     assert told.features.grad is not None
     assert told.features.grad.abs().max() > 0
     assert told.place.grad is None
@@ -163,6 +182,17 @@ def test_the_papers_likelihood_is_a_sum_over_points() -> None:
         for k in range(30)
         if points.inside[0, 0, k] and points.known[0, 0, k]
     )
-    got = net(lay_out(rgb, depth, K), pose(), torch.tensor(0.0), CENTER, RADIUS, 30, torch.Generator().manual_seed(5))
+    got = net(
+        lay_out(rgb, depth, K),
+        pose(),
+        torch.tensor(0.0),
+        CENTER,
+        RADIUS,
+        30,
+        torch.Generator().manual_seed(5),
+    )
     torch.testing.assert_close(got[0, 0], by_hand)
-    assert sum(p.numel() for p in net.parameters()) == 6 * 128 + 128 + 5 * 2 * (128 * 128 + 128) + 128 + 1  # table 1
+    assert (
+        sum(p.numel() for p in net.parameters())
+        == 6 * 128 + 128 + 5 * 2 * (128 * 128 + 128) + 128 + 1
+    )  # table 1

@@ -10,17 +10,20 @@ from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, coordinate_loss
 from posefilter.nets.encoding import masked_mean_pool, normals_from_depth
+from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.nets.votes import draw_poses, measure_cells
 
 H, W = 64, 96
-MIDDLES = torch.tensor([[x, y, z] for x in (-0.4, 0.4) for y in (-0.4, 0.4) for z in (-0.4, 0.4)])  # of eight fragments
+# of eight fragments
+MIDDLES = torch.tensor([[x, y, z] for x in (-0.4, 0.4) for y in (-0.4, 0.4) for z in (-0.4, 0.4)])
 K = intrinsics(120.0, 130.0, 47.0, 30.0)[None]
 CENTER, RADIUS = torch.tensor([0.01, -0.02, 0.03]), 0.15
 
 
 def plane(normal: Tensor, distance: float) -> Tensor:
-    """Return the z-depth (1, 1, H, W) of the plane normal . x = -distance (the normal faces the camera)."""
+    """Return the z-depth (1, 1, H, W) of the plane normal . x = -distance (the normal faces the
+    camera).
+    """
     view = rays(pixel_grid(H, W).reshape(1, -1, 2), K)
     return (-distance / (view @ normal)).reshape(1, 1, H, W)
 
@@ -52,7 +55,8 @@ def test_cells_lie_on_the_surface_and_skip_holes() -> None:
     normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, -0.9]), dim=0)
     depth = plane(normal, 0.8)
     middle = STRIDE // 2
-    depth[..., middle - 1, middle - 1] = 0  # the first choice of cell (0, 0): the next one must serve
+    # the first choice of cell (0, 0): the next one must serve
+    depth[..., middle - 1, middle - 1] = 0
     depth[..., STRIDE : 2 * STRIDE, :STRIDE] = 0
     cells = measure_cells(depth, K)
     assert cells.point.shape == (1, H // STRIDE, W // STRIDE, 3)
@@ -62,9 +66,11 @@ def test_cells_lie_on_the_surface_and_skip_holes() -> None:
 
 
 def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, Tensor]:
-    """Return what a network says of cells on an object at a known pose, with Gaussian noise of so many radii.
+    """Return what a network says of cells on an object at a known pose, with Gaussian noise of so
+    many radii.
 
-    doubt: the share it gives to the point turned half round the object's z axis, as of two faces that look alike.
+    doubt: the share it gives to the point turned half round the object's z axis, as of two faces
+    that look alike.
     """
     g = torch.Generator().manual_seed(0)
     h, w = 6, 8
@@ -73,7 +79,9 @@ def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, T
     point = (thing * RADIUS + CENTER) @ pose[0, :3, :3].T + pose[0, :3, 3]
     logit = torch.full((1, h, w), 6.0)
     logit[:, :, : w // 2] = -12.0  # background, whose coordinates are nonsense
-    said = torch.where(logit[..., None] > 0, thing + noise * torch.randn(thing.shape, generator=g), torch.zeros(3))
+    said = torch.where(
+        logit[..., None] > 0, thing + noise * torch.randn(thing.shape, generator=g), torch.zeros(3)
+    )
     turned = said * torch.tensor([-1.0, -1.0, 1.0])
     right, wrong = nearest_fragment(said, MIDDLES[None]), nearest_fragment(turned, MIDDLES[None])
     share = torch.full((1, h, w, 8), 1e-6)
@@ -82,7 +90,11 @@ def world(noise: float = 0.0, doubt: float = 0.0) -> tuple[Coordinates, Cells, T
     for fragment, where in ((wrong, turned), (right, said)):
         place.scatter_(3, fragment[..., None, None].expand(1, h, w, 1, 3), where[..., None, :])
     valid = torch.ones(1, h, w, dtype=torch.bool)
-    return Coordinates(logit, share.log(), place, MIDDLES[None], torch.zeros(1, h, w, 0)), Cells(point, valid), pose
+    return (
+        Coordinates(logit, share.log(), place, MIDDLES[None], torch.zeros(1, h, w, 0)),
+        Cells(point, valid),
+        pose,
+    )
 
 
 def test_perfect_votes_give_the_pose() -> None:
@@ -90,7 +102,8 @@ def test_perfect_votes_give_the_pose() -> None:
     got = draw_poses(said, cells, CENTER, RADIUS, 200, torch.Generator().manual_seed(1))
     good = angle_between(got[:, :, :3, :3], pose[:, None, :3, :3])[0] < 0.02
     near = (got[0, :, :3, 3] - pose[0, :3, 3]).norm(dim=-1) < 3e-3
-    assert (good & near).float().mean() > 0.95  # the rest drew background, or nearly collinear points
+    # the rest drew background, or nearly collinear points
+    assert (good & near).float().mean() > 0.95
 
 
 def test_noisy_votes_scatter_round_the_pose() -> None:
@@ -115,7 +128,10 @@ def test_votes_in_doubt_agree_with_each_other() -> None:
 def test_an_image_without_depth_does_not_disturb_the_others() -> None:
     said, cells, pose = world()
     both = Coordinates(*(torch.cat([x, x]) for x in said))
-    blind = Cells(torch.cat([torch.zeros_like(cells.point), cells.point]), torch.cat([~cells.valid, cells.valid]))
+    blind = Cells(
+        torch.cat([torch.zeros_like(cells.point), cells.point]),
+        torch.cat([~cells.valid, cells.valid]),
+    )
     got = draw_poses(both, blind, CENTER, RADIUS, 50, torch.Generator().manual_seed(1))
     assert torch.isfinite(got).all()
     assert ((got[1, :, :3, 3] - pose[0, :3, 3]).norm(dim=-1) < 3e-3).float().mean() > 0.9
@@ -127,9 +143,13 @@ def test_the_loss_is_least_for_the_truth() -> None:
     mask = torch.nn.functional.interpolate(mask, scale_factor=STRIDE) > 0.5
     right, error = coordinate_loss(said, cells, mask, pose, CENTER, RADIUS, 0.3)
     assert error.item() < 1e-6
-    wrong, wrong_error = coordinate_loss(said._replace(place=said.place + 0.1), cells, mask, pose, CENTER, RADIUS, 0.3)
+    wrong, wrong_error = coordinate_loss(
+        said._replace(place=said.place + 0.1), cells, mask, pose, CENTER, RADIUS, 0.3
+    )
     assert wrong_error.item() == pytest.approx(0.1 * 3**0.5 * RADIUS, rel=1e-4)
-    flipped, _ = coordinate_loss(said._replace(logit=-said.logit), cells, mask, pose, CENTER, RADIUS, 0.3)
+    flipped, _ = coordinate_loss(
+        said._replace(logit=-said.logit), cells, mask, pose, CENTER, RADIUS, 0.3
+    )
     unsure, _ = coordinate_loss(world(doubt=0.4)[0], cells, mask, pose, CENTER, RADIUS, 0.3)
     assert right < wrong
     assert right < flipped
@@ -144,7 +164,9 @@ def test_fragments_spread_over_the_surface() -> None:
     apart = (torch.cdist(middles, middles) + 9 * torch.eye(20)).min()
     assert apart > 0.5  # 20 even caps of a sphere have middles about 0.8 apart
     assert reach == pytest.approx(torch.cdist(points, middles).amin(1).mean().item(), rel=1e-4)
-    assert torch.equal(nearest_fragment(points[None], middles[None])[0], torch.cdist(points, middles).argmin(1))
+    assert torch.equal(
+        nearest_fragment(points[None], middles[None])[0], torch.cdist(points, middles).argmin(1)
+    )
 
 
 def test_the_network_learns_coordinates_of_a_toy() -> None:
@@ -152,17 +174,21 @@ def test_the_network_learns_coordinates_of_a_toy() -> None:
 
     torch.manual_seed(0)
     net, model = ObjectCoordinateNet((16, 24, 32, 32), fragments=12), square()
-    net.adopt(model.points, model.center, model.radius)
+    net.set_object(model.points, model.center, model.radius)
     cut = net.centers.clone()
     assert cut.norm(dim=-1).max() <= 1 + 1e-5
-    net.adopt(model.points.flip(0) * 0.9, model.center, model.radius)  # other points of the same object, to judge it by
+    # other points of the same object, to judge it by
+    net.set_object(model.points.flip(0) * 0.9, model.center, model.radius)
     assert torch.equal(net.centers, cut)
     optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
     errors = []
     for step in range(60):
         batch = scenes(8, seed=step)
         said = net(batch.rgb, batch.depth, batch.intrinsics)
-        cells, size = measure_cells(batch.depth, batch.intrinsics), (model.center, model.radius, float(net.reach))
+        cells, size = (
+            measure_cells(batch.depth, batch.intrinsics),
+            (model.center, model.radius, float(net.reach)),
+        )
         loss, error = coordinate_loss(said, cells, batch.mask, batch.camera_from_object, *size)
         optimizer.zero_grad()
         loss.mean().backward()

@@ -1,4 +1,6 @@
-"""Readers against real files: YCB-Video frames with the public meshes, and the poses of a real FAT frame."""
+"""Readers against real files: YCB-Video frames with the public meshes, and the poses of a real FAT
+frame.
+"""
 
 import json
 
@@ -6,14 +8,23 @@ import cv2
 import numpy as np
 import pytest
 
-from posefilter.data.check import check_dataset
-from posefilter.data.fat import FatReader
-from posefilter.data.meshes import MeshStore
+from posefilter.data.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
-from posefilter.data.ycb_video import YCBVideoReader
+from posefilter.data.readers.fat import FatReader
+from posefilter.data.readers.ycb_video import YCBVideoReader
+from posefilter.meshes.store import MeshStore
 
 _SOME = ["008_pudding_box", "024_bowl", "035_power_drill", "040_large_marker"]
-_CORNERS = [[1, -1, 1], [-1, -1, 1], [-1, 1, 1], [1, 1, 1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1], [1, 1, -1]]
+_CORNERS = [
+    [1, -1, 1],
+    [-1, -1, 1],
+    [-1, 1, 1],
+    [1, 1, 1],
+    [1, -1, -1],
+    [-1, -1, -1],
+    [-1, 1, -1],
+    [1, 1, -1],
+]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +44,7 @@ def test_real_photographs_fit_their_meshes(real_data, meshes, tmp_path):
         assert row["depth_error_mm"] <= 3.0
 
 
-def test_rendered_ycb_video_frames_fit_to_a_fraction_of_a_millimetre(real_data, meshes):
+def test_rendered_ycb_video_frames_fit_to_a_fraction_of_a_millimeter(real_data, meshes):
     reader = YCBVideoReader(real_data / "ycbv", _SOME, meshes, parts=("data_syn",))
     report = check_dataset(reader, meshes, limit=1)
     assert report["problems"] == []
@@ -44,33 +55,52 @@ def test_rendered_ycb_video_frames_fit_to_a_fraction_of_a_millimetre(real_data, 
 
 
 def test_canary_the_frame_of_ycb_video_is_not_the_meshes(real_data, meshes):
-    reader = YCBVideoReader(real_data / "ycbv" / "data", "003_cracker_box", meshes, mesh_frame="ycb_video")
+    reader = YCBVideoReader(
+        real_data / "ycbv" / "data", "003_cracker_box", meshes, mesh_frame="ycb_video"
+    )
     report = check_dataset(reader, meshes, limit=2)
     assert report["objects"][0]["silhouette_iou"] < 0.5
     assert "YCB-Video's object frame" in report["problems"][0]
 
 
 def test_key_frames_and_published_points(real_data, meshes):
-    dm = PoseDataModule("ycb_video", real_data / "ycbv", "003_cracker_box", meshes, split={"test": 1.0}, image_width=320)
+    dm = PoseDataModule(
+        "ycb_video",
+        real_data / "ycbv",
+        "003_cracker_box",
+        meshes,
+        split={"test": 1.0},
+        image_width=320,
+    )
     batch = dm.test_dataset[0]
     assert len(dm.test_dataset) == 5
     assert batch.rgb.shape == (3, 240, 320)
     points = dm.object_model(0).points.numpy()
     assert len(points) == 2621
-    low, high = dm.meshes.load("003_cracker_box").bounds  # published points lie on the mesh, once in its frame
+    # published points lie on the mesh, once in its frame
+    low, high = dm.meshes.load("003_cracker_box").box_head
     assert (points > low - 0.002).all()
     assert (points < high + 0.002).all()
 
 
 @pytest.fixture
 def banana(real_data, tmp_path):
-    """Return a FAT folder with a real frame's JSON files, and the pixels that its meshes would give."""
+    """Return a FAT folder with a real frame's JSON files, and the pixels that its meshes would
+    give.
+    """
     folder = tmp_path / "single" / "011_banana_16k" / "kitchen_0"
     folder.mkdir(parents=True)
     source = real_data / "fat"
-    names = {"object": "_object_settings", "camera": "_camera_settings", "left": "000000.left", "right": "000000.right"}
+    names = {
+        "object": "_object_settings",
+        "camera": "_camera_settings",
+        "left": "000000.left",
+        "right": "000000.right",
+    }
     for name, target in names.items():
-        (folder / f"{target}.json").write_text((source / f"real_fat_single_banana.{name}.json").read_text())
+        (folder / f"{target}.json").write_text(
+            (source / f"real_fat_single_banana.{name}.json").read_text()
+        )
     for eye in ("left", "right"):
         cv2.imwrite(str(folder / f"000000.{eye}.jpg"), np.zeros((540, 960, 3), np.uint8))
         cv2.imwrite(str(folder / f"000000.{eye}.depth.png"), np.full((540, 960), 9000, np.uint16))
@@ -111,4 +141,5 @@ def test_the_wood_block_of_fat_has_no_geometry(real_data, meshes, banana):
     others = [one["class"].removesuffix("_16k") for one in settings["exported_objects"]]
     others.remove("036_wood_block")
     assert len(others) == 20
-    assert not FatReader(banana, others, meshes).notes  # every other class of the real settings fits its mesh
+    # every other class of the real settings fits its mesh
+    assert not FatReader(banana, others, meshes).notes

@@ -1,4 +1,6 @@
-"""A real headless Chromium, driven over its debugging pipe: no driver and no package is needed beside the browser itself."""
+"""A real headless Chromium, driven over its debugging pipe: no driver and no package is needed
+beside the browser itself.
+"""
 
 import base64
 import json
@@ -16,7 +18,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+CHROMIUM = next(
+    (
+        found
+        for name in ("chromium", "chromium-browser", "google-chrome")
+        if (found := shutil.which(name))
+    ),
+    None,
+)
 OPTIONS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--remote-debugging-pipe",
@@ -32,27 +41,41 @@ class Page:
         self._session: str | None = None
         self._events: list[dict[str, Any]] = []
         self.complaints: list[str] = []
-        target = next(t for t in self._call("Target.getTargets")["targetInfos"] if t["type"] == "page")
-        self._session = self._call("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
+        target = next(
+            t for t in self._call("Target.getTargets")["targetInfos"] if t["type"] == "page"
+        )
+        self._session = self._call(
+            "Target.attachToTarget", targetId=target["targetId"], flatten=True
+        )["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._call(f"{domain}.enable")
 
-    def open(self, address: str, width: int, height: int = 900, dark: bool = False, phone: bool = False) -> None:
+    def open(
+        self, address: str, width: int, height: int = 900, dark: bool = False, phone: bool = False
+    ) -> None:
         """Open an address in a window of a size [px], and wait until its pictures are decoded."""
-        self._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=phone,
+        )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self._call("Emulation.setEmulatedMedia", features=[scheme])
         self.complaints, self._events = [], []
         self._call("Page.navigate", url=address)
         while not any(event["method"] == "Page.loadEventFired" for event in self._events):
             self._events.append(self._message())
-        self.evaluate("Promise.all([...document.images].map(i => i.decode().catch(() => 0))).then(() => 1)")
+        self.evaluate(
+            "Promise.all([...document.images].map(i => i.decode().catch(() => 0))).then(() => 1)"
+        )
 
     def evaluate(self, script: str) -> Any:
         """Return what a script in the page comes to."""
-        return self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)["result"].get(
-            "value"
-        )
+        return self._call(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+        )["result"].get("value")
 
     def picture(self) -> np.ndarray:
         """Return the whole page as it is shown.  -> (H, W, 3) uint8."""
@@ -100,9 +123,12 @@ def browser(profile: Path) -> Iterator[Page]:
     """Start a browser with an empty profile in a folder; give its only tab; end it."""
     (child_reads, write), (read, child_writes) = os.pipe(), os.pipe()
     command = [str(CHROMIUM), *OPTIONS, f"--user-data-dir={profile}", "about:blank"]
-    redirect = f'exec "$0" "$@" 3<&{child_reads} 4>&{child_writes}'  # the browser's pipe is its descriptors 3 and 4
+    # the browser's pipe is its descriptors 3 and 4
+    redirect = f'exec "$0" "$@" 3<&{child_reads} 4>&{child_writes}'
     process = subprocess.Popen(
-        ["bash", "-c", redirect, *command], pass_fds=(child_reads, child_writes), stderr=subprocess.DEVNULL
+        ["bash", "-c", redirect, *command],
+        pass_fds=(child_reads, child_writes),
+        stderr=subprocess.DEVNULL,
     )
     os.close(child_reads)
     os.close(child_writes)

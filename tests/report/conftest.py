@@ -16,7 +16,13 @@ MARK = (250, 30, 200)  # a color that nothing else on the page has
 def metrics(auc: float, **others: Any) -> dict[str, Any]:
     """Return a metrics.json."""
     add = {"auc": auc, "recall_01d": 90.0, "recall_2cm": 80.0, "median_mm": 4.25}
-    belief = {"entropy": 2.0, "effective_particles": 12.0, "coverage_50": 48.0, "coverage_90": 41.0, "mass_2cm": 0.5}
+    belief = {
+        "entropy": 2.0,
+        "effective_particles": 12.0,
+        "coverage_50": 48.0,
+        "coverage_90": 41.0,
+        "mass_2cm": 0.5,
+    }
     return {
         "instances": 20,
         "missed": 5,
@@ -41,11 +47,23 @@ def run(tmp_path: Path) -> Path:
     (folder / ".hydra").mkdir(parents=True)
     signs = {"off_frame": [0.0, 0.1, 0.625], "pairwise_cosine": 0.95, "offset_r2": 0.5}
     (folder / "metrics.json").write_text(json.dumps(metrics(87.5, signs=signs)))
-    (folder / "data.json").write_text(json.dumps({"objects": ["carton"], "source": "scenes", "root": "data/x"}))
-    config = {"seed": 3, "filter": {"particles": 9, "steps": 14}, "out": "elsewhere", "trainer": {"max_steps": 100}}
+    (folder / "data.json").write_text(
+        json.dumps({"objects": ["carton"], "source": "scenes", "root": "data/x"})
+    )
+    config = {
+        "seed": 3,
+        "filter": {"particles": 9, "steps": 14},
+        "out": "elsewhere",
+        "trainer": {"max_steps": 100},
+    }
     (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
     choices = {"model": "pose_pf", "variant": "working", "loss": "contrast"}
-    hydra = {"hydra": {"runtime": {"choices": choices}, "overrides": {"task": ["filter.particles=9", "seed=3"]}}}
+    hydra = {
+        "hydra": {
+            "runtime": {"choices": choices},
+            "overrides": {"task": ["filter.particles=9", "seed=3"]},
+        }
+    }
     (folder / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(hydra))
     with SummaryWriter(str(folder)) as log:
         for step in range(0, 100, 10):
@@ -59,13 +77,17 @@ def run(tmp_path: Path) -> Path:
         log.add_image("1_poses/overlays", np.zeros((8, 8, 3), np.uint8), 99, dataformats="HWC")
     (folder / "figures").mkdir()
     for name in ("worst_2", "worst_10", "best_0", "validation_overlays"):
-        Image.fromarray(np.full((240, 320, 3), MARK, np.uint8)).save(folder / "figures" / f"{name}.png")
+        Image.fromarray(np.full((240, 320, 3), MARK, np.uint8)).save(
+            folder / "figures" / f"{name}.png"
+        )
     return folder
 
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """Return the folder of a sweep: two numbers of particles, two refinements, three seeds, one run not finished."""
+    """Return the folder of a sweep: two numbers of particles, two refinements, three seeds, one run
+    not finished.
+    """
     folder = tmp_path / "sweep"
     offset = {"none": 0.0, "gradient": 10.0}
     for particles in (50, 1000):
@@ -81,7 +103,10 @@ def sweep(tmp_path: Path) -> Path:
                 written = metrics(auc, overrides=[*said, f"out={own}"])
                 (own / "metrics.json").write_text(json.dumps(written))
     asked = {
-        "hydra": {"sweeper": {"params": {"refine": "none,gradient"}}, "overrides": {"task": ["filter.particles=1000,50"]}}
+        "hydra": {
+            "sweeper": {"params": {"refine": "none,gradient"}},
+            "overrides": {"task": ["filter.particles=1000,50"]},
+        }
     }
     (folder / "multirun.yaml").write_text(yaml.safe_dump(asked))
     return folder

@@ -6,7 +6,12 @@ from pathlib import Path
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.report.diagnostics import collect_numbers, collect_timings, diagnose, format_duration
+from posefilter.report.diagnostics import (
+    collect_numbers,
+    collect_timings,
+    diagnose,
+    format_duration,
+)
 from posefilter.report.events import drop_repeats
 from posefilter.report.gather import read_run
 from posefilter.report.images import group_by_section, sort_by_number
@@ -28,7 +33,9 @@ def test_scalars_and_pictures_are_read(run: Path) -> None:
 
 
 def test_a_resumed_run_is_one_curve() -> None:
-    """What was logged beyond the checkpoint that a run went on from is void, in whatever order the files are read."""
+    """What was logged beyond the checkpoint that a run went on from is void, in whatever order the
+    files are read.
+    """
     first = [(step, 1.0, 10.0 + step) for step in (0, 10, 20, 30)]
     resumed = [(step, 2.0, 100.0 + step) for step in (15, 25)]
     assert drop_repeats([*resumed, *first]).steps == (0, 10, 15, 25)
@@ -37,7 +44,9 @@ def test_a_resumed_run_is_one_curve() -> None:
 
 def test_signs_of_failure_are_found(run: Path) -> None:
     """Those beyond their limits, and no others."""
-    found = {finding.diagnostic.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))}
+    found = {
+        finding.diagnostic.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))
+    }
     assert found["signs/pairwise_cosine"] == (0.95, True)
     assert found["signs/off_frame/last"] == (0.625, True)  # the last step's
     assert found["signs/offset_r2"] == (0.5, False)
@@ -65,7 +74,13 @@ def test_without_a_test_the_last_validation_counts(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gone", "said"), [("figures", "pictures"), ("events", "events"), (".hydra", ".hydra"), ("data.json", "data.json")]
+    ("gone", "said"),
+    [
+        ("figures", "pictures"),
+        ("events", "events"),
+        (".hydra", ".hydra"),
+        ("data.json", "data.json"),
+    ],
 )
 def test_missing_pieces_are_named(run: Path, gone: str, said: str) -> None:
     """A run that lacks a piece is read none the less."""

@@ -1,4 +1,6 @@
-"""Errors image by image: their distribution, how they grow with occlusion, and two runs on the same images."""
+"""Errors image by image: their distribution, how they grow with occlusion, and two runs on the same
+images.
+"""
 
 import json
 import math
@@ -11,9 +13,20 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
-from posefilter.report.comparison_page import judge, make_comparison_page, match_images, read_two_runs
+from posefilter.report.comparison_page import (
+    judge,
+    make_comparison_page,
+    match_images,
+    read_two_runs,
+)
 from posefilter.report.gather import read_run
-from posefilter.report.image_errors import chart_errors, compute_cdf, group_by_visibility, is_found, measure_auc
+from posefilter.report.image_errors import (
+    chart_errors,
+    compute_cdf,
+    group_by_visibility,
+    is_found,
+    measure_auc,
+)
 from posefilter.report.run_page import make_run_page
 
 
@@ -26,7 +39,10 @@ def make_row(number: int, error: float, visibility: float = 1.0) -> ImageError:
 def make_rows(seed: int, count: int = 64, offset: float = 0.0) -> list[ImageError]:
     g = np.random.default_rng(seed)
     errors = g.exponential(10.0, count) + offset
-    return [make_row(i, float(e), float(v)) for i, (e, v) in enumerate(zip(errors, g.uniform(0.2, 1, count), strict=True))]
+    return [
+        make_row(i, float(e), float(v))
+        for i, (e, v) in enumerate(zip(errors, g.uniform(0.2, 1, count), strict=True))
+    ]
 
 
 def test_a_cdf_never_falls_and_ends_at_the_share_within_the_limit() -> None:
@@ -58,7 +74,9 @@ def test_ranges_of_visibility_hold_each_image_once_and_in_order() -> None:
     for before, after in pairwise(parts):
         assert max(row.visibility for row in before) <= min(row.visibility for row in after)
     assert group_by_visibility(rows[:10]) == []  # too few to tell apart
-    (curve,) = (panel for panel in chart_errors({"": rows}) if panel.title.startswith("ADD < 0.1 diameter"))
+    (curve,) = (
+        panel for panel in chart_errors({"": rows}) if panel.title.startswith("ADD < 0.1 diameter")
+    )
     means = np.array(curve.lines[0].y)
     assert np.average(means, weights=[len(part) for part in parts]) == pytest.approx(
         100 * np.mean([is_found(row) for row in rows[:50]])
@@ -75,12 +93,18 @@ def test_the_run_page_shows_them(run: Path) -> None:
     assert ">missed<" in text
     assert "No errors.csv" not in text
     (run / FILE).write_text("a,b\n1,2\n")
-    with pytest.raises(UserError, match=r"errors\.csv: is no table of errors \(column scene_id is missing\)"):
+    with pytest.raises(
+        UserError,
+        match=r"errors\.csv: is no table of errors \(column scene_id is "
+        r"missing\)",
+    ):
         read_run(run)
 
 
 def test_ranges_that_share_images_are_apart(run: Path) -> None:
-    """Rows of one table add up to the images in it; those from a share upwards have a table of their own."""
+    """Rows of one table add up to the images in it; those from a share upwards have a table of
+    their own.
+    """
     metrics = json.loads((run / "metrics.json").read_text())
     own = metrics["by_visibility"].pop("0.3-0.5")
     counts = {"0-0.3": 1, "0.3-0.5": 2, "0.5-0.8": 3, "0.8-1": 4, "0.5-1": 7, "0.6-1": 5}
@@ -123,7 +147,12 @@ def test_images_are_matched_by_name_not_by_place(pair: tuple[Path, Path]) -> Non
 def test_a_comparison_turned_round_is_the_same(pair: tuple[Path, Path]) -> None:
     a, b = read_two_runs(f"{pair[0]},{pair[1]}")
     forth, back = judge(match_images(a.errors, b.errors)), judge(match_images(b.errors, a.errors))
-    assert (forth.a, forth.b, forth.equal, forth.chance) == (back.b, back.a, back.equal, back.chance)
+    assert (forth.a, forth.b, forth.equal, forth.chance) == (
+        back.b,
+        back.a,
+        back.equal,
+        back.chance,
+    )
     alike = judge(match_images(a.errors, a.errors))
     assert (alike.a, alike.b, alike.chance) == (0, 0, 1.0)
 

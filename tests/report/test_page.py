@@ -25,7 +25,9 @@ from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import read_sweep
 
 HOME = Path(__file__).parents[2]
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium is installed (apt-get install chromium)"
+)
 
 
 class Outside(HTMLParser):
@@ -40,7 +42,9 @@ class Outside(HTMLParser):
         """Take in one element."""
         self.pictures += tag == "img"
         for name, value in attrs:
-            if name in ("src", "srcset", "href", "data", "poster") and not (value or "").startswith(("data:", "#")):
+            if name in ("src", "srcset", "href", "data", "poster") and not (value or "").startswith(
+                ("data:", "#")
+            ):
                 self.fetched.append(f"{tag} {name}={value}")
         if tag in ("script", "link", "iframe", "object"):
             self.fetched.append(tag)
@@ -55,7 +59,9 @@ def outside(page: str) -> Outside:
 
 def test_the_page_tells_the_run(run: Path) -> None:
     """Figures, signs, settings, by their values; names are escaped; nothing is fetched."""
-    content = make_run_page(read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x")
+    content = make_run_page(
+        read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x"
+    )
     page, files = content.render(), content.files()
     for text in (
         "87.5",
@@ -105,26 +111,43 @@ HOSTILE = "<script>alert(1)</script>\"'&"
 
 
 def test_a_hostile_name_is_only_words(run: Path) -> None:
-    """Wherever a name, a setting or a caption goes on a page, it is escaped: no element comes of it."""
+    """Wherever a name, a setting or a caption goes on a page, it is escaped: no element comes of
+    it.
+    """
     there = run.rename(run.parent / HOSTILE.replace("/", "|"))
-    (there / "metrics.json").write_text((there / "metrics.json").read_text().replace("contrast", "<script>loss"))
+    (there / "metrics.json").write_text(
+        (there / "metrics.json").read_text().replace("contrast", "<script>loss")
+    )
     page = make_run_page(read_run(there), [Change(HOSTILE, HOSTILE, HOSTILE)], HOSTILE).render()
     assert outside(page).fetched == []
     assert "<script>" not in page
     assert page.count("&lt;script&gt;") >= 6
-    blocks = [Paragraph([HOSTILE, Text(HOSTILE, "code")]), *show_images([StoredImage(HOSTILE, HOSTILE, b"")])]
+    blocks = [
+        Paragraph([HOSTILE, Text(HOSTILE, "code")]),
+        *show_images([StoredImage(HOSTILE, HOSTILE, b"")]),
+    ]
     built = Page(
-        HOSTILE, HOSTILE, [], [Tile(HOSTILE, HOSTILE, HOSTILE)], [HOSTILE], [Section("s", blocks)], Paragraph([HOSTILE])
+        HOSTILE,
+        HOSTILE,
+        [],
+        [Tile(HOSTILE, HOSTILE, HOSTILE)],
+        [HOSTILE],
+        [Section("s", blocks)],
+        Paragraph([HOSTILE]),
     )
     text = built.render()
     assert "<script>" not in text
     assert text.count("&lt;script&gt;") == 10
-    assert "<script>" in Environment(autoescape=False).from_string("{{ name }}").render(name=HOSTILE)  # the check can fail
+    assert "<script>" in Environment(autoescape=False).from_string("{{ name }}").render(
+        name=HOSTILE
+    )  # the check can fail
 
 
 def test_charts_have_both_themes() -> None:
     """The same chart on light and dark paper, at twice the size it is shown."""
-    panel = Panel("Loss", "step", "mm", [Line("a", [0, 1, 2], [3, 2, 1]), Line("b", [0, 1, 2], [1, 2, 3])])
+    panel = Panel(
+        "Loss", "step", "mm", [Line("a", [0, 1, 2], [3, 2, 1]), Line("b", [0, 1, 2], [1, 2, 3])]
+    )
     for theme in (LIGHT, DARK):
         image = np.asarray(Image.open(BytesIO(draw_chart(panel, theme))).convert("RGB"))
         assert image.shape == (500, 760, 3)
@@ -151,7 +174,9 @@ def close_to(picture: np.ndarray, color: tuple[int, int, int]) -> int:
 @needs_browser
 @pytest.mark.slow
 def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
-    """On a desk and on a phone, light and dark: no complaint, every picture there, nothing wider than the window."""
+    """On a desk and on a phone, light and dark: no complaint, every picture there, nothing wider
+    than the window.
+    """
     text = make_run_page(read_run(run), [Change("a.long.key." * 9, "1", "x" * 150)], "x").render()
     (tmp_path / "run.html").write_text(text)
     best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
@@ -161,11 +186,16 @@ def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
             pictures = (tmp_path / f"{name}.html").read_text().count("<img")
             assert pictures >= 5
             for width, dark in ((1200, False), (390, True), (390, False)):
-                page.open((tmp_path / f"{name}.html").as_uri(), width, dark=dark, phone=width == 390)
+                page.open(
+                    (tmp_path / f"{name}.html").as_uri(), width, dark=dark, phone=width == 390
+                )
                 assert page.complaints == []
                 assert page.evaluate("innerWidth") == width
                 assert page.evaluate("document.documentElement.scrollWidth") <= width, (name, width)
-                assert page.evaluate("[...document.images].filter(i => i.naturalWidth > 0).length") == pictures
+                assert (
+                    page.evaluate("[...document.images].filter(i => i.naturalWidth > 0).length")
+                    == pictures
+                )
                 shot = page.picture()
                 assert (shot[5, 5].max() < 40) if dark else (shot[5, 5].min() > 230)
                 assert (np.median(shot) < 60) == dark  # the charts too
@@ -175,7 +205,9 @@ def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
 @needs_browser
 @pytest.mark.slow
 def test_the_browser_notices(run: Path, tmp_path: Path) -> None:
-    """A script that is refused, a broken picture and a line too wide are each seen: the test above can fail."""
+    """A script that is refused, a broken picture and a line too wide are each seen: the test above
+    can fail.
+    """
     text = make_run_page(read_run(run), [], "x").render()
     bad = '<img src="data:image/png;base64,AAAA"><div style="width:700px">x</div><script>1</script></body>'
     (tmp_path / "bad.html").write_text(text.replace("</body>", bad))
@@ -192,7 +224,9 @@ def test_the_command(run: Path, sweep: Path) -> None:
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(HOME / "report.py"), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, cwd=run.parent, timeout=280, check=False)
+        return subprocess.run(
+            command, capture_output=True, text=True, cwd=run.parent, timeout=280, check=False
+        )
 
     done = call(f"run={run}")
     assert done.returncode == 0, done.stderr
@@ -222,4 +256,8 @@ def test_the_sweep_page(sweep: Path) -> None:
     assert "Without a result: filter.particles=1000,refine=none,seed=2" in page
     assert "78.0 to 83.0 (sd 2.5)" in page
     assert outside(page).fetched == []
-    assert {"add-auc-filter-particles.png", "add-auc-refine.png", "add-auc-time-per-image-s.png"} <= set(files)
+    assert {
+        "add-auc-filter-particles.png",
+        "add-auc-refine.png",
+        "add-auc-time-per-image-s.png",
+    } <= set(files)

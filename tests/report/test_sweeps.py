@@ -9,11 +9,19 @@ import pytest
 from posefilter.errors import UserError
 from posefilter.metrics.registry import find_metric
 from posefilter.report.sweep_page import chart_over, format_mean, format_spread, make_sweep_page
-from posefilter.report.sweeps import find_best_group, find_best_job, find_ties, group_jobs, read_sweep
+from posefilter.report.sweeps import (
+    find_best_group,
+    find_best_job,
+    find_ties,
+    group_jobs,
+    read_sweep,
+)
 
 
 def test_axes_groups_and_best(sweep: Path) -> None:
-    """Runs that differ in their seed are one group; numbers are sorted by size, names as they were asked for."""
+    """Runs that differ in their seed are one group; numbers are sorted by size, names as they were
+    asked for.
+    """
     found = read_sweep(sweep)
     assert found.axes == ["filter.particles", "refine", "seed"]  # `out` differs too, and is none
     assert found.shown == ["filter.particles", "refine"]
@@ -40,7 +48,9 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     assert list(gradient.low) == pytest.approx([68.5, 78.0])
     assert list(gradient.high) == pytest.approx([73.5, 83.0])
     assert panel.log_x
-    assert chart_over("refine", found, group_jobs(found), [find_metric("add/auc")])[0].categories == ["none", "gradient"]
+    assert chart_over("refine", found, group_jobs(found), [find_metric("add/auc")])[
+        0
+    ].categories == ["none", "gradient"]
 
 
 def test_cells() -> None:
@@ -54,7 +64,10 @@ def test_cells() -> None:
 
 def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
     """To one decimal: a hundredth of a point more is no better, a tenth is."""
-    best, other = (sweep / f"filter.particles=1000,refine=gradient,seed={seed}" / "metrics.json" for seed in (2, 1))
+    best, other = (
+        sweep / f"filter.particles=1000,refine=gradient,seed={seed}" / "metrics.json"
+        for seed in (2, 1)
+    )
     first, second = json.loads(best.read_text()), json.loads(other.read_text())
     for auc, median, seed, ties in ((82.98, 2.0, 1, 2), (82.98, 9.0, 2, 2), (82.8, 2.0, 2, 1)):
         second["add"] |= {"auc": auc, "median_mm": median}
@@ -62,7 +75,9 @@ def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
         found = read_sweep(sweep)
         assert find_best_job(found).place["seed"] == seed
         assert find_ties(found) == ties
-        assert ("least median ADD" in make_sweep_page(found, None, None, "x").render()) == (ties > 1)
+        assert ("least median ADD" in make_sweep_page(found, None, None, "x").render()) == (
+            ties > 1
+        )
     assert first["add"]["auc"] == 83.0
 
 

@@ -1,4 +1,6 @@
-"""A watch over what the interpreter does, and a small checkpoint of a real method to make hostile ones of."""
+"""A watch over what the interpreter does, and a small checkpoint of a real method to make hostile
+ones of.
+"""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -8,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from posefilter.run.command import compose_job
-from posefilter.run.method import build_method, recipe
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
 from posefilter.types import ObjectModel
 
 HOME = Path(__file__).parents[2]
@@ -37,7 +39,9 @@ _ALWAYS = (  # that no loading of a file has to do with
 
 
 class Watch:
-    """Writes down forbidden events while it is armed: processes, connections, writes, hostile imports, reads of secrets."""
+    """Writes down forbidden events while it is armed: processes, connections, writes, hostile
+    imports, reads of secrets.
+    """
 
     def __init__(self, secret: Path) -> None:
         self.armed, self.secret, self.seen = False, secret, list[str]()
@@ -47,14 +51,20 @@ class Watch:
     def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
         if not self.armed:
             return
-        if event in _ALWAYS and "__pycache__" not in str(arguments[:1]) and arguments[:1] != (None,):
+        if (
+            event in _ALWAYS
+            and "__pycache__" not in str(arguments[:1])
+            and arguments[:1] != (None,)
+        ):
             self.seen.append(f"{event} {arguments!r:.120}")
         elif event == "import" and str(arguments[0]).startswith("hostile"):
             self.seen.append(f"import {arguments[0]}")
         elif event == "open" and isinstance(arguments[0], str | bytes | Path):
             path, mode = str(arguments[0]), str(arguments[1] or "")
             own = self.own is not None and Path(path).resolve().is_relative_to(self.own)
-            if (set(mode) & set("wax+") and "__pycache__" not in path and not own) or str(self.secret) in path:
+            if (set(mode) & set("wax+") and "__pycache__" not in path and not own) or str(
+                self.secret
+            ) in path:
                 self.seen.append(f"open {path} {mode}")
 
     def __enter__(self) -> "Watch":
@@ -76,7 +86,9 @@ def secret(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def watch(secret: Path) -> Iterator[Watch]:
-    """Return the watch; at the end of the test nothing may have been seen, and the secret be as it was."""
+    """Return the watch; at the end of the test nothing may have been seen, and the secret be as it
+    was.
+    """
     watching = Watch(secret)
     yield watching
     watching.armed = False
@@ -88,7 +100,9 @@ def watch(secret: Path) -> Iterator[Watch]:
 @pytest.fixture(scope="session")
 def _good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("good")
-    job = compose_job("train", HOME / "conf", ["model=cnn_patch", "debug=smoke", "filter.particles=8"], folder)
+    job = compose_job(
+        "train", HOME / "conf", ["model=cnn_patch", "debug=smoke", "filter.particles=8"], folder
+    )
     points = torch.rand(50, 3)
     model = ObjectModel("carton", points, points.mean(0), 0.5, 1.0, torch.eye(4)[None], points[:8])
     method = build_method(recipe(job), model)

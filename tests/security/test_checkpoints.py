@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
+from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.errors import UserError
-from posefilter.run.method import method_of, read_checkpoint
 
 Save = Callable[[dict[str, Any]], Path]
 
@@ -28,7 +28,9 @@ class Harm:
         return os.system, (self.command,)
 
 
-def rewritten(path: Path, change: Callable[[zipfile.ZipFile, zipfile.ZipInfo, bytes], None]) -> Path:
+def rewritten(
+    path: Path, change: Callable[[zipfile.ZipFile, zipfile.ZipInfo, bytes], None]
+) -> Path:
     """Write an archive anew, part by part."""
     with zipfile.ZipFile(path) as archive:
         parts = [(info, archive.read(info)) for info in archive.infolist()]
@@ -118,7 +120,11 @@ ARCHIVES = (pickled, compressed, linked, above, absolute, twice, overlapping, le
 
 @pytest.mark.parametrize("make", ARCHIVES, ids=lambda make: make.__name__)
 def test_a_hostile_archive_is_refused(
-    make: Callable[[Path, Path], Path], content: dict[str, Any], save: Save, secret: Path, watch: Any
+    make: Callable[[Path, Path], Path],
+    content: dict[str, Any],
+    save: Save,
+    secret: Path,
+    watch: Any,
 ) -> None:
     path = make(save(content), secret)
     with watch, pytest.raises(UserError, match="checkpoint=") as told:
@@ -135,7 +141,9 @@ def claims_more(path: Path) -> Path:
     old, new = b"\x4d" + (4242).to_bytes(2, "little"), b"\x8a\x06" + (1 << 40).to_bytes(6, "little")
 
     def change(archive: zipfile.ZipFile, info: zipfile.ZipInfo, data: bytes) -> None:
-        archive.writestr(info.filename, data.replace(old, new) if info.filename.endswith("data.pkl") else data)
+        archive.writestr(
+            info.filename, data.replace(old, new) if info.filename.endswith("data.pkl") else data
+        )
 
     return rewritten(path, change)
 
@@ -149,9 +157,15 @@ def laughs() -> list[Any]:
 
 CONTENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "strides": lambda c: c["state_dict"].update({"x": large_by_strides()}),
-    "strides in the object": lambda c: c["object_model"].update(points=torch.zeros(1).expand(1 << 40, 3)),
-    "strides in the optimizer": lambda c: c.update(optimizer_states=[{"state": {0: large_by_strides()}}]),
-    "sparse": lambda c: c["state_dict"].update(x=torch.sparse_coo_tensor(torch.zeros(1, 1).long(), [1.0], (1 << 40,))),
+    "strides in the object": lambda c: c["object_model"].update(
+        points=torch.zeros(1).expand(1 << 40, 3)
+    ),
+    "strides in the optimizer": lambda c: c.update(
+        optimizer_states=[{"state": {0: large_by_strides()}}]
+    ),
+    "sparse": lambda c: c["state_dict"].update(
+        x=torch.sparse_coo_tensor(torch.zeros(1, 1).long(), [1.0], (1 << 40,))
+    ),
     "no storage": lambda c: c["state_dict"].update(x=torch.empty(1 << 40, device="meta")),
     "no tensor": lambda c: c["state_dict"].update(x=[1]),
     "many values": lambda c: c.update(loops=laughs()),
@@ -169,7 +183,9 @@ CONTENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
 
 
 @pytest.mark.parametrize("what", CONTENTS)
-def test_hostile_contents_are_refused(what: str, content: dict[str, Any], save: Save, watch: Any) -> None:
+def test_hostile_contents_are_refused(
+    what: str, content: dict[str, Any], save: Save, watch: Any
+) -> None:
     CONTENTS[what](content)
     path = save(content)
     with watch, pytest.raises(UserError, match="checkpoint") as told:

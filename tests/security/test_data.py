@@ -1,4 +1,6 @@
-"""Datasets, meshes, caches and archives are data: none leads out of its folder, or promises more than can be held."""
+"""Datasets, meshes, caches and archives are data: none leads out of its folder, or promises more
+than can be held.
+"""
 
 import io
 import json
@@ -15,23 +17,29 @@ import cv2
 import numpy as np
 import pytest
 
-from posefilter.data import decode
 from posefilter.data.cache import DiskCache
-from posefilter.data.decode import read_color, read_depth, read_json, read_label
 from posefilter.data.download import unpack
-from posefilter.data.generate import generate
-from posefilter.data.mesh_files import read_mesh
 from posefilter.data.points import model_points
-from posefilter.data.readers import open_reader
+from posefilter.data.readers.decode import read_color, read_depth, read_json, read_label
+from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
+from posefilter.meshes.files import read_mesh
+from posefilter.synthetic.generate import generate
 
 
 def png(width: int, height: int) -> bytes:
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 100))
+        + chunk(b"IEND", b"")
+    )
 
 
 def jpeg(width: int, height: int) -> bytes:
@@ -59,20 +67,28 @@ PICTURES = {
 
 @pytest.mark.parametrize("kind", PICTURES)
 @pytest.mark.parametrize(
-    "read", [read_color, lambda path: read_depth(path, 1000), read_label], ids=["color", "depth", "label"]
+    "read",
+    [read_color, lambda path: read_depth(path, 1000), read_label],
+    ids=["color", "depth", "label"],
 )
 def test_an_image_of_too_many_pixels_is_not_decoded(
-    kind: str, read: Callable[[Path], Any], tmp_path: Path, watch: Any, monkeypatch: pytest.MonkeyPatch
+    kind: str,
+    read: Callable[[Path], Any],
+    tmp_path: Path,
+    watch: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path = tmp_path / "image.png"
     path.write_bytes(PICTURES[kind])
-    monkeypatch.setattr(decode.cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
     with watch, pytest.raises(UserError, match=r"image\.png") as told:
         read(path)
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "\0", "[1"], ids=["lists", "mappings", "zero", "cut"])
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"a":' * 100_000, "\0", "[1"], ids=["lists", "mappings", "zero", "cut"]
+)
 def test_hostile_json_is_refused(text: str, tmp_path: Path, watch: Any) -> None:
     (tmp_path / "x.json").write_text(text)
     with watch, pytest.raises(UserError, match=r"x\.json") as told:
@@ -92,7 +108,16 @@ def test_a_file_of_enormous_size_is_not_read(tmp_path: Path, watch: Any) -> None
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("scenes") / "carton"
-    generate(out, 2, object="carton", workers=1, size=(64, 48), distractors=(0, 1), frames_per_scene=2, progress=False)
+    generate(
+        out,
+        2,
+        object="carton",
+        workers=1,
+        size=(64, 48),
+        distractors=(0, 1),
+        frames_per_scene=2,
+        progress=False,
+    )
     return out
 
 
@@ -110,7 +135,9 @@ def read_all(root: Path) -> None:
         reader.read(i)
 
 
-@pytest.mark.parametrize("ending", ["left.jpg", "left.depth.png", "left.seg.png", "left.json", "_object_settings.json"])
+@pytest.mark.parametrize(
+    "ending", ["left.jpg", "left.depth.png", "left.seg.png", "left.json", "_object_settings.json"]
+)
 @pytest.mark.parametrize("way", ["absolute", "relative"])
 def test_a_datasets_link_that_leads_out_is_not_followed(
     ending: str, way: str, scenes: Path, secret: Path, watch: Any
@@ -124,8 +151,12 @@ def test_a_datasets_link_that_leads_out_is_not_followed(
     assert "\n" not in str(told.value)
 
 
-def test_a_linked_folder_ofrendered_is_not_followed(scenes: Path, rendered: Path, watch: Any) -> None:
-    (scenes / "hostile").symlink_to(next(path.parent for path in rendered.rglob("_object_settings.json")))
+def test_a_linked_folder_ofrendered_is_not_followed(
+    scenes: Path, rendered: Path, watch: Any
+) -> None:
+    (scenes / "hostile").symlink_to(
+        next(path.parent for path in rendered.rglob("_object_settings.json"))
+    )
     with watch, pytest.raises(UserError, match="leads out of"):
         open_reader("fat", scenes)
 
@@ -166,7 +197,11 @@ def test_a_list_of_frames_names_frames(stem: str, tmp_path: Path, watch: Any) ->
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("truth", [{"../../x": []}, {"-1": []}, [], {"١": 1, "x": 2}], ids=["path", "sign", "list", "word"])
+@pytest.mark.parametrize(
+    "truth",
+    [{"../../x": []}, {"-1": []}, [], {"١": 1, "x": 2}],
+    ids=["path", "sign", "list", "word"],
+)
 def test_bop_records_are_by_number(truth: Any, tmp_path: Path, watch: Any) -> None:
     folder = tmp_path / "test" / "000001"
     folder.mkdir(parents=True)
@@ -177,7 +212,9 @@ def test_bop_records_are_by_number(truth: Any, tmp_path: Path, watch: Any) -> No
     assert "\n" not in str(told.value)
 
 
-def test_a_link_for_a_cache_is_not_written_through(secret: Path, tmp_path: Path, watch: Any) -> None:
+def test_a_link_for_a_cache_is_not_written_through(
+    secret: Path, tmp_path: Path, watch: Any
+) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / ".cache").symlink_to(secret)
     with watch, pytest.raises(UserError, match="leads out of"):
@@ -244,14 +281,18 @@ ARCHIVES: dict[str, Callable[[Path, Path], Path]] = {
     "tar above": lambda path, secret: tarred(path, name="../secret/x"),
     "tar absolute": lambda path, secret: tarred(path, name=f"{secret}/x"),
     "tar link": lambda path, secret: tarred(path, type=tarfile.SYMTYPE, linkname=str(secret)),
-    "tar hard link": lambda path, secret: tarred(path, type=tarfile.LNKTYPE, linkname="../secret/file.txt"),
+    "tar hard link": lambda path, secret: tarred(
+        path, type=tarfile.LNKTYPE, linkname="../secret/file.txt"
+    ),
     "tar device": lambda path, secret: tarred(path, type=tarfile.CHRTYPE),
     "tar bomb": lambda path, secret: tarred(path, data=bytes(50 << 20)),
 }
 
 
 @pytest.mark.parametrize("what", ARCHIVES)
-def test_a_hostile_archive_is_not_unpacked(what: str, secret: Path, tmp_path: Path, watch: Any) -> None:
+def test_a_hostile_archive_is_not_unpacked(
+    what: str, secret: Path, tmp_path: Path, watch: Any
+) -> None:
     archive = ARCHIVES[what](tmp_path / "hostile", secret)
     with watch, pytest.raises(UserError) as told:
         unpack(archive, tmp_path / "out")

@@ -1,4 +1,6 @@
-"""A recipe is data: it calls nothing, reads no environment, chooses no place, and is no larger than a method's."""
+"""A recipe is data: it calls nothing, reads no environment, chooses no place, and is no larger than
+a method's.
+"""
 
 import json
 import os
@@ -9,11 +11,11 @@ from typing import Any
 import pytest
 import torch
 
+from posefilter.cli import run_command
+from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
+from posefilter.cli.command import compose_job, register_resolvers
+from posefilter.cli.evaluate import data_settings
 from posefilter.errors import UserError
-from posefilter.run import run_command
-from posefilter.run.command import compose_job, register_resolvers
-from posefilter.run.evaluate import data_settings
-from posefilter.run.method import build_method, method_of, read_checkpoint, recipe
 
 HOME = Path(__file__).parents[2]
 Save = Callable[[dict[str, Any]], Path]
@@ -68,10 +70,17 @@ def test_a_hostile_recipe_is_refused(
 
 
 @pytest.mark.parametrize("key", ["widths", "blocks"])
-def test_a_method_larger_than_its_weights_is_not_allocated(key: str, content: dict[str, Any], save: Save) -> None:
-    """Nothing is filled before the weights are seen not to fit: 8 GB here, and a million blocks there."""
+def test_a_method_larger_than_its_weights_is_not_allocated(
+    key: str, content: dict[str, Any], save: Save
+) -> None:
+    """Nothing is filled before the weights are seen not to fit: 8 GB here, and a million blocks
+    there.
+    """
     settings = content["recipe"]["settings"]
-    large = {"widths": {"in_features": 50_000, "out_features": 40_000}, "blocks": {"in_features": 1000, "out_features": 900}}
+    large = {
+        "widths": {"in_features": 50_000, "out_features": 40_000},
+        "blocks": {"in_features": 1000, "out_features": 900},
+    }
     node = {"_target_": "torch.nn.Linear", **large[key]}
     settings["model"] = {**settings["model"], "loss": [node] * (1 if key == "widths" else 50)}
     path = save(content)
@@ -85,7 +94,9 @@ def test_the_good_checkpoint_is_read(good: Path, watch: Any) -> None:
     assert method.model.name == "carton"
 
 
-def test_what_the_user_resolves_is_resolved_before_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_user_resolves_is_resolved_before_it_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOSTILE", "0.125")
     job = compose_job("train", HOME / "conf", [], tmp_path)
     job.cfg.optimizer.lr = "${oc.decode:${oc.env:HOSTILE}}"
@@ -97,7 +108,10 @@ def test_what_the_user_resolves_is_resolved_before_it_is_kept(tmp_path: Path, mo
 
 def test_older_checkpoints_select(content: dict[str, Any], save: Save) -> None:
     settings = content["recipe"]["settings"]
-    settings["variant"] = {"there": "${oc.select:filter.particles,0}", "absent": "${oc.select:no.such,7}"}
+    settings["variant"] = {
+        "there": "${oc.select:filter.particles,0}",
+        "absent": "${oc.select:no.such,7}",
+    }
     kept = read_checkpoint(save(content))["recipe"]["settings"]["variant"]
     assert kept == {"there": "${filter.particles}", "absent": 7}
 
@@ -114,9 +128,14 @@ DATA: dict[str, dict[str, Any]] = {
     "cache above": {"cache_dir": "../secret"},
     "cache on disk": {"cache": "disk"},
     "list of frames": {"options": {"frames": "{secret}/file.txt"}},
-    "generator's place": {"generate": {"_target_": "posefilter.data.generate.generate", "out": "{secret}/x"}},
-    "another target": {"_target_": "posefilter.run.command.os.system", "command": "touch {secret}/x"},
-    "another generator": {"generate": {"_target_": "posefilter.run.command.os.system"}},
+    "generator's place": {
+        "generate": {"_target_": "posefilter.synthetic.generate.generate", "out": "{secret}/x"}
+    },
+    "another target": {
+        "_target_": "posefilter.cli.command.os.system",
+        "command": "touch {secret}/x",
+    },
+    "another generator": {"generate": {"_target_": "posefilter.cli.command.os.system"}},
     "an address": {"meshes": "http://127.0.0.1:9/x"},
     "a share": {"meshes": "\\\\host\\share"},
 }
@@ -144,7 +163,11 @@ def test_a_recipe_chooses_no_place(
     (work / "outputs" / "data" / "mine").mkdir(parents=True)
     (work / "link").symlink_to(secret)
     monkeypatch.chdir(work)
-    own = {"_target_": "posefilter.data.module.PoseDataModule", "source": "fat", "root": "outputs/data/mine"}
+    own = {
+        "_target_": "posefilter.data.module.PoseDataModule",
+        "source": "fat",
+        "root": "outputs/data/mine",
+    }
     content["recipe"]["settings"]["data"] = own | filled(DATA[what], secret)
     path = save(content)
     checkpoint = read_checkpoint(path)
@@ -152,15 +175,25 @@ def test_a_recipe_chooses_no_place(
     with watch, pytest.raises(UserError, match=r"^data\.") as told:
         data_settings(job, checkpoint["recipe"]["settings"], "carton")
     assert "\n" not in str(told.value)
-    assert run_command("evaluate", HOME, [f"checkpoint={path}", "console=plain", f"out={tmp_path / 'out'}"]) == 2
+    assert (
+        run_command(
+            "evaluate", HOME, [f"checkpoint={path}", "console=json", f"out={tmp_path / 'out'}"]
+        )
+        == 2
+    )
     assert capfd.readouterr().err.strip().splitlines()[-1] == f"evaluate: {told.value}"
 
 
 def test_the_users_own_run_and_what_the_user_types_count(
-    content: dict[str, Any], save: Save, secret: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    content: dict[str, Any],
+    save: Save,
+    secret: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (tmp_path / "disk").mkdir()
-    (tmp_path / "outputs").symlink_to(tmp_path / "disk")  # a larger disk's, of the user's own making
+    # a larger disk's, of the user's own making
+    (tmp_path / "outputs").symlink_to(tmp_path / "disk")
     monkeypatch.chdir(tmp_path)
     own = {
         "_target_": "posefilter.data.module.PoseDataModule",
@@ -196,7 +229,12 @@ RESUMED = {
 
 @pytest.mark.parametrize("override", RESUMED)
 def test_a_resumed_run_brings_settings_alone(
-    override: str, secret: Path, watch: Any, tmp_path: Path, good: Path, capfd: pytest.CaptureFixture[str]
+    override: str,
+    secret: Path,
+    watch: Any,
+    tmp_path: Path,
+    good: Path,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     run = tmp_path / "run"
     (run / ".hydra").mkdir(parents=True)
@@ -205,22 +243,33 @@ def test_a_resumed_run_brings_settings_alone(
     typed = override.replace("{secret}", str(secret))
     (run / ".hydra" / "overrides.yaml").write_text(json.dumps(["model=cnn_patch", typed]))
     with watch:
-        assert run_command("train", HOME, [f"resume={run}", "console=plain"]) == 2
+        assert run_command("train", HOME, [f"resume={run}", "console=json"]) == 2
     said = capfd.readouterr().err.strip().splitlines()
     assert len(said) == 1
     assert RESUMED[override] in said[0]
 
 
 def test_what_a_resumed_run_brings_may_be_typed_again(tmp_path: Path, good: Path) -> None:
-    from posefilter.run.resume import with_resumed
+    from posefilter.cli.resume import with_resumed
 
     (tmp_path / ".hydra").mkdir()
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "last.ckpt").write_bytes(good.read_bytes())
-    brought = ["model=cnn_patch", "data.root=/foreign", "plugins=[hostile_plugin]", "data.split={train: 0.6, val: 0.4}"]
+    brought = [
+        "model=cnn_patch",
+        "data.root=/foreign",
+        "plugins=[hostile_plugin]",
+        "data.split={train: 0.6, val: 0.4}",
+    ]
     (tmp_path / ".hydra" / "overrides.yaml").write_text(json.dumps(brought))
     found = with_resumed([f"resume={tmp_path}", "data.root=/mine"])
-    assert found == [brought[0], brought[3], f"resume={tmp_path}", "data.root=/mine", f"out={tmp_path}"]
+    assert found == [
+        brought[0],
+        brought[3],
+        f"resume={tmp_path}",
+        "data.root=/mine",
+        f"out={tmp_path}",
+    ]
 
 
 def test_a_run_whose_files_are_links_is_not_written_to(
@@ -232,18 +281,25 @@ def test_a_run_whose_files_are_links_is_not_written_to(
     torch.save(content, run / "checkpoints" / "best.ckpt")
     watch.own = run
     with watch:
-        assert run_command("evaluate", HOME, [f"checkpoint={run}/checkpoints/best.ckpt", "console=plain"]) == 2
+        assert (
+            run_command(
+                "evaluate", HOME, [f"checkpoint={run}/checkpoints/best.ckpt", "console=json"]
+            )
+            == 2
+        )
     (run / "metrics.json").write_text("{}")
     (run / "report").symlink_to(secret)
     with watch:
-        assert run_command("report", HOME, [f"run={run}", "console=plain"]) == 2
+        assert run_command("report", HOME, [f"run={run}", "console=json"]) == 2
 
 
 @pytest.mark.parametrize("where", ["dirpath told", "dirpath left out"])
-def test_a_resumed_checkpoint_names_no_file_to_delete(where: str, tmp_path: Path, secret: Path) -> None:
+def test_a_resumed_checkpoint_names_no_file_to_delete(
+    where: str, tmp_path: Path, secret: Path
+) -> None:
     from lightning import Trainer
 
-    from posefilter.run.build import instantiate
+    from posefilter.cli.instantiate import instantiate
 
     folder = tmp_path / "run" / "checkpoints"
     folder.mkdir(parents=True)
@@ -253,7 +309,9 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(where: str, tmp_path: Path
     job.cfg.folder = str(tmp_path / "run")
     victims = [f"{folder}/../../secret/file.txt", str(secret / "file.txt"), "memory://x/y.ckpt"]
     for callback in instantiate(job.cfg.callbacks, "callbacks").values():
-        callback.setup(Trainer(logger=False, accelerator="cpu", enable_progress_bar=False), None, "fit")  # type: ignore[arg-type]
+        callback.setup(
+            Trainer(logger=False, accelerator="cpu", enable_progress_bar=False), None, "fit"
+        )  # type: ignore[arg-type]
         for victim in victims:
             state = {
                 "best_model_score": torch.tensor(-1.0),
@@ -261,9 +319,14 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(where: str, tmp_path: Path
                 "last_model_path": victim,
                 "kth_best_model_path": victim,
                 "kth_value": torch.tensor(-1.0),
-                "best_k_models": {victim: torch.tensor(-1.0), str(folder / "old.ckpt"): torch.tensor(-1.0)},
+                "best_k_models": {
+                    victim: torch.tensor(-1.0),
+                    str(folder / "old.ckpt"): torch.tensor(-1.0),
+                },
             }
-            callback.load_state_dict(state | ({"dirpath": str(folder)} if where == "dirpath told" else {}))
+            callback.load_state_dict(
+                state | ({"dirpath": str(folder)} if where == "dirpath told" else {})
+            )
             kept = [
                 callback.best_model_path,
                 callback.last_model_path,

@@ -8,47 +8,68 @@ from typing import Any
 import pytest
 import torch
 
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.instantiate import instantiate
 from posefilter.errors import UserError
-from posefilter.run.build import instantiate
-from posefilter.run.method import method_of, read_checkpoint
 
 Save = Callable[[dict[str, Any]], Path]
 # Each would do harm if it were called: {secret} is the folder that nobody may touch.
 ROUTES: dict[str, dict[str, Any]] = {
     "os.system": {"command": "touch {secret}/x"},
-    "posefilter.run.command.os.system": {"command": "touch {secret}/x"},
-    "posefilter.run.machine.subprocess.run": {"args": ["touch", "{secret}/x"]},
-    "posefilter.run.machine.subprocess.Popen": {"args": ["touch", "{secret}/x"]},
-    "posefilter.run.command.importlib.import_module": {"name": "hostile_module"},
-    "posefilter.run.build.importlib.import_module": {"name": "hostile_module"},
-    "posefilter.run.build.functools.partial": {},
-    "posefilter.run.evaluate.shutil.copy2": {"src": "{secret}/file.txt", "dst": "{secret}/x"},
-    "posefilter.run.results.write_json": {"path": "{secret}/x", "content": 1},
-    "posefilter.data.decode.read_bytes": {"path": "{secret}/file.txt"},
-    "posefilter.data.mesh_files.trimesh.load": {"file_obj": "{secret}/file.txt"},
-    "posefilter.data.download.fetch": {"url": "http://127.0.0.1:9/x", "path": "{secret}/x", "retries": 0},
+    "posefilter.cli.command.os.system": {"command": "touch {secret}/x"},
+    "posefilter.cli.machine.subprocess.run": {"args": ["touch", "{secret}/x"]},
+    "posefilter.cli.machine.subprocess.Popen": {"args": ["touch", "{secret}/x"]},
+    "posefilter.cli.command.importlib.import_module": {"name": "hostile_module"},
+    "posefilter.cli.instantiate.importlib.import_module": {"name": "hostile_module"},
+    "posefilter.cli.instantiate.functools.partial": {},
+    "posefilter.cli.evaluate.shutil.copy2": {"src": "{secret}/file.txt", "dst": "{secret}/x"},
+    "posefilter.cli.results.write_json": {"path": "{secret}/x", "content": 1},
+    "posefilter.limits.read_bytes": {"path": "{secret}/file.txt"},
+    "posefilter.meshes.files.trimesh.load": {"file_obj": "{secret}/file.txt"},
+    "posefilter.data.download.fetch": {
+        "url": "http://127.0.0.1:9/x",
+        "path": "{secret}/x",
+        "retries": 0,
+    },
     "posefilter.data.download.unpack": {"archive": "{secret}/file.txt", "folder": "{secret}/x"},
     "posefilter.nets.resnet.torch.load": {"f": "{secret}/file.txt", "weights_only": False},
-    "posefilter.nets.resnet.torch.hub.load": {"repo_or_dir": "{secret}", "model": "x", "source": "local"},
-    "posefilter.models.pose_pf.PosePF.load_from_checkpoint": {"checkpoint_path": "{secret}/file.txt"},
+    "posefilter.nets.resnet.torch.hub.load": {
+        "repo_or_dir": "{secret}",
+        "model": "x",
+        "source": "local",
+    },
+    "posefilter.models.pose_pf.PosePF.load_from_checkpoint": {
+        "checkpoint_path": "{secret}/file.txt"
+    },
     "posefilter.nets.mlp.__builtins__": {},
     "torch.os.system": {"command": "touch {secret}/x"},
     "torch.load": {"f": "{secret}/file.txt", "weights_only": False},
     "torch.save": {"obj": 1, "f": "{secret}/x"},
     "torch.hub.load": {"repo_or_dir": "{secret}", "model": "x", "source": "local"},
     "torch.hub.download_url_to_file": {"url": "http://127.0.0.1:9/x", "dst": "{secret}/x"},
-    "torch.utils.cpp_extension.load_inline": {"name": "hostile", "cpp_sources": "int x;", "build_directory": "{secret}"},
+    "torch.utils.cpp_extension.load_inline": {
+        "name": "hostile",
+        "cpp_sources": "int x;",
+        "build_directory": "{secret}",
+    },
     "torch.utils.collect_env.run": {"command": "touch {secret}/x"},
     "torch.package.PackageImporter": {"file_or_buffer": "{secret}/file.txt"},
     "lightning.pytorch.core.saving.os.system": {"command": "touch {secret}/x"},
     "lightning.fabric.utilities.cloud_io._load": {"path_or_url": "{secret}/file.txt"},
-    "lightning.pytorch.core.saving.save_hparams_to_yaml": {"config_yaml": "{secret}/x", "hparams": {}},
+    "lightning.pytorch.core.saving.save_hparams_to_yaml": {
+        "config_yaml": "{secret}/x",
+        "hparams": {},
+    },
     "posefilterx.hostile": {},
     "hostile_module.Thing": {},
     "builtins.exec": {"source": "1"},
 }
 ONLY_THE_USERS: dict[str, dict[str, Any]] = {  # that settings may build, and a checkpoint may not
-    "posefilter.data.generate.generate": {"out": "{secret}/x", "frames": 1, "object": "carton"},
+    "posefilter.synthetic.generate.generate": {
+        "out": "{secret}/x",
+        "frames": 1,
+        "object": "carton",
+    },
     "posefilter.data.module.PoseDataModule": {"source": "fat", "root": "{secret}"},
     "lightning.Trainer": {"default_root_dir": "{secret}", "logger": False},
     "lightning.pytorch.loggers.TensorBoardLogger": {"save_dir": "{secret}"},
@@ -86,7 +107,9 @@ def test_a_recipe_reaches_components_alone(
 ) -> None:
     settings = content["recipe"]["settings"]
     node = {"_target_": name, **filled({**ROUTES, **ONLY_THE_USERS}[name], secret)}
-    settings["model"] = node if place == "model" else {**settings["model"], "loss": [{"deep": node}]}
+    settings["model"] = (
+        node if place == "model" else {**settings["model"], "loss": [{"deep": node}]}
+    )
     path = save(content)
     with watch, pytest.raises(UserError) as told:
         method_of(read_checkpoint(path))
@@ -97,7 +120,10 @@ def test_a_recipe_reaches_components_alone(
 def test_a_plug_in_is_not_trusted_because_a_checkpoint_says_so(
     partial: bool, content: dict[str, Any], save: Save, watch: Any
 ) -> None:
-    content["recipe"]["settings"]["loss"] = {"_target_": "hostile_plugin.Thing", "_partial_": partial}
+    content["recipe"]["settings"]["loss"] = {
+        "_target_": "hostile_plugin.Thing",
+        "_partial_": partial,
+    }
     path = save(content)
     with watch, pytest.raises(UserError, match="plugins"):
         method_of(read_checkpoint(path))
@@ -114,8 +140,10 @@ def test_a_component_that_is_no_method_is_told(content: dict[str, Any], save: Sa
 
 
 def test_weights_that_a_recipe_names_are_not_read(secret: Path, watch: Any) -> None:
-    """A trunk's own weights are in the checkpoint: the file, or address, that it was started from is not looked at."""
-    from posefilter.run.recipe import without_pretrained
+    """A trunk's own weights are in the checkpoint: the file, or address, that it was started from
+    is not looked at.
+    """
+    from posefilter.cli.recipe import without_pretrained
 
     for weights in (f"{secret}/file.txt", "http://127.0.0.1:9/resnet.pth"):
         node = {"_target_": "posefilter.nets.resnet.ResNet", "kind": "resnet18", "weights": weights}

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from posefilter.cli import command, run_command, trust
+from posefilter.cli.instantiate import instantiate, instantiate_recipe, locate
 from posefilter.errors import UserError
-from posefilter.run import command, run_command, trust
-from posefilter.run.build import instantiate, instantiate_recipe, locate
 
 HOME = Path(__file__).parents[2]
 SOURCE = """
@@ -48,14 +48,18 @@ def test_what_a_trusted_package_defines_is_built(package: str) -> None:
         instantiate({"_target_": "my_plugin.pieces.Owm"}, "loss")
 
 
-@pytest.mark.parametrize("name", ["my_plugin.pieces.os.system", "my_plugin.pieces.Linear", "my_plugin_two.x.Own"])
+@pytest.mark.parametrize(
+    "name", ["my_plugin.pieces.os.system", "my_plugin.pieces.Linear", "my_plugin_two.x.Own"]
+)
 def test_what_it_imports_is_not(name: str, package: str) -> None:
     trust.trust(package)
     with pytest.raises(UserError):
         locate(name, "loss")
 
 
-@pytest.mark.parametrize("name", ["os", "subprocess", "torch", "posefilter.run", "not a name", "", "../x"])
+@pytest.mark.parametrize(
+    "name", ["os", "subprocess", "torch", "posefilter.cli", "not a name", "", "../x"]
+)
 def test_some_packages_cannot_be_plug_ins(name: str, package: str) -> None:
     with pytest.raises(UserError, match="plugins="):
         trust.trust(name)
@@ -67,33 +71,55 @@ def test_an_installed_entry_point_is_trusted(package: str, monkeypatch: pytest.M
         value = "my_plugin"
 
     trust._installed.cache_clear()
-    monkeypatch.setattr(trust, "entry_points", lambda group: [Point()] if group == "posefilter.plugins" else [])
+    monkeypatch.setattr(
+        trust, "entry_points", lambda group: [Point()] if group == "posefilter.plugins" else []
+    )
     assert trust.is_plugin("my_plugin.pieces.Own")
     trust._installed.cache_clear()
 
 
-def test_the_command_line_names_them(package: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for wanted, told in (("[nowhere_at_all]", "there is no package"), ("[os]", "of your own"), ("7", "must be a list")):
-        assert run_command("train", HOME, [f"out={tmp_path}", f"plugins={wanted}", "loss=add", "console=plain"]) == 2
+def test_the_command_line_names_them(
+    package: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for wanted, told in (
+        ("[nowhere_at_all]", "there is no package"),
+        ("[os]", "of your own"),
+        ("7", "must be a list"),
+    ):
+        assert (
+            run_command(
+                "train", HOME, [f"out={tmp_path}", f"plugins={wanted}", "loss=add", "console=json"]
+            )
+            == 2
+        )
         said = capfd.readouterr().err.strip().splitlines()
         assert len(said) == 1
         assert told in said[0]
-    assert run_command("train", HOME, [f"out={tmp_path}", "plugins=[my_plugin]", "loss=add", "console=plain"]) == 2
+    assert (
+        run_command(
+            "train", HOME, [f"out={tmp_path}", "plugins=[my_plugin]", "loss=add", "console=json"]
+        )
+        == 2
+    )
     assert "loss=add does not fit" in capfd.readouterr().err
     assert "my_plugin" in trust.trusted()
 
 
 def test_every_target_of_the_configuration_is_allowed_and_located() -> None:
     files = (HOME / "conf").rglob("*.yaml")
-    names = {name for file in files for name in re.findall(r"_target_: *[\"']?([\w.]+)", file.read_text())}
-    names -= {"posefilter.run.sweeps.SweepSummary"}  # that Hydra builds itself
+    names = {
+        name
+        for file in files
+        for name in re.findall(r"_target_: *[\"']?([\w.]+)", file.read_text())
+    }
+    names -= {"posefilter.cli.sweeps.SweepSummary"}  # that Hydra builds itself
     assert len(names) > 80
     for name in names:
         assert callable(locate(name, "x"))
 
 
 def test_a_recipe_does_not_keep_them(package: str, tmp_path: Path) -> None:
-    from posefilter.run.method import recipe
+    from posefilter.cli.checkpoints import recipe
 
     job = command.compose_job("train", HOME / "conf", ["plugins=[my_plugin]"], tmp_path)
     settings: dict[str, Any] = recipe(job)["settings"]

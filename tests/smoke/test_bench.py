@@ -8,7 +8,9 @@ import pytest
 from posefilter.data.module import PoseDataModule
 
 
-def test_waiting_for_data_is_measured(load_script, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+def test_waiting_for_data_is_measured(
+    load_script, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
     """A loader that sleeps is waited for; the share grows by what it sleeps."""
     measure = load_script("bench/loader.py").measure
     settings = ("model=cnn_patch", f"trainer.default_root_dir={tmp_path}")

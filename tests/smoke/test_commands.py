@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from posefilter.cli import run_command
+from posefilter.cli.evaluate import evaluate
+from posefilter.cli.train import train
 from posefilter.errors import UserError
 from posefilter.metrics.registry import find_metric
-from posefilter.run import run_command
-from posefilter.run.evaluate import evaluate
-from posefilter.run.train import train
 
 HOME = Path(__file__).parents[2]
 TIMES = ("seconds_per_image",)
@@ -36,8 +36,17 @@ def check_registry(metrics: dict) -> None:
 def list_numbers(content: object, name: str = "") -> list[str]:
     """Return where numbers are, and lists of numbers."""
     if isinstance(content, dict):
-        return [key for own, value in content.items() for key in list_numbers(value, f"{name}/{own}" if name else own)]
-    return [name] if isinstance(content, int | float) or (isinstance(content, list) and name.startswith("signs")) else []
+        return [
+            key
+            for own, value in content.items()
+            for key in list_numbers(value, f"{name}/{own}" if name else own)
+        ]
+    return (
+        [name]
+        if isinstance(content, int | float)
+        or (isinstance(content, list) and name.startswith("signs"))
+        else []
+    )
 
 
 def read(folder: Path) -> dict:
@@ -48,13 +57,25 @@ def read(folder: Path) -> dict:
 def trained(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a run of the pose-space method, trained by its command."""
     run = tmp_path_factory.mktemp("runs") / "pose"
-    typed = ["debug=smoke", "console=plain", "threads=1", "data.progress=false", f"data.root={tiny_scenes}", f"out={run}"]
+    typed = [
+        "debug=smoke",
+        "console=json",
+        "threads=1",
+        "data.progress=false",
+        f"data.root={tiny_scenes}",
+        f"out={run}",
+    ]
     assert run_command("train", HOME, typed) == 0
     return run
 
 
 def test_a_run_leaves_what_was_promised(trained: Path) -> None:
-    for name in (".hydra/config.yaml", "checkpoints/best.ckpt", "checkpoints/last.ckpt", "metrics.json"):
+    for name in (
+        ".hydra/config.yaml",
+        "checkpoints/best.ckpt",
+        "checkpoints/last.ckpt",
+        "metrics.json",
+    ):
         assert (trained / name).is_file(), name
     assert list(trained.glob("events.out.tfevents.*"))
     figures = list((trained / "figures").rglob("*.jpg"))
@@ -62,8 +83,20 @@ def test_a_run_leaves_what_was_promised(trained: Path) -> None:
     assert all(cv2.imread(str(figure)) is not None for figure in figures)
     metrics = read(trained)
     assert metrics["instances"] > 0
-    assert set(metrics["add"]) == set(metrics["add_s"]) == {"auc", "recall_01d", "recall_2cm", "median_mm"}
-    assert {"iou", "particles_on_object", "seconds_per_image", "belief", "data", "git", "versions"} <= set(metrics)
+    assert (
+        set(metrics["add"])
+        == set(metrics["add_s"])
+        == {"auc", "recall_01d", "recall_2cm", "median_mm"}
+    )
+    assert {
+        "iou",
+        "particles_on_object",
+        "seconds_per_image",
+        "belief",
+        "data",
+        "git",
+        "versions",
+    } <= set(metrics)
     assert "debug=smoke" in metrics["overrides"]
     assert metrics["training"]["steps"] == 8
     assert 0 < metrics["training"]["tested_step"] <= 8
@@ -82,10 +115,17 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     trained: Path, tmp_path: Path, tiny_scenes: Path
 ) -> None:
     checkpoint = trained / "checkpoints" / "best.ckpt"
-    common = ["console=plain", "threads=1"]
+    common = ["console=json", "threads=1"]
     assert (
         run_command(
-            "evaluate", HOME, [*common, f"checkpoint={checkpoint}", f"data.root={tiny_scenes}", f"out={tmp_path / 'a'}"]
+            "evaluate",
+            HOME,
+            [
+                *common,
+                f"checkpoint={checkpoint}",
+                f"data.root={tiny_scenes}",
+                f"out={tmp_path / 'a'}",
+            ],
         )
         == 0
     )
@@ -97,8 +137,17 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     assert beliefs["poses"].shape[0] == len(rows)
     assert np.allclose(beliefs["weights"].sum(1), 1, atol=1e-4)
 
-    data = ["data=scenes", f"data.root={tiny_scenes}", "data.image_width=160", "data.progress=false"]
-    data += ["data.split={train: 0.6, val: 0.2, test: 0.2}", "data.min_visibility_test=0.3", "data.points=500"]
+    data = [
+        "data=scenes",
+        f"data.root={tiny_scenes}",
+        "data.image_width=160",
+        "data.progress=false",
+    ]
+    data += [
+        "data.split={train: 0.6, val: 0.2, test: 0.2}",
+        "data.min_visibility_test=0.3",
+        "data.points=500",
+    ]
     typed = [*common, *data, f"estimates={tmp_path / 'a' / 'poses.csv'}", f"out={tmp_path / 'b'}"]
     assert run_command("evaluate", HOME, typed) == 0
     again, before = read(tmp_path / "b"), read(trained)
@@ -108,7 +157,9 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     assert again["iou"] == pytest.approx(before["iou"], abs=1e-3)
 
 
-def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tiny_scenes: Path, tmp_path: Path) -> None:
+def test_pieces_change_at_test_time_and_sweeps_sum_up(
+    trained: Path, tiny_scenes: Path, tmp_path: Path
+) -> None:
     typed = [
         f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}",
         f"data.root={tiny_scenes}",
@@ -116,7 +167,9 @@ def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tiny_scenes
         "-m",
         "filter.particles=4,8",
     ]
-    assert run_command("evaluate", HOME, [*typed, f"out={tmp_path}", "console=plain", "threads=1"]) == 0
+    assert (
+        run_command("evaluate", HOME, [*typed, f"out={tmp_path}", "console=json", "threads=1"]) == 0
+    )
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["filter.particles"] for row in rows] == ["4", "8"]
@@ -127,8 +180,14 @@ def test_pieces_change_at_test_time_and_sweeps_sum_up(trained: Path, tiny_scenes
         assert beliefs["poses"].shape[1] == int(row["filter.particles"])
 
 
-def test_unknown_pieces_are_told(trained: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", f"out={tmp_path}", "filter.partcles=4"]
+def test_unknown_pieces_are_told(
+    trained: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = [
+        f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}",
+        f"out={tmp_path}",
+        "filter.partcles=4",
+    ]
     assert run_command("evaluate", HOME, typed) == 2
     assert "did you mean 'particles'" in capfd.readouterr().err
 
@@ -144,9 +203,19 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     out = tmp_path / "prediction"
-    typed = [f"checkpoint={weights}", f"rgb={rgb}", f"depth={depth}", "intrinsics=266,266,78,60", f"out={out}", "threads=1"]
+    typed = [
+        f"checkpoint={weights}",
+        f"rgb={rgb}",
+        f"depth={depth}",
+        "intrinsics=266,266,78,60",
+        f"out={out}",
+        "threads=1",
+    ]
     can_view = importlib.util.find_spec("rerun") is not None  # the optional extra [viz]
-    assert run_command("predict", HOME, [*typed, "meshes=builtin", f"view={str(can_view).lower()}"]) == 0
+    assert (
+        run_command("predict", HOME, [*typed, "meshes=builtin", f"view={str(can_view).lower()}"])
+        == 0
+    )
     assert (out / "view.rrd").is_file() == can_view
     told = json.loads((out / "pose.json").read_text())
     R = np.array(told["camera_from_object"])[:3, :3]
@@ -159,12 +228,22 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     assert (out / "belief.png").is_file()
 
 
-@pytest.mark.parametrize(("view", "told"), [("true", "pip install -e '.[viz]'"), ("maybe", "choose true or false")])
+@pytest.mark.parametrize(
+    ("view", "told"), [("true", "pip install -e '.[viz]'"), ("maybe", "choose true or false")]
+)
 def test_a_view_that_cannot_be_written_is_told_before_the_work(
-    view: str, told: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    view: str,
+    told: str,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "rerun" else found(name, *rest))
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *rest: None if name == "rerun" else found(name, *rest),
+    )
     assert run_command("predict", HOME, [f"view={view}", f"out={tmp_path}"]) == 2
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
 
@@ -178,8 +257,14 @@ def test_every_image_space_method_goes_the_whole_way(model: str, tiny_job, tmp_p
     check_registry(metrics)
 
 
-def test_a_training_shorter_than_its_interval_is_validated_at_its_end(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    train(tiny_job(tmp_path, "model=cnn_patch", "trainer.max_steps=2", "trainer.val_check_interval=100"))
+def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
+    tiny_job, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    train(
+        tiny_job(
+            tmp_path, "model=cnn_patch", "trainer.max_steps=2", "trainer.val_check_interval=100"
+        )
+    )
     assert read(tmp_path)["training"]["steps"] == 2
     assert (tmp_path / "checkpoints" / "best.ckpt").is_file()
 
@@ -193,21 +278,42 @@ def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_p
     assert found[0] != found[2]
 
 
-def test_a_mesh_of_another_kind_is_refused(trained: Path, tmp_path: Path, tiny_scenes: Path) -> None:
-    from posefilter.run.command import compose_job
+def test_a_mesh_of_another_kind_is_refused(
+    trained: Path, tmp_path: Path, tiny_scenes: Path
+) -> None:
+    from posefilter.cli.command import compose_job
 
     checkpoint = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)
     checkpoint["object_model"]["center"] = checkpoint["object_model"]["center"] + 0.05
     torch.save(checkpoint, tmp_path / "moved.ckpt")
-    typed = [f"checkpoint={tmp_path / 'moved.ckpt'}", f"++data.root={tiny_scenes}", "console=plain", "threads=1"]
+    typed = [
+        f"checkpoint={tmp_path / 'moved.ckpt'}",
+        f"++data.root={tiny_scenes}",
+        "console=json",
+        "threads=1",
+    ]
     with pytest.raises(UserError, match="is not the mesh"):
         evaluate(compose_job("evaluate", HOME / "conf", typed, tmp_path))
 
 
-def test_plain_is_for_machines(tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Every line on stdout is a JSON object, the last one tells where everything is; stderr is silent."""
-    typed = ["debug=smoke", "model=cnn_patch", "console=plain", "threads=1", "trainer.max_steps=4", "logger=none"]
-    assert run_command("train", HOME, [*typed, f"data.root={tiny_scenes}", f"out={tmp_path / 'run'}"]) == 0
+def test_plain_is_for_machines(
+    tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Every line on stdout is a JSON object, the last one tells where everything is; stderr is
+    silent.
+    """
+    typed = [
+        "debug=smoke",
+        "model=cnn_patch",
+        "console=json",
+        "threads=1",
+        "trainer.max_steps=4",
+        "logger=none",
+    ]
+    assert (
+        run_command("train", HOME, [*typed, f"data.root={tiny_scenes}", f"out={tmp_path / 'run'}"])
+        == 0
+    )
     out, err = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
     assert [line["event"] for line in lines] == ["validation", "trained"]
@@ -219,19 +325,23 @@ def test_plain_is_for_machines(tiny_scenes: Path, tmp_path: Path, capfd: pytest.
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("initialise=from_depth", "initialise=from_depth.*PatchPF"),
-        ("initialise=from_relevance context=pyramid", "from_relevance.*PatchPF"),
-        ("resample=guided context=none", "resample=guided"),
+        ("initialize=from_depth", "initialize=from_depth.*PatchPF"),
+        ("initialize=from_relevance encoder=pyramid", "from_relevance.*PatchPF"),
+        ("resample=guided encoder=none", "resample=guided"),
         ("refine=rescore", "refine.*PatchPF"),
     ],
 )
-def test_pieces_that_do_not_fit_are_told_of_before_any_training(choice: str, words: str, tiny_job, tmp_path: Path) -> None:
+def test_pieces_that_do_not_fit_are_told_of_before_any_training(
+    choice: str, words: str, tiny_job, tmp_path: Path
+) -> None:
     with pytest.raises(UserError, match=words):
         train(tiny_job(tmp_path, "model=patch_pf", *choice.split()))
     assert not (tmp_path / "checkpoints").exists()
 
 
 @pytest.mark.parametrize("resample", ["transport", "ensemble"])
-def test_particles_are_resampled_by_optimal_transport(resample: str, tiny_job, tmp_path: Path) -> None:
+def test_particles_are_resampled_by_optimal_transport(
+    resample: str, tiny_job, tmp_path: Path
+) -> None:
     train(tiny_job(tmp_path, "model=patch_pf", f"resample={resample}", "trainer.max_steps=2"))
     assert 0 <= read(tmp_path)["particles_on_object"] <= 1

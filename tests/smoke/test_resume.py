@@ -6,8 +6,8 @@ import pytest
 import torch
 from lightning import Callback
 
-from posefilter.run import train as training
-from posefilter.run.console import Lines
+from posefilter.cli import train as training
+from posefilter.cli.progress_bar import Lines
 
 
 class Killed(BaseException):
@@ -38,7 +38,11 @@ def state(folder: Path) -> dict:
 def test_a_killed_run_goes_on_to_the_same_end(
     model: str, interval: int, tiny_job, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # type: ignore[no-untyped-def]
-    settings = [f"model={model}", f"trainer.val_check_interval={interval}", f"trainer.max_steps={3 * interval}"]
+    settings = [
+        f"model={model}",
+        f"trainer.val_check_interval={interval}",
+        f"trainer.max_steps={3 * interval}",
+    ]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     training.train(tiny_job(whole, *settings))
 
@@ -59,7 +63,9 @@ def test_a_killed_run_goes_on_to_the_same_end(
     for key, value in a["state_dict"].items():
         assert torch.equal(value, b["state_dict"][key]), key
     for one, other in zip(
-        a["optimizer_states"][0]["state"].values(), b["optimizer_states"][0]["state"].values(), strict=True
+        a["optimizer_states"][0]["state"].values(),
+        b["optimizer_states"][0]["state"].values(),
+        strict=True,
     ):
         for key in one:
             assert torch.equal(one[key], other[key]), key

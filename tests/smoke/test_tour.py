@@ -1,4 +1,6 @@
-"""docs/tour.md does what it says: its commands run one after the other, and leave the files that it speaks of."""
+"""docs/tour.md does what it says: its commands run one after the other, and leave the files that it
+speaks of.
+"""
 
 import json
 import re
@@ -10,9 +12,21 @@ from docs.run_tour import HOME, PAGE, call, commands, settings
 from posefilter.data.splits import split_records
 
 TOY = {  # what is added to each command so that all of them together take less than a minute
-    "generate": ["frames=24", "frames_per_scene=4", "size=[160,120]", "distractors=[1,2]", "workers=1"],
+    "generate": [
+        "frames=24",
+        "frames_per_scene=4",
+        "size=[160,120]",
+        "distractors=[1,2]",
+        "workers=1",
+    ],
     "check_data": ["limit=3"],
-    "train": ["debug=smoke", "threads=1", "trainer.max_steps=2", "trainer.val_check_interval=2", "data.limit_test=2"],
+    "train": [
+        "debug=smoke",
+        "threads=1",
+        "trainer.max_steps=2",
+        "trainer.val_check_interval=2",
+        "data.limit_test=2",
+    ],
     "predict": ["threads=1"],
 }
 
@@ -45,7 +59,9 @@ def test_the_image_at_the_end_was_held_out() -> None:
 
 
 @pytest.mark.slow
-def test_the_tour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_tour(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Every command ends well at toy size, and every file that the page names is there."""
     monkeypatch.chdir(tmp_path)
     text = PAGE.read_text()
@@ -55,7 +71,9 @@ def test_the_tour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest
     assert len(named) >= 6
     for path in named:
         assert (tmp_path / path).is_file(), path
-    assert json.loads((tmp_path / "outputs/tour/prediction/pose.json").read_text())["object"] == "duck"
+    assert (
+        json.loads((tmp_path / "outputs/tour/prediction/pose.json").read_text())["object"] == "duck"
+    )
 
 
 def test_a_command_that_breaks_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

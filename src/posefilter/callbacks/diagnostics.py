@@ -1,4 +1,6 @@
-"""Show how the image-space methods fail: curves over the iterations, the particles' trajectories, a short animation."""
+"""Show how the image-space methods fail: curves over the iterations, the particles' trajectories, a
+short animation.
+"""
 
 from pathlib import Path
 from typing import Any, cast
@@ -27,9 +29,11 @@ NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 
 
 class Diagnostics(Callback):
-    """Log where the particles are, step by step, after each validation; draw it of a test, with trajectories of some images.
+    """Log where the particles are, step by step, after each validation; draw it of a test, with
+    trajectories of some images.
 
-    The numbers themselves are among the method's metrics (val/signs/...).  Silent for methods whose particles are no pixels.
+    The numbers themselves are among the method's metrics (val/signs/...).  Silent for methods whose
+    particles are no pixels.
 
     Args:
         folder: Where figures and animations are written; nowhere if null.
@@ -37,7 +41,9 @@ class Diagnostics(Callback):
         share: Part of the validations' time that the curves may take; no limit if null.
     """
 
-    def __init__(self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005) -> None:
+    def __init__(
+        self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005
+    ) -> None:
         self.folder = None if folder is None else Path(folder)
         self.images = images
         self.budget = Budget(share)
@@ -54,21 +60,31 @@ class Diagnostics(Callback):
             return
         found = cast(SignsOfFailure, scores["signs"]).compute()
         for logger in trainer.loggers:
-            logger.log_metrics({f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step)
+            logger.log_metrics(
+                {f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
+            )
         if self.budget.allows():
             with self.budget.spend():
                 title = f"Signs of failure\nafter {trainer.global_step} steps of training"
                 post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Draw and animate the first batch's trajectories."""
         if batch_idx == 0 and has_pixel_particles(outputs):
             self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw where the particles of the test were: of validations, the last one drawn may be an early one."""
+        """Draw where the particles of the test were: of validations, the last one drawn may be an
+        early one.
+        """
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" in scores and trainer.is_global_zero:
             found = cast(SignsOfFailure, scores["signs"]).compute()
@@ -77,24 +93,32 @@ class Diagnostics(Callback):
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
         """Draw and animate the trajectories of a batch's first images."""
-        states = trace_lineage(trace.clouds)
+        states = trace_lineage(trace.particles)
         for i in range(min(self.images, len(states))):
             rgb, mask = to_image(batch.rgb[i]), batch.mask[i, 0].cpu().numpy()
             name = name_frame(trainer, "test", int(batch.frame_id[i]))
-            picture = draw_trajectories(rgb, mask, states[i].cpu().numpy(), f"Trajectories\n{name} of the test")
+            picture = draw_trajectories(
+                rgb, mask, states[i].cpu().numpy(), f"Trajectories\n{name} of the test"
+            )
             post_image(trainer, f"trajectories_{i}", picture, self.folder, "test")
-            K, truth = (x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object))
+            K, truth = (
+                x[i].cpu().double().numpy() for x in (batch.intrinsics, batch.camera_from_object)
+            )
             scene = AnimatedScene(rgb, K, truth, mask)
-            animation = animate(method, select_image(trace, i), scene, f"The filter at work\n{name} of the test")
+            animation = animate(
+                method, select_image(trace, i), scene, f"The filter at work\n{name} of the test"
+            )
             post_image(trainer, f"animation_{i}", animation, self.folder, "test")
 
 
 def has_pixel_particles(outputs: Any) -> bool:
     """Tell whether a step's outputs are a trace of particles that are pixels."""
-    return isinstance(outputs, Trace) and outputs.clouds[-1].state.shape[2:] == (2,)
+    return isinstance(outputs, Trace) and outputs.particles[-1].state.shape[2:] == (2,)
 
 
 def draw_diagnostics(found: dict[str, Any], title: str) -> Any:
-    """Draw the shares of particles on the object, off the frame, at an edge and in a corner against the step."""
+    """Draw the shares of particles on the object, off the frame, at an edge and in a corner against
+    the step.
+    """
     foot = ", ".join(f"{name.replace('_', ' ')} {found[name]:.2f}" for name in NUMBERS)
     return draw_shares({name: (found[name], color) for name, color in LISTS.items()}, title, foot)

@@ -1,4 +1,5 @@
-"""The figures of a validation, one function each: an occasion in, a picture out; None where it does not apply.
+"""The figures of a validation, one function each: an occasion in, a picture out; None where it does
+not apply.
 
 Pictures are (H, W, 3) uint8; bytes are a animation, a GIF.
 """
@@ -18,8 +19,13 @@ from posefilter.callbacks.fields import (
 )
 from posefilter.callbacks.gallery import KeptImage, draw_gallery
 from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
-from posefilter.contracts import HasRelevance
-from posefilter.figures.animation import Animation, draw_silhouettes, encode_gif, outline_hulls, project_hulls
+from posefilter.figures.animation import (
+    Animation,
+    draw_silhouettes,
+    encode_gif,
+    outline_hulls,
+    project_hulls,
+)
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.field import draw_point_field, draw_pose_field
 from posefilter.figures.maps import draw_proposals, draw_relevance
@@ -30,6 +36,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
+from posefilter.protocols import HasRelevance
 from posefilter.types import Batch, Trace
 
 
@@ -87,7 +94,9 @@ def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
     if not o.method.tells_pose:
         return None
-    return draw_belief(o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief"))
+    return draw_belief(
+        o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief")
+    )
 
 
 def silhouettes(o: Occasion) -> Drawn:
@@ -95,7 +104,9 @@ def silhouettes(o: Occasion) -> Drawn:
     if not o.posed:
         return None
     title = o.title("Silhouettes")
-    return draw_silhouettes(o.one.rgb, o.one.intrinsics, o.trace, o.method.model.hull.cpu(), o.one.truth, title)
+    return draw_silhouettes(
+        o.one.rgb, o.one.intrinsics, o.trace, o.method.model.hull.cpu(), o.one.truth, title
+    )
 
 
 def field(o: Occasion) -> Drawn:
@@ -103,26 +114,45 @@ def field(o: Occasion) -> Drawn:
     if not isinstance(o.method, PosePF):
         return None
     model = o.method.model
-    found = evaluate_pose_field(o.method, o.scene, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps))
+    found = evaluate_pose_field(
+        o.method, o.scene, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps)
+    )
     center = model.center.cpu().double().numpy()
-    shift = (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center + o.one.estimate[:3, 3] - o.one.truth[:3, 3]
+    shift = (
+        (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center
+        + o.one.estimate[:3, 3]
+        - o.one.truth[:3, 3]
+    )
     return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
 
 
 def points(o: Occasion) -> Drawn:
-    """Draw slices of the likelihood of single points through the object's frame (the paper, figure 5)."""
+    """Draw slices of the likelihood of single points through the object's frame (the paper, figure
+    5).
+    """
     if not isinstance(o.method, PosePF):
         return None
     model, truth = o.method.model, o.batch.camera_from_object[0]
     slices = [
         evaluate_point_field(
-            o.method.likelihood, o.scene.image, truth, model, pixel, on, choose_levels(o.trace.steps), depthwise
+            o.method.likelihood,
+            o.scene.image,
+            truth,
+            model,
+            pixel,
+            on,
+            choose_levels(o.trace.steps),
+            depthwise,
         )
         for pixel, on in choose_pixels(o.batch, model)
         for depthwise in ((False, True) if on else (False,))
     ]
     surface = (model.points - model.center).cpu().double().numpy()
-    return draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points")) if slices else None
+    return (
+        draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
+        if slices
+        else None
+    )
 
 
 def proposals(o: Occasion) -> Drawn:
@@ -131,25 +161,30 @@ def proposals(o: Occasion) -> Drawn:
     if said is None:
         return None
     title = o.title("Proposals")
-    return draw_proposals(said, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title)
+    return draw_proposals(
+        said, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
+    )
 
 
 def relevance(o: Occasion) -> Drawn:
     """Draw the map of relevance beside where particles started and ended."""
     if o.posed or not isinstance(o.scene, HasRelevance):
         return None
-    clouds = [
-        (c.state[0].double().numpy(), normalize_weights(c, 0).numpy()) for c in (o.trace.clouds[0], o.trace.clouds[-1])
+    history = [
+        (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
+        for c in (o.trace.particles[0], o.trace.particles[-1])
     ]
     seen = o.scene.relevance[0, 0].detach().float().cpu().numpy()
-    return draw_relevance(seen, o.one.rgb, o.mask(), clouds[0], clouds[1], o.title("Relevance"))
+    return draw_relevance(seen, o.one.rgb, o.mask(), history[0], history[1], o.title("Relevance"))
 
 
 def trajectories(o: Occasion) -> Drawn:
     """Draw the way of particles that are pixels (the paper, figure 4)."""
     if o.posed:
         return None
-    return draw_trajectories(o.one.rgb, o.mask(), trace_lineage(o.trace.clouds)[0].numpy(), o.title("Trajectories"))
+    return draw_trajectories(
+        o.one.rgb, o.mask(), trace_lineage(o.trace.particles)[0].numpy(), o.title("Trajectories")
+    )
 
 
 def glimpses(o: Occasion) -> Drawn:
@@ -181,14 +216,20 @@ def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: st
     hull, K = method.model.hull.cpu(), scene.intrinsics
     posed = isinstance(method.space, PoseSpace)
     target = (
-        outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K)) if posed else trace_outline(scene.mask)
+        outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
+        if posed
+        else trace_outline(scene.mask)
     )
-    return encode_gif(list(Animation(scene.rgb, K, trace, method.space, hull, target, title).frames()))
+    return encode_gif(
+        list(Animation(scene.rgb, K, trace, method.space, hull, target, title).frames())
+    )
 
 
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
     images = o.kept[kind]
-    return draw_gallery(images, o.shape, o.method.tells_pose, f"{title}\n{o.when}") if images else None
+    return (
+        draw_gallery(images, o.shape, o.method.tells_pose, f"{title}\n{o.when}") if images else None
+    )
 
 
 DRAWINGS: dict[str, Callable[[Occasion], Drawn]] = {

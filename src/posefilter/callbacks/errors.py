@@ -49,10 +49,14 @@ class ErrorTable(Callback):
         """Take in one batch."""
         assert isinstance(pl_module, PoseEstimator)
         records: Sequence[FrameRecord] = trainer.datamodule.records("test")  # type: ignore[attr-defined]
-        rows = measure_batch(pl_module, outputs, batch, [records[i] for i in batch.frame_id.tolist()])
+        rows = measure_batch(
+            pl_module, outputs, batch, [records[i] for i in batch.frame_id.tolist()]
+        )
         self.rows += rows
         for i, row in enumerate(rows):
-            error = row.add_mm / 1000 if math.isfinite(row.diameter_mm) else 1 - row.particles_on_object
+            error = (
+                row.add_mm / 1000 if math.isfinite(row.diameter_mm) else 1 - row.particles_on_object
+            )
             keep = partial(keep_image, outputs, batch, pl_module, i, error, row.image)
             self._selection.offer(error, keep)
 
@@ -71,7 +75,9 @@ class ErrorTable(Callback):
                 post_image(trainer, name, figure, self.folder / "figures", "test")
 
 
-def measure_batch(method: PoseEstimator, trace: Trace, batch: Batch, records: Sequence[FrameRecord]) -> list[ImageError]:
+def measure_batch(
+    method: PoseEstimator, trace: Trace, batch: Batch, records: Sequence[FrameRecord]
+) -> list[ImageError]:
     """Return a row an image of a batch that a method has just been tested on.
 
     Args:
@@ -86,7 +92,7 @@ def measure_batch(method: PoseEstimator, trace: Trace, batch: Batch, records: Se
         poses = method.scores["poses"]
         assert isinstance(poses, PoseErrors)
         errors = [(1000 * state[-1]).tolist() for state in (poses.add, poses.add_s, poses.diameter)]
-    shares = on_object(batch.mask, method.particle_pixels(trace.clouds[-1], batch)).tolist()
+    shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
     return make_rows(records, batch, errors, shares, trace.belief.score.tolist(), [seconds] * count)
 

@@ -1,7 +1,8 @@
-"""Ask a method what it makes of places that no particle need have visited: the likelihood field (the paper, figure 5).
+"""Ask a method what it makes of places that no particle need have visited: the likelihood field
+(the paper, figure 5).
 
-Two views of one field. Of poses: the score of the truth, shifted and turned. Of points: what one point of the image would be
-worth, were it elsewhere in the object's frame.
+Two views of one field. Of poses: the score of the truth, shifted and turned. Of points: what one
+point of the image would be worth, were it elsewhere in the object's frame.
 """
 
 import math
@@ -12,25 +13,34 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
-from posefilter.contracts import Scene, ScoresPoses
 from posefilter.figures.field import PLANES, PointField, PoseField
 from posefilter.figures.maps import Proposals
 from posefilter.figures.particles import project_axes
 from posefilter.geometry.camera import back_project, pixel_grid, project
-from posefilter.geometry.pose import invert, make_pose, origin_of, pose_about, rotation_of, transform
+from posefilter.geometry.pose import (
+    invert,
+    make_pose,
+    origin_of,
+    pose_about,
+    rotation_of,
+    transform,
+)
 from posefilter.geometry.rotation import exp_so3
 from posefilter.models.pose_pf import PosePF, PoseScene
 from posefilter.nets.coordinates import ask, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, Points, PoseLikelihood, look
 from posefilter.nets.paper_likelihood import PaperLikelihood
+from posefilter.protocols import Scene, ScoresPoses
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
 
 
 def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
-    """Return noise levels that a filter ran through, broad to sharp: the ends and what lies evenly between them."""
+    """Return noise levels that a filter ran through, broad to sharp: the ends and what lies evenly
+    between them.
+    """
     found = sorted({float(step.sigma.reshape(-1)[0]) for step in steps}, reverse=True)
     picked = {round(i) for i in np.linspace(0, len(found) - 1, min(most, len(found))).tolist()}
     return tuple(found[i] for i in sorted(picked))
@@ -45,21 +55,30 @@ def evaluate_pose_field(
     pixels: int = 48,
     cells: int = 9,
 ) -> PoseField:
-    """Score slices through the truth of one image, at each noise level, with the same image points at all of them.
+    """Score slices through the truth of one image, at each noise level, with the same image points
+    at all of them.
 
-    truth (4, 4) camera_from_object [m]; pixels: image points a pose; cells: a side of a slice, odd so that the truth is its
-    middle. Slices go as far as six noise levels, at least a quarter of the object's radius and at most twice it.
+    truth (4, 4) camera_from_object [m]; pixels: image points a pose; cells: a side of a slice, odd
+    so that the truth is its middle. Slices go as far as six noise levels, at least a quarter of the
+    object's radius and at most twice it.
     """
     center = model.center.to(truth)
-    degrees = torch.tensor(sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()}))
+    degrees = torch.tensor(
+        sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()})
+    )
     about = turn_pose(truth, center, degrees.to(truth) * math.pi / 180)
     reaches = tuple(min(max(6 * sigma, model.radius / 4), 2 * model.radius) for sigma in sigmas)
     planes, turns = [], []
     for sigma, reach in zip(sigmas, reaches, strict=True):
-        poses = torch.cat([truth[None], shift_pose(truth, reach, cells).flatten(0, -3), about.flatten(0, -3)])
+        poses = torch.cat(
+            [truth[None], shift_pose(truth, reach, cells).flatten(0, -3), about.flatten(0, -3)]
+        )
         generator = torch.Generator(device=truth.device).manual_seed(0)
-        with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):  # as the filter reads
-            score = method.score_poses(scene, poses[None], sigma, generator, pixels)[0].float().cpu()
+        # as the filter reads
+        with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):
+            score = (
+                method.score_poses(scene, poses[None], sigma, generator, pixels)[0].float().cpu()
+            )
         less = (score - score[0])[1:].numpy()
         planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
         turns.append(less[3 * cells * cells :].reshape(3, len(degrees)))
@@ -67,7 +86,10 @@ def evaluate_pose_field(
 
 
 def shift_pose(pose: Tensor, reach: float, cells: int) -> Tensor:
-    """Return a pose shifted within the planes of the object's axes.  (4, 4) -> (3, cells, cells, 4, 4)."""
+    """Return a pose shifted within the planes of the object's axes.
+
+    (4, 4) -> (3, cells, cells, 4, 4).
+    """
     line = torch.linspace(-reach, reach, cells, dtype=pose.dtype, device=pose.device)
     shift = torch.zeros(3, cells, cells, 3, dtype=pose.dtype, device=pose.device)
     for k, (a, b) in enumerate(PLANES):
@@ -76,7 +98,10 @@ def shift_pose(pose: Tensor, reach: float, cells: int) -> Tensor:
 
 
 def turn_pose(pose: Tensor, center: Tensor, angles: Tensor) -> Tensor:
-    """Return a pose turned about the object's axes through its center.  (4, 4), (3,) [m], (A,) [rad] -> (3, A, 4, 4)."""
+    """Return a pose turned about the object's axes through its center.
+
+    (4, 4), (3,) [m], (A,) [rad] -> (3, A, 4, 4).
+    """
     axes = torch.eye(3, dtype=pose.dtype, device=pose.device)
     rotation = rotation_of(pose) @ exp_so3(axes[:, None] * angles[None, :, None])
     return pose_about(rotation, rotation_of(pose) @ center + pose[:3, 3], center)
@@ -95,8 +120,8 @@ def evaluate_point_field(
 ) -> PointField:
     """Judge one pixel of one image at places in the object's frame, its color and ray as they are.
 
-    The slice goes through where the pixel lies under the truth (4, 4), across the viewing ray, or (`depthwise`) along it:
-    it is spanned by the two object axes that lie best so.
+    The slice goes through where the pixel lies under the truth (4, 4), across the viewing ray, or
+    (`depthwise`) along it: it is spanned by the two object axes that lie best so.
     """
     points = make_point(pixel, image, truth, model)
     place = points.position[0, 0, 0]
@@ -108,34 +133,49 @@ def evaluate_point_field(
     places[..., plane[0]], places[..., plane[1]] = line[None, :], line[:, None]
     asked = torch.cat([place[None], places.flatten(0, 1)])
     alike = lambda x: x.expand(1, 1, len(asked), *x.shape[3:])  # noqa: E731
-    many = Points(asked[None, None], *(alike(x) for x in (points.color, points.ray, points.known, points.inside)))
+    many = Points(
+        asked[None, None],
+        *(alike(x) for x in (points.color, points.ray, points.known, points.inside)),
+    )
     if image.context is not None:  # what the proposal network says of the place that is asked for
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
         many = many._replace(context=ask(image.context, u, v, many.position / model.radius))
-    found = torch.stack([judge(likelihood, many, sigma, model)[0, 0].float().cpu() for sigma in sigmas]).numpy()
+    found = torch.stack(
+        [judge(likelihood, many, sigma, model)[0, 0].float().cpu() for sigma in sigmas]
+    ).numpy()
     judged = found[:, 1:].reshape(len(sigmas), cells, cells)
-    return PointField(pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), judged, found[:, 0])
+    return PointField(
+        pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), judged, found[:, 0]
+    )
 
 
 def make_point(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: ObjectModel) -> Points:
-    """Return one pixel (u, v) of one image as a point that the truth (4, 4) looks at.  -> Points (1, 1, 1)."""
+    """Return one pixel (u, v) of one image as a point that the truth (4, 4) looks at.  -> Points
+    (1, 1, 1).
+    """
     center = model.center.to(truth)
     middle = origin_of(truth, center)
     reach = model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
-    noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach  # what `look` will undo
+    # what `look` will undo
+    noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach
     return look(image, truth[None, None], center, model.radius, noise[None, None, None], spread=1.0)
 
 
 def judge(likelihood: nn.Module, points: Points, sigma: float, model: ObjectModel) -> Tensor:
     """Judge points at a noise level, by our likelihood or by the paper's.  -> (B, N, P)."""
     if isinstance(likelihood, PaperLikelihood):
-        return likelihood.judge_samples(points.position + model.center.to(points.position), points.color)
+        return likelihood.judge_samples(
+            points.position + model.center.to(points.position), points.color
+        )
     assert isinstance(likelihood, PoseLikelihood)
-    return likelihood.judge(points, likelihood.level(points.position.new_tensor([sigma])), model.radius)
+    return likelihood.judge(
+        points, likelihood.level(points.position.new_tensor([sigma])), model.radius
+    )
 
 
 def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
-    """Choose pixels of known depth in one image: one well on the object, and one off it but near; (u, v), and which it is.
+    """Choose pixels of known depth in one image: one well on the object, and one off it but near;
+    (u, v), and which it is.
 
     batch: of one image. Empty where the object is not seen.
     """
@@ -147,23 +187,36 @@ def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int
     best = [int(within.argmax())]
     grid = pixel_grid(H, W, device=batch.depth.device).reshape(1, -1, 2)
     points = back_project(grid, batch.depth.flatten(1), batch.intrinsics)
-    away = (transform(invert(batch.camera_from_object), points)[0] - model.center.to(points)).norm(dim=-1).cpu().numpy()
+    away = (
+        (transform(invert(batch.camera_from_object), points)[0] - model.center.to(points))
+        .norm(dim=-1)
+        .cpu()
+        .numpy()
+    )
     off = (distance_transform_edt(~mask) > 4) & known
     if off.any():
         best.append(int(np.where(off.reshape(-1), np.abs(away - model.radius), np.inf).argmin()))
     return [((i % W, i // W), number == 0) for number, i in enumerate(best)]
 
 
-def predict_proposals(method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24) -> Proposals | None:
-    """Return what the proposal network makes of one image; None where the method has none, or no depth is known."""
+def predict_proposals(
+    method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24
+) -> Proposals | None:
+    """Return what the proposal network makes of one image; None where the method has none, or no
+    depth is known.
+    """
     if scene.said is None or scene.cells is None or not bool(scene.cells.valid.any()):
         return None
     model = method.model
     center = model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
-    poses = method.propose(scene, drawn, generator)[0].cpu().double()
-    axes = project_axes(poses, model.center.cpu().double(), 0.5 * model.radius, batch.intrinsics[0].cpu().double())
-    truth, _, usable = true_coordinates(scene.cells, batch.mask, batch.camera_from_object, center, model.radius)
+    poses = method.propose_poses(scene, drawn, generator)[0].cpu().double()
+    axes = project_axes(
+        poses, model.center.cpu().double(), 0.5 * model.radius, batch.intrinsics[0].cpu().double()
+    )
+    truth, _, usable = true_coordinates(
+        scene.cells, batch.mask, batch.camera_from_object, center, model.radius
+    )
     true, on = truth[0], usable[0]
     off = (scene.said.coordinate[0] - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan

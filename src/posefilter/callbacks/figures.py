@@ -1,4 +1,6 @@
-"""Figures of each validation, into TensorBoard and the run's folder: callbacks/drawings.py says which there are."""
+"""Figures of each validation, into TensorBoard and the run's folder: callbacks/drawings.py says
+which there are.
+"""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -22,7 +24,7 @@ from posefilter.callbacks.gallery import (
 )
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.errors import UserError
-from posefilter.geometry.deviation import thin
+from posefilter.geometry.pose_error import thin
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -30,10 +32,11 @@ from posefilter.types import Batch, Trace
 class Figures(Callback):
     """Draw what happened after each `every`-th validation, into TensorBoard and `folder`.
 
-    folder: null for TensorBoard alone; first, best, worst: how many images of each kind; without: names of figures that are
-    left out; share: of the validations' time that drawing may take on the whole (null: no limit): drawing that would take
-    more is put off to a later validation, at the latest to the end of the training. Only looks: neither the method nor any
-    random generator is touched.
+    folder: null for TensorBoard alone; first, best, worst: how many images of each kind; without:
+    names of figures that are left out; share: of the validations' time that drawing may take on the
+    whole (null: no limit): drawing that would take more is put off to a later validation, at the
+    latest to the end of the training. Only looks: neither the method nor any random generator is
+    touched.
     """
 
     def __init__(
@@ -49,7 +52,8 @@ class Figures(Callback):
         unknown = sorted(set(without) - set(DRAWINGS))
         if unknown:
             raise UserError(
-                f"callbacks.figures.without={unknown[0]}: there is no such figure; there are {', '.join(DRAWINGS)}"
+                f"callbacks.figures.without={unknown[0]}: there is no such figure; there are "
+                f"{', '.join(DRAWINGS)}"
             )
         self.folder = None if folder is None else Path(folder)
         self.every, self.counts = every, {"first": first, "best": best, "worst": worst}
@@ -67,10 +71,20 @@ class Figures(Callback):
         self.budget.start()
 
     def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Keep the images that may be drawn."""
-        if trainer.sanity_checking or not isinstance(outputs, Trace) or self._validations % self.every:
+        if (
+            trainer.sanity_checking
+            or not isinstance(outputs, Trace)
+            or self._validations % self.every
+        ):
             return
         method = _method(pl_module)
         if self._points is None:
@@ -78,10 +92,16 @@ class Figures(Callback):
         errors = compute_errors(outputs, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))
-            self._selection.offer(error, partial(keep_image, outputs, batch, method, i, error, name))
+            self._selection.offer(
+                error, partial(keep_image, outputs, batch, method, i, error, name)
+            )
             if self._example is None:
                 one = keep_image(outputs, batch, method, i, error, name)
-                self._example = one, select_image(outputs, 0), Batch(*(x[:1].clone() for x in batch))
+                self._example = (
+                    one,
+                    select_image(outputs, 0),
+                    Batch(*(x[:1].clone() for x in batch)),
+                )
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""
@@ -108,7 +128,7 @@ class Figures(Callback):
         one, trace, batch = self._example
         with self.budget.spend(), evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
-            shape, scene = find_shape(trainer, method), method.observe(batch)
+            shape, scene = find_shape(trainer, method), method.encode(batch)
             when = f"after {trainer.global_step} steps of training"
             occasion = Occasion(method, shape, self._selection.kept, one, trace, batch, scene, when)
             for name, drawing in self.drawings.items():

@@ -1,4 +1,6 @@
-"""What is kept of the images of a validation or test, and figures of them: the first, the best and the worst."""
+"""What is kept of the images of a validation or test, and figures of them: the first, the best and
+the worst.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -8,15 +10,23 @@ import torch
 from lightning import Trainer
 from torch import Tensor
 
-from posefilter.data.meshes import MeshStore
 from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, full_view, to_image
-from posefilter.figures.layout import DETAIL, add_caption, compose_figure, cut_text, draw_legend, format_length, tile_width
+from posefilter.figures.layout import (
+    DETAIL,
+    add_caption,
+    compose_figure,
+    cut_text,
+    draw_legend,
+    format_length,
+    tile_width,
+)
 from posefilter.figures.overlay import Shape, draw_poses, list_axes, view_poses
 from posefilter.figures.particles import draw_particles, draw_weight_scale
+from posefilter.meshes.store import MeshStore
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Belief, Cloud, Reading, Trace
+from posefilter.types import Batch, Belief, ParticleOutput, Particles, Trace
 
 _COLUMNS = 3
 _TILE = tile_width(_COLUMNS)
@@ -27,7 +37,8 @@ class KeptImage(NamedTuple):
 
     frame_id: int
     name: str  # of the frame
-    error: float  # ADD [m]; for methods that tell no pose, the share of the particles that miss the object
+    # ADD [m]; for methods that tell no pose, the share of the particles that miss the object
+    error: float
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]
     estimate: np.ndarray  # (4, 4)
@@ -37,16 +48,20 @@ class KeptImage(NamedTuple):
 
 
 def compute_errors(trace: Trace, batch: Batch, method: PoseEstimator, points: Tensor) -> Tensor:
-    """Return how wrong each image is, infinite where no number says: ADD [m], or the share of particles that miss.  (B,)."""
+    """Return how wrong each image is, infinite where no number says: ADD [m], or the share of
+    particles that miss.  (B,).
+    """
     if method.tells_pose:
         error = add(trace.belief.best.detach(), batch.camera_from_object, points)
     else:
-        error = 1 - on_object(batch.mask, method.particle_pixels(trace.clouds[-1], batch))
+        error = 1 - on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch))
     return torch.nan_to_num(error.double(), nan=torch.inf)
 
 
 class ImageSelection:
-    """Keeps the first, the best and the worst images of a stage; an image is only copied where it is one of them."""
+    """Keeps the first, the best and the worst images of a stage; an image is only copied where it
+    is one of them.
+    """
 
     def __init__(self, first: int, best: int, worst: int) -> None:
         self.counts = {"first": first, "best": best, "worst": worst}
@@ -61,7 +76,9 @@ class ImageSelection:
             kept["first"].append(made)
         for name, sign in (("best", 1), ("worst", -1)):
             ranked = kept[name]
-            if counts[name] and (len(ranked) < counts[name] or sign * error < sign * ranked[-1].error):
+            if counts[name] and (
+                len(ranked) < counts[name] or sign * error < sign * ranked[-1].error
+            ):
                 made = made or make()
                 ranked.append(made)
                 ranked.sort(key=lambda one: sign * one.error)
@@ -74,11 +91,13 @@ def name_frame(trainer: Trainer, split: str, frame_id: int) -> str:
     return str(data.records(split)[frame_id].name) if data is not None else f"image {frame_id}"
 
 
-def keep_image(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float, name: str) -> KeptImage:
+def keep_image(
+    trace: Trace, batch: Batch, method: PoseEstimator, i: int, error: float, name: str
+) -> KeptImage:
     """Copy what a drawing needs of one image."""
     numpy = lambda x: x[i].detach().cpu().double().numpy()  # noqa: E731
-    cloud = trace.clouds[-1]
-    pixels = method.particle_pixels(cloud, batch)
+    particles = trace.particles[-1]
+    pixels = method.particle_pixels(particles, batch)
     return KeptImage(
         int(batch.frame_id[i]),
         name,
@@ -88,7 +107,7 @@ def keep_image(trace: Trace, batch: Batch, method: PoseEstimator, i: int, error:
         numpy(trace.belief.best),
         numpy(batch.camera_from_object),
         numpy(pixels),
-        numpy(torch.softmax(cloud.log_weights.double(), 1)),
+        numpy(torch.softmax(particles.log_weights.double(), 1)),
     )
 
 
@@ -96,27 +115,34 @@ def select_image(trace: Trace, i: int) -> Trace:
     """Return the trace of one image alone, on the CPU, without gradients."""
     take = lambda x: x[i : i + 1].detach().cpu() if x.ndim else x.detach().cpu()  # noqa: E731
     return Trace(
-        tuple(Cloud(*map(take, cloud)) for cloud in trace.clouds),
-        tuple(Reading(*map(take, reading[:-1])) for reading in trace.readings),  # fragments: not for the eye
+        tuple(Particles(*map(take, particles)) for particles in trace.particles),
+        # fragments: not for the eye
+        tuple(ParticleOutput(*map(take, output[:-1])) for output in trace.outputs),
         tuple(step._replace(sigma=take(step.sigma)) for step in trace.steps),
         Belief(*map(take, trace.belief)),
     )
 
 
 def find_shape(trainer: Trainer, method: PoseEstimator) -> Shape:
-    """Return what outlines are drawn from: the mesh where the data has it, else the hull that the method carries."""
+    """Return what outlines are drawn from: the mesh where the data has it, else the hull that the
+    method carries.
+    """
     store = getattr(getattr(trainer, "datamodule", None), "meshes", None)
     if isinstance(store, MeshStore) and method.model.name in store.names():
         return store.load(method.model.name)
     return method.model.hull
 
 
-def draw_gallery(kept: Sequence[KeptImage], shape: Shape, tells_pose: bool, title: str) -> np.ndarray:
+def draw_gallery(
+    kept: Sequence[KeptImage], shape: Shape, tells_pose: bool, title: str
+) -> np.ndarray:
     """Draw images side by side, in rows, under a title and above what the lines mean."""
     tiles = arrange_grid([draw_tile(one, shape, tells_pose) for one in kept], _COLUMNS)
     if not tells_pose:
         return compose_figure(title, tiles, draw_weight_scale())
-    return compose_figure(title, tiles, draw_legend([("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()]))
+    return compose_figure(
+        title, tiles, draw_legend([("truth", TRUTH), ("estimate", ESTIMATE), *list_axes()])
+    )
 
 
 def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
@@ -124,9 +150,13 @@ def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
     height, width = one.rgb.shape[:2]
     if tells_pose:
         view = view_poses([one.estimate, one.truth], shape, one.intrinsics, height, width, _TILE)
-        picture = draw_poses(one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2)
+        picture = draw_poses(
+            one.rgb, one.intrinsics, one.estimate, shape, view, truth=one.truth, coarse=2
+        )
         caption = f"ADD {format_length(one.error)}"
     else:
         picture = draw_particles(one.rgb, one.pixels, one.weights, full_view(height, width, _TILE))
         caption = f"{1 - one.error:.0%} on the object"
-    return add_caption(add_caption(picture, cut_text(one.name, DETAIL, picture.shape[1]), DETAIL), caption)
+    return add_caption(
+        add_caption(picture, cut_text(one.name, DETAIL, picture.shape[1]), DETAIL), caption
+    )

@@ -1,4 +1,6 @@
-"""How the filter fares, iteration by iteration: effective particles, spread, noise level and best log-likelihood."""
+"""How the filter fares, iteration by iteration: effective particles, spread, noise level and best
+log-likelihood.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -7,21 +9,25 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from posefilter.callbacks.tensorboard import Budget, post_image
-from posefilter.contracts import Space
 from posefilter.figures.curves import draw_health
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
+from posefilter.protocols import Space
 from posefilter.types import Trace
 
 
 class FilterHealth(Callback):
-    """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one figure.
+    """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one
+    figure.
 
-    folder: where the figure is written too (null: nowhere); most: iterations that become scalars, evenly chosen;
-    share: of the validations' time that the figure may take (null: no limit), else it is left to a later validation.
+    folder: where the figure is written too (null: nowhere); most: iterations that become scalars,
+    evenly chosen; share: of the validations' time that the figure may take (null: no limit), else
+    it is left to a later validation.
     """
 
-    def __init__(self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.005) -> None:
+    def __init__(
+        self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.005
+    ) -> None:
         self.folder = None if folder is None else Path(folder)
         self.most = most
         self.budget = Budget(share)
@@ -34,7 +40,13 @@ class FilterHealth(Callback):
         self.budget.start()
 
     def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Take in one batch."""
         if trainer.sanity_checking or not isinstance(outputs, Trace):
@@ -55,7 +67,11 @@ class FilterHealth(Callback):
             logger.log_metrics(name_scalars(curves, self.most), trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
-                picture = draw_health(curves, self._images, f"Filter health\nafter {trainer.global_step} steps of training")
+                picture = draw_health(
+                    curves,
+                    self._images,
+                    f"Filter health\nafter {trainer.global_step} steps of training",
+                )
                 post_image(trainer, "health", picture, self.folder)
 
     def curves(self) -> dict[str, list[float]]:
@@ -66,12 +82,12 @@ class FilterHealth(Callback):
 def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
     """Return each image's numbers by name, (B, T) each.
 
-    ess: 1 / sum w^2 over the number of particles, in (0, 1]; spread_*: weighted root mean square distance from the mean;
-    sigma_*: noise level; best_log_likelihood: of the image's best particle.
+    ess: 1 / sum w^2 over the number of particles, in (0, 1]; spread_*: weighted root mean square
+    distance from the mean; sigma_*: noise level; best_log_likelihood: of the image's best particle.
     """
     steps: list[dict[str, torch.Tensor]] = []
-    for cloud, reading, step in zip(trace.clouds, trace.readings, trace.steps, strict=True):
-        state, log_weights = cloud.state.detach(), cloud.log_weights.detach().float()
+    for particles, output, step in zip(trace.particles, trace.outputs, trace.steps, strict=True):
+        state, log_weights = particles.state.detach(), particles.log_weights.detach().float()
         weights = log_weights.exp()
         row = {"ess": 1 / weights.square().sum(1) / weights.shape[1]}
         if isinstance(space, PoseSpace):
@@ -81,13 +97,15 @@ def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
             row["spread_px"] = (weights * space.distance(state, mean).square()).sum(1).sqrt()
         unit = "m" if isinstance(space, PoseSpace) else "px"
         row[f"sigma_{unit}"] = step.sigma.detach().to(weights).expand(len(weights))
-        row["best_log_likelihood"] = reading.log_likelihood.detach().float().max(1).values
+        row["best_log_likelihood"] = output.log_likelihood.detach().float().max(1).values
         steps.append(row)
     return {name: torch.stack([row[name] for row in steps], dim=1).double() for name in steps[0]}
 
 
 def name_scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
-    """Return curves as scalars with names that sort, `filter/ess/step_03`: `most` of each, evenly chosen."""
+    """Return curves as scalars with names that sort, `filter/ess/step_03`: `most` of each, evenly
+    chosen.
+    """
     out: dict[str, float] = {}
     for name, values in curves.items():
         for step in choose_evenly(len(values), most):
@@ -96,7 +114,13 @@ def name_scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
 
 
 def choose_evenly(count: int, most: int) -> list[int]:
-    """Return at most `most` indices below `count`, evenly spread, the first and the last among them."""
+    """Return at most `most` indices below `count`, evenly spread, the first and the last among
+    them.
+    """
     if count <= most:
         return list(range(count))
-    return sorted({round(i * (count - 1) / (most - 1)) for i in range(most)}) if most > 1 else [count - 1]
+    return (
+        sorted({round(i * (count - 1) / (most - 1)) for i in range(most)})
+        if most > 1
+        else [count - 1]
+    )

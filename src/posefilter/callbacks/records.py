@@ -1,4 +1,6 @@
-"""What a test said of each image, written down: poses in the format of the BOP challenge, and whole beliefs."""
+"""What a test said of each image, written down: poses in the format of the BOP challenge, and whole
+beliefs.
+"""
 
 import csv
 import math
@@ -19,7 +21,10 @@ NativeFromMesh = Callable[[str], np.ndarray]
 
 
 class Outcome(NamedTuple):
-    """What the filter said of one image.  Poses are camera_from_object in the mesh file's frame [m]."""
+    """What the filter said of one image.
+
+    Poses are camera_from_object in the mesh file's frame [m].
+    """
 
     frame_id: int  # index into the split's records
     estimate: np.ndarray  # (4, 4) float64
@@ -55,14 +60,24 @@ class Records(Callback):
         self.outcomes = []
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Take in one batch."""
         times = getattr(pl_module, "seconds_per_image", [])
-        self.outcomes += collect_outcomes(outputs, batch, times[-1] if times else math.nan, self.beliefs)
+        self.outcomes += collect_outcomes(
+            outputs, batch, times[-1] if times else math.nan, self.beliefs
+        )
 
 
-def collect_outcomes(trace: Trace, batch: Batch, seconds: float, beliefs: bool = True) -> list[Outcome]:
+def collect_outcomes(
+    trace: Trace, batch: Batch, seconds: float, beliefs: bool = True
+) -> list[Outcome]:
     """Return a run's belief image by image.  Without `beliefs` no particles are kept."""
     belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()
@@ -75,11 +90,14 @@ def collect_outcomes(trace: Trace, batch: Batch, seconds: float, beliefs: bool =
     ]
 
 
-def to_rows(outcomes: Sequence[Outcome], records: Sequence[FrameRecord], native_from_mesh: NativeFromMesh) -> list[PoseRow]:
-    """Return the estimates as lines of a results file; one that is not finite is left out, and so counts as a miss.
+def to_rows(
+    outcomes: Sequence[Outcome], records: Sequence[FrameRecord], native_from_mesh: NativeFromMesh
+) -> list[PoseRow]:
+    """Return the estimates as lines of a results file; one that is not finite is left out, and so
+    counts as a miss.
 
-    records: the split's, which `frame_id` indexes; native_from_mesh: given a class, its frame in the dataset from the mesh
-    file's (4, 4).
+    records: the split's, which `frame_id` indexes; native_from_mesh: given a class, its frame in
+    the dataset from the mesh file's (4, 4).
     """
     rows = []
     for outcome in outcomes:
@@ -88,13 +106,20 @@ def to_rows(outcomes: Sequence[Outcome], records: Sequence[FrameRecord], native_
         record = records[outcome.frame_id]
         pose = to_native(outcome.estimate, native_from_mesh(record.object))
         seconds = outcome.seconds if math.isfinite(outcome.seconds) else -1.0
-        rows.append(PoseRow(record.scene_id, record.im_id, record.obj_id, outcome.score, pose, seconds))
+        rows.append(
+            PoseRow(record.scene_id, record.im_id, record.obj_id, outcome.score, pose, seconds)
+        )
     return rows
 
 
 def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:
-    """Return poses of the dataset's own object frame.  (*, 4, 4) of the mesh file's -> (*, 4, 4) float64."""
-    return np.asarray(camera_from_object, np.float64) @ np.linalg.inv(np.asarray(native_from_mesh, np.float64))
+    """Return poses of the dataset's own object frame.
+
+    (*, 4, 4) of the mesh file's -> (*, 4, 4) float64.
+    """
+    return np.asarray(camera_from_object, np.float64) @ np.linalg.inv(
+        np.asarray(native_from_mesh, np.float64)
+    )
 
 
 def to_mesh(camera_from_native: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:
@@ -103,7 +128,9 @@ def to_mesh(camera_from_native: np.ndarray, native_from_mesh: np.ndarray) -> np.
 
 
 def write_poses_csv(path: Path, rows: Sequence[PoseRow]) -> None:
-    """Write a BOP results file: R row by row, t in millimetres, every digit kept, so that reading gives the same numbers."""
+    """Write a BOP results file: R row by row, t in millimeters, every digit kept, so that reading
+    gives the same numbers.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -114,11 +141,24 @@ def write_poses_csv(path: Path, rows: Sequence[PoseRow]) -> None:
             t_mm = " ".join(
                 format(Decimal(repr(float(x))).scaleb(3), "f") for x in pose[:3, 3]
             )  # moves the point, rounds nothing
-            writer.writerow([row.scene_id, row.im_id, row.obj_id, repr(float(row.score)), R, t_mm, repr(float(row.seconds))])
+            writer.writerow(
+                [
+                    row.scene_id,
+                    row.im_id,
+                    row.obj_id,
+                    repr(float(row.score)),
+                    R,
+                    t_mm,
+                    repr(float(row.seconds)),
+                ]
+            )
 
 
 def read_poses_csv(path: Path) -> list[PoseRow]:
-    """Read a BOP results file; its header may be missing.  Raises UserError, naming file and line, where it is malformed."""
+    """Read a BOP results file; its header may be missing.
+
+    Raises UserError, naming file and line, where it is malformed.
+    """
     if not path.is_file():
         raise UserError(f"estimates={path}: no such file")
     rows = []
@@ -132,8 +172,12 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
 
 def _parse(cells: Sequence[str], where: str) -> PoseRow:
     if len(cells) != len(HEADER):
-        raise UserError(f"{where}: {len(cells)} columns where {len(HEADER)} are due ({','.join(HEADER)})")
-    scene, image, object_id = (_whole(cell, name, where) for cell, name in zip(cells[:3], HEADER[:3], strict=True))
+        raise UserError(
+            f"{where}: {len(cells)} columns where {len(HEADER)} are due ({','.join(HEADER)})"
+        )
+    scene, image, object_id = (
+        _whole(cell, name, where) for cell, name in zip(cells[:3], HEADER[:3], strict=True)
+    )
     pose = np.eye(4)
     pose[:3, :3] = np.reshape([float(x) for x in _numbers(cells[4], 9, "R", where)], (3, 3))
     pose[:3, 3] = [float(x.scaleb(-3)) for x in _numbers(cells[5], 3, "t", where)]
@@ -157,22 +201,32 @@ def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
     except InvalidOperation as error:
         raise UserError(f"{where}: {name} holds something that is no number: {cell!r}") from error
     if len(numbers) != count:
-        raise UserError(f"{where}: {name} has {len(numbers)} numbers where {count} are due, separated by blanks")
+        raise UserError(
+            f"{where}: {name} has {len(numbers)} numbers where {count} are due, separated by blanks"
+        )
     if name in "Rt" and not all(number.is_finite() for number in numbers):
         raise UserError(f"{where}: {name} is not finite: {cell!r}")
     return numbers
 
 
 def write_beliefs(
-    path: Path, outcomes: Sequence[Outcome], records: Sequence[FrameRecord], native_from_mesh: NativeFromMesh
+    path: Path,
+    outcomes: Sequence[Outcome],
+    records: Sequence[FrameRecord],
+    native_from_mesh: NativeFromMesh,
 ) -> None:
-    """Write all beliefs as one .npz: poses (I, N, 4, 4) camera_from_native [m], weights (I, N), and their ids (I,).
+    """Write all beliefs as one .npz: poses (I, N, 4, 4) camera_from_native [m], weights (I, N), and
+    their ids (I,).
 
-    The ids are scene_id, im_id and obj_id, as in poses.csv. Image i of one array is image i of the others.
+    The ids are scene_id, im_id and obj_id, as in poses.csv. Image i of one array is image i of the
+    others.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     own = [records[outcome.frame_id] for outcome in outcomes]
-    poses = [to_native(o.poses, native_from_mesh(r.object)).astype(np.float32) for o, r in zip(outcomes, own, strict=True)]
+    poses = [
+        to_native(o.poses, native_from_mesh(r.object)).astype(np.float32)
+        for o, r in zip(outcomes, own, strict=True)
+    ]
     np.savez_compressed(
         path,
         poses=np.stack(poses) if poses else np.zeros((0, 0, 4, 4), np.float32),

@@ -10,10 +10,12 @@ from posefilter.callbacks.tensorboard import Budget
 
 
 class Speed(Callback):
-    """Log `speed/...`: images and steps a second, the share of the training that waits for data, and what validations take.
+    """Log `speed/...`: images and steps a second, the share of the training that waits for data,
+    and what validations take.
 
-    Training's numbers are means since they were last logged, every `log_every_n_steps` steps; validations are left out of
-    them. drawing_share: what other callbacks' figures have taken so far, over the time of all validations without them.
+    Training's numbers are means since they were last logged, every `log_every_n_steps` steps;
+    validations are left out of them. drawing_share: what other callbacks' figures have taken so
+    far, over the time of all validations without them.
     """
 
     def __init__(self) -> None:
@@ -22,7 +24,9 @@ class Speed(Callback):
         self._mark: float | None = None  # when the last batch ended
         self._began = 0.0  # the batch, or the validation
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
+    ) -> None:
         """Count the time since the last batch as waiting."""
         self._began = time.perf_counter()
         if self._mark is not None:
@@ -58,7 +62,13 @@ class Speed(Callback):
         self._began, self._seen = time.perf_counter(), 0
 
     def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Count images."""
         self._seen += len(batch[0])
@@ -70,14 +80,22 @@ class Speed(Callback):
         if trainer.sanity_checking:
             return
         seconds = max(now - self._began, 1e-9)
-        budgets = [found for c in trainer.callbacks if isinstance(found := getattr(c, "budget", None), Budget)]  # type: ignore[attr-defined]
-        numbers = {"validation_seconds": seconds, "validation_images_per_second": self._seen / seconds}
+        others: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        budgets = [b for c in others if isinstance(b := getattr(c, "budget", None), Budget)]
+        numbers = {
+            "validation_seconds": seconds,
+            "validation_images_per_second": self._seen / seconds,
+        }
         if budgets:
-            numbers["drawing_share"] = sum(b.drawn for b in budgets) / max(max(b.validated for b in budgets), 1e-9)
+            numbers["drawing_share"] = sum(b.drawn for b in budgets) / max(
+                max(b.validated for b in budgets), 1e-9
+            )
         self.write_down(trainer, numbers)
 
     def write_down(self, trainer: Trainer, numbers: dict[str, float]) -> None:
         """Hand numbers to the loggers."""
         if trainer.is_global_zero:
             for logger in trainer.loggers:
-                logger.log_metrics({f"speed/{name}": value for name, value in numbers.items()}, trainer.global_step)
+                logger.log_metrics(
+                    {f"speed/{name}": value for name, value in numbers.items()}, trainer.global_step
+                )

@@ -34,7 +34,11 @@ def name_tag(name: str, stage: str) -> str | None:
 
 
 def post_image(
-    trainer: Trainer, name: str, drawn: np.ndarray | bytes, folder: Path | None, stage: str = "validation"
+    trainer: Trainer,
+    name: str,
+    drawn: np.ndarray | bytes,
+    folder: Path | None,
+    stage: str = "validation",
 ) -> None:
     """Show a figure in TensorBoard at the trainer's step, and write it to a file.
 
@@ -55,7 +59,9 @@ def post_image(
         width, height = measure_size(drawn)
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
         for writer in get_writers(trainer):
-            writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step)
+            writer.add_summary(
+                Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step
+            )
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{stage}_{name}{suffix}").write_bytes(packed)
@@ -78,7 +84,8 @@ def get_writers(trainer: Trainer) -> list[FileWriter]:
 class Budget:
     """Lets drawing take at most a share of the time that validations take.
 
-    share: None for no limit. The first drawing is always allowed, since nobody knows what it will cost.
+    share: None for no limit. The first drawing is always allowed, since nobody knows what it will
+    cost.
     """
 
     def __init__(self, share: float | None) -> None:
@@ -96,7 +103,11 @@ class Budget:
 
     def allows(self) -> bool:
         """Tell whether another drawing, as dear as the last one, stays within the share."""
-        return self.share is None or self.last == 0 or self.drawn + self.last <= self.share * self.validated
+        return (
+            self.share is None
+            or self.last == 0
+            or self.drawn + self.last <= self.share * self.validated
+        )
 
     @contextmanager
     def spend(self) -> Iterator[None]:

@@ -1,4 +1,6 @@
-"""Tell TensorBoard how to show a run: a layout of charts that tells its layout, and settings by which runs are compared."""
+"""Tell TensorBoard how to show a run: a layout of charts that tells its layout, and settings by
+which runs are compared.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +14,12 @@ from tensorboard.plugins.hparams.api_pb2 import (
     MetricName,
 )
 from tensorboard.plugins.hparams.api_pb2 import MetricInfo as MetricColumn
-from tensorboard.plugins.hparams.metadata import EXPERIMENT_TAG, NULL_TENSOR, PLUGIN_DATA_VERSION, create_summary_metadata
+from tensorboard.plugins.hparams.metadata import (
+    EXPERIMENT_TAG,
+    NULL_TENSOR,
+    PLUGIN_DATA_VERSION,
+    create_summary_metadata,
+)
 from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torch.utils.tensorboard.summary import custom_scalars
@@ -23,14 +30,24 @@ from posefilter.metrics.registry import find_metric
 Setting = bool | int | float | str
 
 Chart = tuple[str, list[str]]
-# Regular expressions of tags, one line each in a chart. What a method does not log, its charts leave out.
+# Regular expressions of tags, one line each in a chart. What a method does not log, its charts
+# leave out.
 LAYOUT: dict[str, dict[str, Chart]] = {
     "1  Does it work?": {
-        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": ("Multiline", ["val/score$"]),
+        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": (
+            "Multiline",
+            ["val/score$"],
+        ),
         "AUC of ADD and ADD-S": ("Multiline", [r"val/add/auc$", r"val/add_s/auc$"]),
         "median error [mm]": ("Multiline", [r"val/add/median_mm$", r"val/add_s/median_mm$"]),
-        "found: share of the images [%]": ("Multiline", [r"val/add/recall_01d$", r"val/add/recall_2cm$"]),
-        "box IoU, and share of the particles on the object": ("Multiline", [r"val/iou$", r"val/particles_on_object$"]),
+        "found: share of the images [%]": (
+            "Multiline",
+            [r"val/add/recall_01d$", r"val/add/recall_2cm$"],
+        ),
+        "box IoU, and share of the particles on the object": (
+            "Multiline",
+            [r"val/iou$", r"val/particles_on_object$"],
+        ),
     },
     "2  Does it learn?": {
         "losses": ("Multiline", [r"train/(?!learning_rate|coordinate).*"]),
@@ -40,18 +57,30 @@ LAYOUT: dict[str, dict[str, Chart]] = {
     "3  What do the particles do?": {
         "effective particles, by iteration": ("Multiline", [r"filter/ess/step_\d+$"]),
         "spread of the centers [m], by iteration": ("Multiline", [r"filter/spread_m/step_\d+$"]),
-        "spread of the rotations [rad], by iteration": ("Multiline", [r"filter/spread_rad/step_\d+$"]),
+        "spread of the rotations [rad], by iteration": (
+            "Multiline",
+            [r"filter/spread_rad/step_\d+$"],
+        ),
         "spread [px], by iteration": ("Multiline", [r"filter/spread_px/step_\d+$"]),
         "noise level [m] or [px], by iteration": ("Multiline", [r"filter/sigma_(m|px)/step_\d+$"]),
         "where they end": ("Multiline", [r"signs/.*/last$"]),
     },
     "4  Is the belief honest?": {
-        "truths within the region that holds 50 % and 90 % of the belief [%]": ("Multiline", [r"val/belief/coverage_\d+$"]),
+        "truths within the region that holds 50 % and 90 % of the belief [%]": (
+            "Multiline",
+            [r"val/belief/coverage_\d+$"],
+        ),
         "weight near the truth": ("Multiline", [r"val/belief/mass_.*"]),
-        "the truth outscored: share of the images": ("Multiline", [r"val/belief/truth_outscored.*"]),
+        "the truth outscored: share of the images": (
+            "Multiline",
+            [r"val/belief/truth_outscored.*"],
+        ),
     },
     "5  How fast?": {
-        "images a second, in training and in validation": ("Multiline", [r"speed/(train|validation)_images_per_second$"]),
+        "images a second, in training and in validation": (
+            "Multiline",
+            [r"speed/(train|validation)_images_per_second$"],
+        ),
         "share of the training that waits for data": ("Multiline", [r"speed/waiting_share$"]),
         "validation: seconds, and the share of them that is drawing": (
             "Multiline",
@@ -60,13 +89,15 @@ LAYOUT: dict[str, dict[str, Chart]] = {
     },
 }
 
-# What the tab HParams shows of a run, in this order: the validation's score so far and its best, and what the test found.
+# What the tab HParams shows of a run, in this order: the validation's score so far and its best,
+# and what the test found.
 METRICS = (
     "val/score", "val/best_score",
     "test/add/auc", "test/add/recall_01d", "test/add/median_mm", "test/add_s/auc", "test/iou", "test/particles_on_object",
     "test/seconds_per_image", "test/belief/mass_2cm", "test/belief/coverage_90",
 )  # fmt: skip
-# TensorBoard shows the settings that differ first, five of them unless asked for more; these always count as such.
+# TensorBoard shows the settings that differ first, five of them unless asked for more; these always
+# count as such.
 FIRST = ("filter.particles", "loss", "model", "seed", "variant")
 BEST = "val/best_score"
 
@@ -105,7 +136,9 @@ class TensorBoardLayout(Callback):
             logger.log_metrics({BEST: self._best}, trainer.global_step)
 
 
-def describe_run(settings: Mapping[str, Setting], swept: Sequence[str], name: str) -> tuple[Summary, Summary]:
+def describe_run(
+    settings: Mapping[str, Setting], swept: Sequence[str], name: str
+) -> tuple[Summary, Summary]:
     """Return what the tab HParams shows, and the settings of one run.
 
     Args:
@@ -120,7 +153,9 @@ def describe_run(settings: Mapping[str, Setting], swept: Sequence[str], name: st
     first = {*FIRST, *swept}
     columns = [describe_column(name, value, name in first) for name, value in values.items()]
     metrics = [
-        MetricColumn(name=MetricName(tag=tag), display_name=f"{tag.split('/')[0]}: {find_metric(tag).title}")
+        MetricColumn(
+            name=MetricName(tag=tag), display_name=f"{tag.split('/')[0]}: {find_metric(tag).title}"
+        )
         for tag in METRICS
     ]
     experiment = Experiment(hparam_infos=columns, metric_infos=metrics)
@@ -132,7 +167,9 @@ def describe_run(settings: Mapping[str, Setting], swept: Sequence[str], name: st
 
 
 def describe_column(name: str, value: float | str, first: bool) -> HParamInfo:
-    """Return a setting's column; `first`: whether it is among those that are shown without being asked for."""
+    """Return a setting's column; `first`: whether it is among those that are shown without being
+    asked for.
+    """
     kind = DATA_TYPE_STRING if isinstance(value, str) else DATA_TYPE_FLOAT64
     return HParamInfo(name=name, type=kind, differs=first)
 

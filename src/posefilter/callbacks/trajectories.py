@@ -8,29 +8,36 @@ from torch import Tensor
 
 from posefilter.figures.particles import choose_by_weight, normalize_weights
 from posefilter.models.image_space import ImageScene, ImageSpace
-from posefilter.types import Cloud, Trace
+from posefilter.types import Particles, Trace
 
 
-def trace_lineage(clouds: Sequence[Cloud]) -> Tensor:
-    """Return where each particle of the last cloud, and its ancestors before it, stood.  -> (B, T, N, *S)."""
-    last = clouds[-1]
+def trace_lineage(history: Sequence[Particles]) -> Tensor:
+    """Return where each particle of the last cloud, and its ancestors before it, stood.  -> (B, T,
+    N, *S).
+    """
+    last = history[-1]
     rows = torch.arange(len(last.state), device=last.state.device)[:, None]
     index = torch.arange(last.state.shape[1], device=last.state.device).expand(len(last.state), -1)
     path = []
-    for cloud in reversed(clouds):
-        path.append(cloud.state[rows, index])
-        index = cloud.ancestors[rows, index]
+    for particles in reversed(history):
+        path.append(particles.state[rows, index])
+        index = particles.ancestors[rows, index]
     return torch.stack(path[::-1], dim=1)
 
 
 def follow_particles(trace: Trace, most: int = 8) -> Tensor:
-    """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2) [px]."""
-    chosen = choose_by_weight(normalize_weights(trace.clouds[-1], 0), most).unique()
-    return trace_lineage(trace.clouds)[0][:, chosen]
+    """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2)
+    [px].
+    """
+    chosen = choose_by_weight(normalize_weights(trace.particles[-1], 0), most).unique()
+    return trace_lineage(trace.particles)[0][:, chosen]
 
 
 def extract_glimpses(method: ImageSpace, scene: ImageScene, states: Tensor) -> np.ndarray:
-    """Return what particles see where they stand in one image, its colors.  (T, n, 2) [px] -> (T, n, k, k, 3) uint8."""
+    """Return what particles see where they stand in one image, its colors.
+
+    (T, n, 2) [px] -> (T, n, k, k, 3) uint8.
+    """
     seen = method.glimpse(scene.image, states.flatten(0, 1)[None].to(scene.image))[0, :, :3]
     colors = ((seen + 1) / 2).clamp(0, 1).mul(255).round().byte().cpu()
     return colors.unflatten(0, states.shape[:2]).permute(0, 1, 3, 4, 2).numpy()

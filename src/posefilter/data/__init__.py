@@ -1,1 +1,3 @@
-"""Readers, meshes, scenes and loaders: everything above sees metres, the mesh file's frame and OpenCV cameras only."""
+"""Readers, meshes, scenes and loaders: everything above sees meters, the mesh file's frame and
+OpenCV cameras only.
+"""

@@ -1,6 +1,8 @@
-"""Keep decoded, resized frames, so that training waits for no decoder: in memory, on disk, or not at all.
+"""Keep decoded, resized frames, so that training waits for no decoder: in memory, on disk, or not
+at all.
 
-Colour stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it counts as unknown), masks become bits.
+Color stays 8-bit, depth becomes 16-bit (0.1 mm a unit; beyond 6.5535 m it counts as unknown), masks
+become bits.
 """
 
 import hashlib
@@ -13,14 +15,16 @@ from typing import Protocol
 
 import numpy as np
 
-from posefilter.data.confine import check_inside
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
+from posefilter.paths import check_inside
 
 CACHES = ("memory", "disk", "none")
 _HEADER = 4096  # bytes, at most, ahead of an array
-_UNITS = 10_000.0  # a metre
-_LAYOUT = 2  # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is read
+_UNITS = 10_000.0  # a meter
+# of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
+# read
+_LAYOUT = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,19 +85,25 @@ class MemoryCache:
 class DiskCache:
     """Keep frames in a folder, one file an image and one a record, for this and later runs.
 
-    A file is written whole or not at all, and is out of date as soon as a source file's size or time of change differs.
+    A file is written whole or not at all, and is out of date as soon as a source file's size or
+    time of change differs.
     """
 
     def __init__(self, folder: Path, version: str) -> None:
-        """Use a folder; `version` says all that decides the content beside the source files (size, class list, meshes)."""
+        """Use a folder; `version` says all that decides the content beside the source files (size,
+        class list, meshes).
+        """
         check_inside(folder, folder.parent)  # a dataset may bring a link of that name
         self.folder = folder / hashlib.sha256(f"{_LAYOUT} {version}".encode()).hexdigest()[:16]
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "README").write_text(f"decoded frames; may be deleted at any time\n{version}\n")
+            (self.folder / "README").write_text(
+                f"decoded frames; may be deleted at any time\n{version}\n"
+            )
         except OSError as error:
             raise UserError(
-                f"{folder}: the cache cannot be written ({error.strerror}); set data.cache_dir or data.cache=memory"
+                f"{folder}: the cache cannot be written ({error.strerror}); set data.cache_dir or "
+                f"data.cache=memory"
             ) from error
         self._records: dict[str, Prepared] = {}
 
@@ -106,7 +116,9 @@ class DiskCache:
             try:
                 self._records[record.key] = _read_prepared(path)
             except (OSError, ValueError, KeyError, MemoryError, zipfile.BadZipFile) as error:
-                raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}") from error
+                raise UserError(
+                    f"{path}: a damaged file of the cache; delete {self.folder}"
+                ) from error
         return self._records[record.key]
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
@@ -122,7 +134,10 @@ class DiskCache:
             "pose": one.camera_from_object,
             "visibility": np.array(one.visibility),
         }
-        _write(self._path(record.key, _stamp(record), ".npz"), lambda path: np.savez(path, allow_pickle=False, **parts))
+        _write(
+            self._path(record.key, _stamp(record), ".npz"),
+            lambda path: np.savez(path, allow_pickle=False, **parts),
+        )
         self._records[record.key] = one
         return one
 
@@ -166,8 +181,12 @@ class NoCache:
         return unpack(pack_image(sample), one, frame_id)
 
 
-def open_cache(kind: str, folder: Path, version: str, read: Callable[[FrameRecord], Sample]) -> FrameCache:
-    """Return a cache: "memory", "disk" in a folder (see `DiskCache` for `version`), or "none", which reads anew."""
+def open_cache(
+    kind: str, folder: Path, version: str, read: Callable[[FrameRecord], Sample]
+) -> FrameCache:
+    """Return a cache: "memory", "disk" in a folder (see `DiskCache` for `version`), or "none",
+    which reads anew.
+    """
     if kind == "disk":
         return DiskCache(folder, version)
     return MemoryCache() if kind == "memory" else NoCache(read)
@@ -177,11 +196,18 @@ def prepare(sample: Sample) -> Prepared:
     """Return what is kept of a sample beside its image."""
     height, width = sample.mask.shape
     pose, K = sample.camera_from_object.astype(np.float32), sample.intrinsics.astype(np.float32)
-    return Prepared(np.packbits(sample.mask), (height, width), K, pose, sample.object_id, float(sample.visibility))
+    return Prepared(
+        np.packbits(sample.mask),
+        (height, width),
+        K,
+        pose,
+        sample.object_id,
+        float(sample.visibility),
+    )
 
 
 def pack_image(sample: Sample) -> np.ndarray:
-    """Return colour and depth in one array, one after the other.  -> (5 H W,) uint8."""
+    """Return color and depth in one array, one after the other.  -> (5 H W,) uint8."""
     units = np.round(sample.depth * _UNITS)
     depth = np.where(units > 65535, 0, units).astype("<u2")
     return np.concatenate([sample.rgb.ravel(), depth.ravel().view(np.uint8)])
@@ -191,15 +217,28 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     """Return the sample that was packed."""
     height, width = one.shape
     rgb, depth = np.split(image, [3 * height * width])
-    rgb, depth = rgb.reshape(height, width, 3).copy(), depth.view("<u2").reshape(height, width) / np.float32(_UNITS)
+    rgb, depth = (
+        rgb.reshape(height, width, 3).copy(),
+        depth.view("<u2").reshape(height, width) / np.float32(_UNITS),
+    )
     mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
     return Sample(
-        rgb, depth, mask, one.intrinsics.copy(), one.camera_from_object.copy(), one.object_id, frame_id, one.visibility
+        rgb,
+        depth,
+        mask,
+        one.intrinsics.copy(),
+        one.camera_from_object.copy(),
+        one.object_id,
+        frame_id,
+        one.visibility,
     )
 
 
 def _read_prepared(path: Path) -> Prepared:
-    """Read what was kept of a record.  Raises ValueError where the file is larger than what it says."""
+    """Read what was kept of a record.
+
+    Raises ValueError where the file is larger than what it says.
+    """
     with zipfile.ZipFile(path) as archive:
         if sum(part.file_size for part in archive.infolist()) > path.stat().st_size:
             raise ValueError("its parts claim to be larger than the file")
@@ -208,11 +247,13 @@ def _read_prepared(path: Path) -> Prepared:
         bits, visibility = kept["mask_bits"], float(kept["visibility"])
         if len(bits) != -(-height * width // 8):
             raise ValueError("its mask is not of the image's size")
-        return Prepared(bits, (height, width), kept["intrinsics"], kept["pose"], object_id, visibility)
+        return Prepared(
+            bits, (height, width), kept["intrinsics"], kept["pose"], object_id, visibility
+        )
 
 
 def _stamp(record: FrameRecord, files: int | None = None) -> str:
-    """Return what changes when a source file does: any of them, or the first two (colour, depth)."""
+    """Return what changes when a source file does: any of them, or the first two (color, depth)."""
     states = [path.stat() for path in record.files[:files] if path.exists()]
     return " ".join(f"{state.st_size}:{state.st_mtime_ns}" for state in states)
 

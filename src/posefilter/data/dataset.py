@@ -1,4 +1,6 @@
-"""Frames as torch sees them: an indexable dataset, and a shuffle that depends on (seed, epoch) alone."""
+"""Frames as torch sees them: an indexable dataset, and a shuffle that depends on (seed, epoch)
+alone.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -14,7 +16,7 @@ from posefilter.errors import UserError
 from posefilter.types import Batch
 
 if TYPE_CHECKING:
-    from posefilter.data.augment import Augment
+    from posefilter.data.augmentation import Augment
 
 
 def to_batch(sample: Sample) -> Batch:
@@ -34,14 +36,20 @@ def to_batch(sample: Sample) -> Batch:
 class FrameDataset(Dataset[Batch]):
     """The frames of one split.
 
-    Augmentation of sample i draws from a generator of (seed, epoch, i): whatever the workers, the order or the batch.
+    Augmentation of sample i draws from a generator of (seed, epoch, i): whatever the workers, the
+    order or the batch.
     """
 
     def __init__(
-        self, records: Sequence[FrameRecord], cache: FrameCache, augment: "Augment | None" = None, seed: int = 0
+        self,
+        records: Sequence[FrameRecord],
+        cache: FrameCache,
+        augment: "Augment | None" = None,
+        seed: int = 0,
     ) -> None:
         self.records, self._cache, self._augment, self._seed = list(records), cache, augment, seed
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # workers that persist must see it change
+        # workers that persist must see it change
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -73,7 +81,9 @@ class EpochShuffle(Sampler[int]):
 
     def __init__(self, length: int, seed: int, tell: Callable[[int], None]) -> None:
         if length == 0:
-            raise UserError("no training frames are left: see data.split, data.min_visibility and data.object")
+            raise UserError(
+                "no training frames are left: see data.split, data.min_visibility and data.object"
+            )
         self._length, self._seed, self._tell, self._epoch = length, seed, tell, 0
         self._skip = 0
 
@@ -83,7 +93,11 @@ class EpochShuffle(Sampler[int]):
 
     def __iter__(self) -> Iterator[int]:
         """Yield the epoch's order."""
-        order = np.random.default_rng([self._seed, self._epoch, 1 << 20]).permutation(self._length).tolist()
+        order = (
+            np.random.default_rng([self._seed, self._epoch, 1 << 20])
+            .permutation(self._length)
+            .tolist()
+        )
         skip, self._skip = self._skip, 0
         return iter(order[skip:])
 
@@ -98,13 +112,17 @@ class EpochShuffle(Sampler[int]):
 
 
 class ResumableLoader(DataLoader[Batch]):
-    """A loader that knows how many batches it has given; Lightning keeps that in checkpoints, and hands it back."""
+    """A loader that knows how many batches it has given; Lightning keeps that in checkpoints, and
+    hands it back.
+    """
 
     _given = 0
     _start = 0
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
-        """Yield the epoch's batches; those that follow the last one given, where the loader was handed its state."""
+        """Yield the epoch's batches; those that follow the last one given, where the loader was
+        handed its state.
+        """
         start, self._start = self._start, 0
         if isinstance(self.sampler, EpochShuffle):
             self.sampler.skip(start * int(self.batch_size or 1))

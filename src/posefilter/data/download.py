@@ -1,4 +1,6 @@
-"""Fetch an archive: goes on where a broken transfer stopped, checks its SHA-256, appears under its name only when whole."""
+"""Fetch an archive: goes on where a broken transfer stopped, checks its SHA-256, appears under its
+name only when whole.
+"""
 
 import hashlib
 import shutil
@@ -12,24 +14,43 @@ from http.client import HTTPException, HTTPResponse
 from pathlib import Path
 from urllib.parse import urlparse
 
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
 
-from posefilter.data.bars import bars
-from posefilter.data.confine import stays_inside
 from posefilter.errors import UserError
+from posefilter.paths import stays_inside
+from posefilter.progress import bars
 
 _BLOCK = 1 << 20
 _MOST_GROWTH = 100  # times an archive's size, unpacked
-_COLUMNS = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+_COLUMNS = (
+    TextColumn("{task.description}"),
+    BarColumn(),
+    DownloadColumn(),
+    TransferSpeedColumn(),
+    TimeRemainingColumn(),
+)
 
 
 def fetch(
-    url: str, path: Path | str, sha256: str | None = None, retries: int = 5, timeout: float = 30.0, progress: bool = True
+    url: str,
+    path: Path | str,
+    sha256: str | None = None,
+    retries: int = 5,
+    timeout: float = 30.0,
+    progress: bool = True,
 ) -> Path:
     """Download `url` to `path` unless it is there already; return the path.
 
-    The transfer goes to `<path>.part`; up to `retries` more tries, and a later call, ask the server for the rest only.
-    Raises UserError where the server refuses or cannot be reached, and where the checksum differs (the file is removed).
+    The transfer goes to `<path>.part`; up to `retries` more tries, and a later call, ask the server
+    for the rest only. Raises UserError where the server refuses or cannot be reached, and where the
+    checksum differs (the file is removed).
     """
     path = Path(path)
     if path.is_file():
@@ -48,14 +69,17 @@ def fetch(
                 reason = "the connection was cut"
             except urllib.error.HTTPError as error:
                 if error.code < 500:
-                    raise UserError(f"{url}: the server says {error.code} {error.reason}") from error
+                    raise UserError(
+                        f"{url}: the server says {error.code} {error.reason}"
+                    ) from error
                 reason = f"the server says {error.code} {error.reason}"
             except (urllib.error.URLError, HTTPException, TimeoutError, ConnectionError) as error:
                 reason = str(getattr(error, "reason", error)) or type(error).__name__
             if attempt == retries:
                 kept = partial.stat().st_size if partial.is_file() else 0
                 raise UserError(
-                    f"{url}: {reason}, {retries + 1} times; {kept:,} bytes are kept, the same command goes on from there"
+                    f"{url}: {reason}, {retries + 1} times; {kept:,} bytes are kept, the same "
+                    f"command goes on from there"
                 )
     _verify(partial, path, sha256, url)
     partial.replace(path)
@@ -65,16 +89,21 @@ def fetch(
 def unpack(archive: Path | str, folder: Path | str) -> Path:
     """Unpack a zip or tar archive, whole or not at all; return the folder.
 
-    Raises UserError where it is corrupt, names places outside of the folder, holds links, or grows out of bounds.
+    Raises UserError where it is corrupt, names places outside of the folder, holds links, or grows
+    out of bounds.
     """
     archive, folder = Path(archive), Path(folder)
     if folder.exists():
-        raise UserError(f"{folder}: exists already; remove it, or choose another folder to unpack {archive.name} into")
+        raise UserError(
+            f"{folder}: exists already; remove it, or choose another folder to unpack "
+            f"{archive.name} into"
+        )
     check_members(archive)
     partial = folder.with_name(f".{folder.name}.part")
     shutil.rmtree(partial, ignore_errors=True)
     try:
-        how = {} if archive.suffix == ".zip" else {"filter": "data"}  # refuses members that point outside
+        # refuses members that point outside
+        how = {} if archive.suffix == ".zip" else {"filter": "data"}
         shutil.unpack_archive(archive, partial, **how)  # type: ignore[arg-type]
     except (shutil.ReadError, ValueError, EOFError, OSError) as error:
         shutil.rmtree(partial, ignore_errors=True)
@@ -84,11 +113,16 @@ def unpack(archive: Path | str, folder: Path | str) -> Path:
 
 
 def check_members(archive: Path) -> None:
-    """Raise UserError unless an archive holds plain files and folders below its own, of a size that it can have."""
+    """Raise UserError unless an archive holds plain files and folders below its own, of a size that
+    it can have.
+    """
     try:
         if zipfile.is_zipfile(archive):
             with zipfile.ZipFile(archive) as opened:
-                members = [(m.filename, m.file_size, not stat.S_ISLNK(m.external_attr >> 16)) for m in opened.infolist()]
+                members = [
+                    (m.filename, m.file_size, not stat.S_ISLNK(m.external_attr >> 16))
+                    for m in opened.infolist()
+                ]
         else:
             with tarfile.open(archive) as opened_tar:
                 members = [(m.name, m.size, m.isfile() or m.isdir()) for m in opened_tar]
@@ -96,12 +130,16 @@ def check_members(archive: Path) -> None:
         raise UserError(f"{archive}: cannot be unpacked ({error})") from error
     for name, _, plain in members:
         if not plain:
-            raise UserError(f"{archive}: {name[:80]!r} in it is a link or device, which is not unpacked")
+            raise UserError(
+                f"{archive}: {name[:80]!r} in it is a link or device, which is not unpacked"
+            )
         if not stays_inside(name, Path()):
             raise UserError(f"{archive}: {name[:80]!r} in it leads out of its folder")
     total = sum(size for _, size, _ in members)
     if total > _MOST_GROWTH * archive.stat().st_size + _BLOCK:
-        raise UserError(f"{archive}: would grow to {total:,} bytes, more than {_MOST_GROWTH} times its size")
+        raise UserError(
+            f"{archive}: would grow to {total:,} bytes, more than {_MOST_GROWTH} times its size"
+        )
 
 
 def _transfer(url: str, partial: Path, timeout: float, bar: Progress, task: object) -> bool:
@@ -117,7 +155,9 @@ def _transfer(url: str, partial: Path, timeout: float, bar: Progress, task: obje
     with response:
         resumed = response.status == 206
         if resumed and not response.headers.get("Content-Range", "").startswith(f"bytes {have}-"):
-            raise UserError(f"{url}: the server sent another part than was asked for; delete {partial}")
+            raise UserError(
+                f"{url}: the server sent another part than was asked for; delete {partial}"
+            )
         start = have if resumed else 0  # a server that knows no ranges begins anew
         length = response.headers.get("Content-Length")
         total = start + int(length) if length else None
@@ -148,5 +188,6 @@ def _verify(file: Path, path: Path, sha256: str | None, url: str) -> None:
     if digest.hexdigest() != sha256.lower():
         file.unlink()
         raise UserError(
-            f"{path}: SHA-256 is {digest.hexdigest()}, not {sha256.lower()}: {url} has changed, or came broken; removed"
+            f"{path}: SHA-256 is {digest.hexdigest()}, not {sha256.lower()}: {url} has changed, "
+            f"or came broken; removed"
         )

@@ -1,4 +1,6 @@
-"""What every reader yields: frames of a dataset as records, and one object in one image as a `Sample`."""
+"""What every reader yields: frames of a dataset as records, and one object in one image as a
+`Sample`.
+"""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import BadData
 
 SATURATED = 65535  # what 16-bit depth images hold where the distance does not fit
 
@@ -20,11 +22,12 @@ class Sample:
     rgb: np.ndarray  # (H, W, 3) uint8
     depth: np.ndarray  # (H, W) float32 z-depth [m], 0 where unknown
     mask: np.ndarray  # (H, W) bool, the visible part of the object
-    intrinsics: np.ndarray  # (3, 3) float32 [px], pixel centres at integers
+    intrinsics: np.ndarray  # (3, 3) float32 [px], pixel centers at integers
     camera_from_object: np.ndarray  # (4, 4) float32 [m]
     object_id: int  # index into the reader's objects
     frame_id: int  # index into the reader's (or the split's) records
-    visibility: float  # visible share of the pixels that the object would have alone in the frame; NaN where unknown
+    # visible share of the pixels that the object would have alone in the frame; NaN where unknown
+    visibility: float
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class FrameRecord:
     obj_id: int  # the dataset's own number of the class
     object: str  # the class, as the mesh store knows it
     instance: int  # which of the image's annotations
-    files: tuple[Path, ...]  # what decides the content; the first is the colour image
+    files: tuple[Path, ...]  # what decides the content; the first is the color image
 
     @property
     def key(self) -> str:
@@ -89,24 +92,16 @@ class Reader(Protocol):
         ...
 
     def native_from_mesh(self, name: str) -> np.ndarray:
-        """Return the transform from the mesh file's frame into the dataset's own object frame.  -> (4, 4) [m]."""
+        """Return the transform from the mesh file's frame into the dataset's own object frame.  ->
+        (4, 4) [m].
+        """
         ...
 
 
-class BadData(UserError):  # noqa: N818
-    """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
-
-    def __init__(self, path: Path, cause: str, detail: str = "") -> None:
-        super().__init__(f"{path}: {cause}" + (f" ({detail})" if detail else ""))
-        self.path, self.cause, self.detail = path, cause, detail
-
-    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
-        """Survive the way from one process to another."""
-        return BadData, (self.path, self.cause, self.detail)
-
-
 class NotShown(BadData):
-    """An object is listed but has no pixel in the label: no mistake, but nothing to learn from either."""
+    """An object is listed but has no pixel in the label: no mistake, but nothing to learn from
+    either.
+    """
 
     def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
         """Survive the way from one process to another."""
@@ -114,7 +109,9 @@ class NotShown(BadData):
 
 
 def tight_box(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Return (left, top, right, bottom) of the mask's pixels, right and bottom exclusive; all 0 for an empty mask."""
+    """Return (left, top, right, bottom) of the mask's pixels, right and bottom exclusive; all 0 for
+    an empty mask.
+    """
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if len(rows) == 0:
         return 0, 0, 0, 0

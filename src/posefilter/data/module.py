@@ -1,4 +1,6 @@
-"""The data of an experiment: one reader, its splits by scene, and loaders that never keep the training waiting."""
+"""The data of an experiment: one reader, its splits by scene, and loaders that never keep the
+training waiting.
+"""
 
 import dataclasses
 import logging
@@ -17,37 +19,49 @@ from torch.utils.data import DataLoader
 
 from posefilter.data.cache import CACHES, FrameCache, Prepared, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset, ResumableLoader
-from posefilter.data.frames import BadData, FrameRecord, Reader, Sample
-from posefilter.data.generated import ensure_scenes
-from posefilter.data.meshes import BUILTIN, MeshStore, object_model
+from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
-from posefilter.data.readers import default_mesh_scale, open_reader
+from posefilter.data.readers.registry import default_mesh_scale, open_reader
 from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
+from posefilter.meshes.store import BUILTIN, MeshStore, object_model
 from posefilter.types import Batch, ObjectModel
 
 if TYPE_CHECKING:
-    from posefilter.data.augment import Augment
+    from posefilter.data.augmentation import Augment
 
 log = logging.getLogger(__name__)
 
-_STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",), None: NAMES}
+_STAGES = {
+    "fit": ("train", "val"),
+    "validate": ("val",),
+    "test": ("test",),
+    "predict": ("test",),
+    None: NAMES,
+}
 
 
 def spare_cores(most: int = 4) -> int:
-    """Return how many loader processes fit beside a training: what cores torch's threads leave, or with a GPU all but one.
+    """Return how many loader processes fit beside a training: what cores torch's threads leave, or
+    with a GPU all but one.
 
-    The threads of one operation wait for each other, so a process that takes one's core away holds up all of them.
+    The threads of one operation wait for each other, so a process that takes one's core away holds
+    up all of them.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     busy = 1 if torch.cuda.is_available() else torch.get_num_threads()
     return max(0, min(most, cores - busy))
 
 
 class PoseDataModule(LightningDataModule):
-    """Frames of one dataset with the objects asked for, split by scene, resized, cached and augmented."""
+    """Frames of one dataset with the objects asked for, split by scene, resized, cached and
+    augmented.
+    """
 
     def __init__(
         self,
@@ -81,15 +95,17 @@ class PoseDataModule(LightningDataModule):
     ) -> None:
         """Say what to read; nothing is opened before `setup`.
 
-        source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all. meshes: "builtin", a folder
-        or a mesh store; mesh_scale: metres a unit of its files (0.001 for BOP's models, else 1). image_width alone keeps the
-        aspect. split: what part of the scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
-        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`. min_visibility: of training
-        frames; min_visibility_test: of val and test frames (unknown visibility passes). cache: "memory", "none", or "disk"
-        (in `cache_dir`, by default the dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them.
-        limit_*: the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a folder with
-        <class>/points.xyz in the dataset's own frame instead. generate: called with the root where scenes are yet to be
-        rendered. options: the reader's own.
+        source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all.
+        meshes: "builtin", a folder or a mesh store; mesh_scale: meters a unit of its files (0.001
+        for BOP's models, else 1). image_width alone keeps the aspect. split: what part of the
+        scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
+        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`.
+        min_visibility: of training frames; min_visibility_test: of val and test frames (unknown
+        visibility passes). cache: "memory", "none", or "disk" (in `cache_dir`, by default the
+        dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them. limit_*:
+        the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a
+        folder with <class>/points.xyz in the dataset's own frame instead. generate: called with the
+        root where scenes are yet to be rendered. options: the reader's own.
         """
         super().__init__()
         if cache not in CACHES:
@@ -100,8 +116,15 @@ class PoseDataModule(LightningDataModule):
         self._object, self._meshes, self._mesh_scale = object, meshes, mesh_scale
         self._options, self._generate = dict(options or {}), generate
         self._image_width, self._image_height = image_width, image_height
-        self._split, self._split_seed = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}), split_seed
-        self._least = {"train": min_visibility, "val": min_visibility_test, "test": min_visibility_test}
+        self._split, self._split_seed = (
+            dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}),
+            split_seed,
+        )
+        self._least = {
+            "train": min_visibility,
+            "val": min_visibility_test,
+            "test": min_visibility_test,
+        }
         self._limits = {"train": limit_train, "val": limit_val, "test": limit_test}
         self._batch_size, self._batch_size_test = batch_size, batch_size_test or batch_size
         self._workers = spare_cores() if workers is None else workers
@@ -116,12 +139,16 @@ class PoseDataModule(LightningDataModule):
         """Return the mesh store."""
         if isinstance(self._meshes, MeshStore):
             return self._meshes
-        return MeshStore(self._meshes, scale=self._mesh_scale or default_mesh_scale(self.source, self._object))
+        return MeshStore(
+            self._meshes, scale=self._mesh_scale or default_mesh_scale(self.source, self._object)
+        )
 
     @cached_property
     def reader(self) -> Reader:
         """Return the dataset's reader."""
-        return open_reader(self.source, self.root, self._object, self.meshes, self._on_error, **self._options)
+        return open_reader(
+            self.source, self.root, self._object, self.meshes, self._on_error, **self._options
+        )
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -144,8 +171,20 @@ class PoseDataModule(LightningDataModule):
     @cached_property
     def _cache(self) -> FrameCache:
         size = f"{self._image_width}x{self._image_height}"
-        content = (self.source, self.root.resolve(), self.objects, self.meshes.root, size, sorted(self._options.items()))
-        return open_cache(self._cache_kind, Path(self._cache_dir or self.root / ".cache"), f"1 {content}", self._read)
+        content = (
+            self.source,
+            self.root.resolve(),
+            self.objects,
+            self.meshes.root,
+            size,
+            sorted(self._options.items()),
+        )
+        return open_cache(
+            self._cache_kind,
+            Path(self._cache_dir or self.root / ".cache"),
+            f"1 {content}",
+            self._read,
+        )
 
     def prepare_data(self) -> None:
         """Render the scenes where the source is our own and they are not there yet."""
@@ -163,8 +202,13 @@ class PoseDataModule(LightningDataModule):
         """Return what methods and metrics know of a class."""
         name = self.objects[object_id]
         if self.source in ("ycb_video", "bop") and str(self.meshes.root) == BUILTIN:
-            raise UserError(f"{name}: builtin meshes are not the objects of real photographs; give data.meshes=DIR")
-        points = model_points(self._model_points, self.root, name, self.reader.native_from_mesh(name))
+            raise UserError(
+                f"{name}: builtin meshes are not the objects of real photographs; "
+                f"give data.meshes=DIR"
+            )
+        points = model_points(
+            self._model_points, self.root, name, self.reader.native_from_mesh(name)
+        )
         return object_model(self.meshes.load(name), points=points, count=self._points)
 
     def records(self, split: str) -> list[FrameRecord]:
@@ -194,7 +238,9 @@ class PoseDataModule(LightningDataModule):
         """Return shuffled, augmented batches."""
         dataset = self.train_dataset
         order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch)
-        return self._loader(dataset, self._batch_size, sampler=order, drop_last=len(dataset) >= self._batch_size)
+        return self._loader(
+            dataset, self._batch_size, sampler=order, drop_last=len(dataset) >= self._batch_size
+        )
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Return validation batches in order."""
@@ -209,12 +255,19 @@ class PoseDataModule(LightningDataModule):
         return self.test_dataloader()
 
     def split_record(self) -> dict[str, dict[str, int]]:
-        """Return which scenes each split has, with their frames: what the run writes down before it trains."""
+        """Return which scenes each split has, with their frames: what the run writes down before it
+        trains.
+        """
         records = self._records
-        return {name: dict(sorted(Counter(records[i].group for i in part).items())) for name, part in self._parts.items()}
+        return {
+            name: dict(sorted(Counter(records[i].group for i in part).items()))
+            for name, part in self._parts.items()
+        }
 
     def describe(self) -> dict[str, Any]:
-        """Return what the log should say: objects, frames and scenes a split, and what was left out and why."""
+        """Return what the log should say: objects, frames and scenes a split, and what was left out
+        and why.
+        """
         splits = {}
         for name, dataset in self._datasets.items():
             splits[name] = {
@@ -236,7 +289,9 @@ class PoseDataModule(LightningDataModule):
         """Return a split in a sentence."""
         own = self.describe()["splits"][split]
         left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
-        return f"{split}: {own['frames']} frames of {own['scenes']} scenes" + (f"; left out: {left}" if left else "")
+        return f"{split}: {own['frames']} frames of {own['scenes']} scenes" + (
+            f"; left out: {left}" if left else ""
+        )
 
     def _dataset(self, split: str) -> FrameDataset:
         if split not in NAMES:
@@ -256,10 +311,17 @@ class PoseDataModule(LightningDataModule):
         records = [self._records[i] for i in part]
         want = Criteria(self._least[split], limit, self._on_error)
         title = f"decoding {split} frames"
-        chosen, self._left_out[split] = usable(records, self._fetch, want, max(self._workers, 2), title, self._progress)
+        chosen, self._left_out[split] = usable(
+            records, self._fetch, want, max(self._workers, 2), title, self._progress
+        )
         if part and not chosen and limit != 0:
-            raise UserError(f"{self.root}: none of {len(part)} {split} frames can be used: {dict(self._left_out[split])}")
-        return FrameDataset(chosen, self._cache, self._augment if split == "train" else None, self._seed)
+            raise UserError(
+                f"{self.root}: none of {len(part)} {split} frames can be used: "
+                f"{dict(self._left_out[split])}"
+            )
+        return FrameDataset(
+            chosen, self._cache, self._augment if split == "train" else None, self._seed
+        )
 
     def _fetch(self, record: FrameRecord) -> Prepared | BadData:
         kept = self._cache.find(record)
@@ -279,7 +341,8 @@ class PoseDataModule(LightningDataModule):
         return resize(sample, *network_size(height, width, self._image_width, self._image_height))
 
     def _loader(self, dataset: FrameDataset, batch_size: int, **how: Any) -> DataLoader[Batch]:
-        if self._workers > 0:  # a forked worker would wait for ever for OpenCV threads that only its parent has
+        # a forked worker would wait for ever for OpenCV threads that only its parent has
+        if self._workers > 0:
             cv2.setNumThreads(1)
         return ResumableLoader(
             dataset,

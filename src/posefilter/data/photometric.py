@@ -1,9 +1,10 @@
 """Photometric augmentation: a color model of real cameras.
 
-The sensor model of the renderer and the color jitter of `augment.py` leave hues where the texture has them. Real cameras do
-not: their filters mix the channels, their white balance tints, and scans of textures are faded. Each step here is a callable
-`(Sample, draw, rng) -> Sample` that changes color alone; pose, camera, depth and mask stay as they are. A step of strength 0
-returns the image bit for bit, and takes the same number of draws as at any other strength.
+The sensor model of the renderer and the color jitter of `augment.py` leave hues where the texture
+has them. Real cameras do not: their filters mix the channels, their white balance tints, and scans
+of textures are faded. Each step here is a callable `(Sample, draw, rng) -> Sample` that changes
+color alone; pose, camera, depth and mask stay as they are. A step of strength 0 returns the image
+bit for bit, and takes the same number of draws as at any other strength.
 """
 
 import dataclasses
@@ -12,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 
-from posefilter.data.augment import Draw
+from posefilter.data.augmentation import Draw
 from posefilter.data.frames import Sample
-from posefilter.data.sensor import motion_kernel
 from posefilter.errors import UserError
+from posefilter.synthetic.sensor import motion_kernel
 
 _WHITE = np.ones(3)
 
@@ -24,8 +25,8 @@ _WHITE = np.ones(3)
 class ColorResponse:
     """Draw the color response of another camera and apply it to the image, or to the object alone.
 
-    Applied are, in this order: a gamma curve, and one 3 x 3 matrix, the product of a tint, a mixing of channels and a
-    rotation of hue.
+    Applied are, in this order: a gamma curve, and one 3 x 3 matrix, the product of a tint, a mixing
+    of channels and a rotation of hue.
 
     Attributes:
         hue_deg: standard deviation of the rotation about the gray axis [degrees].
@@ -68,7 +69,9 @@ class ColorResponse:
 
 @dataclasses.dataclass(frozen=True)
 class Vignette:
-    """Darken the image towards its corners, by at most `strength` (a share of the brightness) in the corner itself."""
+    """Darken the image towards its corners, by at most `strength` (a share of the brightness) in
+    the corner itself.
+    """
 
     strength: float = 0.35
 
@@ -81,7 +84,9 @@ class Vignette:
 
 @dataclasses.dataclass(frozen=True)
 class Highlights:
-    """Overexpose: brighten so that the brightest areas are clipped.  gain: scale of the half-normal log gain."""
+    """Overexpose: brighten so that the brightest areas are clipped.  gain: scale of the half-normal
+    log gain.
+    """
 
     gain: float = 0.2
     probability: float = 0.3
@@ -96,14 +101,19 @@ class Highlights:
 
 @dataclasses.dataclass(frozen=True)
 class MotionBlur:
-    """Blur along a line, as a moving camera does.  length: the longest line, as a share of the image width."""
+    """Blur along a line, as a moving camera does.  length: the longest line, as a share of the
+    image width.
+    """
 
     length: float = 0.02
     probability: float = 0.2
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, blurred or not."""
-        chosen, length = rng.random() < self.probability, rng.uniform(0, self.length) * sample.mask.shape[1]
+        chosen, length = (
+            rng.random() < self.probability,
+            rng.uniform(0, self.length) * sample.mask.shape[1],
+        )
         kernel = motion_kernel(rng, max(1, round(float(length))))
         if not chosen or len(kernel) < 2:
             return sample
@@ -120,7 +130,10 @@ class Jpeg:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, compressed or not."""
-        chosen, quality = rng.random() < self.probability, int(rng.integers(self.quality[0], self.quality[1] + 1))
+        chosen, quality = (
+            rng.random() < self.probability,
+            int(rng.integers(self.quality[0], self.quality[1] + 1)),
+        )
         if not chosen:
             return sample
         _, data = cv2.imencode(".jpg", sample.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -129,14 +142,18 @@ class Jpeg:
 
 
 def hue_rotation(angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) of RGB by an angle [rad] about the gray axis: gray and the channels' mean stay."""
+    """Return the rotation (3, 3) of RGB by an angle [rad] about the gray axis: gray and the
+    channels' mean stay.
+    """
     axis = _WHITE / np.sqrt(3)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
 def mixing_matrix(off_diagonal: np.ndarray) -> np.ndarray:
-    """Return the matrix (3, 3) with these six off-diagonal entries, row by row, whose rows sum to one: gray stays gray."""
+    """Return the matrix (3, 3) with these six off-diagonal entries, row by row, whose rows sum to
+    one: gray stays gray.
+    """
     matrix = np.zeros((3, 3))
     matrix[~np.eye(3, dtype=bool)] = off_diagonal
     return matrix + np.diag(1 - matrix.sum(1))

@@ -4,19 +4,25 @@ from pathlib import Path
 
 import numpy as np
 
-from posefilter.data.confine import is_plain_name
 from posefilter.errors import UserError
+from posefilter.paths import is_plain_name
 
 
-def model_points(folder: str | Path | None, root: Path, name: str, native_from_mesh: np.ndarray) -> np.ndarray | None:
-    """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P, 3) [m].
+def model_points(
+    folder: str | Path | None, root: Path, name: str, native_from_mesh: np.ndarray
+) -> np.ndarray | None:
+    """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P,
+    3) [m].
 
-    They are looked for in `folder`/<class>/points.xyz, else in `models` beside the dataset, as YCB-Video has them.
+    They are looked for in `folder`/<class>/points.xyz, else in `models` beside the dataset, as
+    YCB-Video has them.
     """
     folders = [Path(folder)] if folder is not None else [root / "models", root.parent / "models"]
     if not is_plain_name(name):
         raise UserError(f"{root}: class with an impossible name {name[:40]!r}")
-    path = next((f / name / "points.xyz" for f in folders if (f / name / "points.xyz").is_file()), None)
+    path = next(
+        (f / name / "points.xyz" for f in folders if (f / name / "points.xyz").is_file()), None
+    )
     if path is None:
         if folder is not None:
             raise UserError(f"{folder}: no {name}/points.xyz here (data.model_points)")

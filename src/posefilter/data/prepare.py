@@ -1,14 +1,16 @@
-"""Go once through a split before it is used: decode into the cache, and find out which frames are fit for use."""
+"""Go once through a split before it is used: decode into the cache, and find out which frames are
+fit for use.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from posefilter.data.bars import bars
 from posefilter.data.cache import Prepared
-from posefilter.data.frames import BadData, FrameRecord, NotShown
-from posefilter.errors import UserError
+from posefilter.data.frames import FrameRecord, NotShown
+from posefilter.errors import BadData, UserError
+from posefilter.progress import bars
 
 _CHUNK = 64  # records decoded at a time
 Fetch = Callable[[FrameRecord], Prepared | BadData]
@@ -24,12 +26,17 @@ class Criteria:
 
 
 def usable(
-    records: Sequence[FrameRecord], fetch: Fetch, want: Criteria, threads: int, title: str, progress: bool
+    records: Sequence[FrameRecord],
+    fetch: Fetch,
+    want: Criteria,
+    threads: int,
+    title: str,
+    progress: bool,
 ) -> tuple[list[FrameRecord], Counter[str]]:
     """Return the records that can be used, and how many were left out for which reason.
 
-    Raises UserError for the first broken file where `on_error` is "raise". An object that is listed but not in the label is
-    no error: it is left out and counted.
+    Raises UserError for the first broken file where `on_error` is "raise". An object that is listed
+    but not in the label is no error: it is left out and counted.
     """
     chosen: list[FrameRecord] = []
     left_out: Counter[str] = Counter()
@@ -38,7 +45,9 @@ def usable(
             break
         if isinstance(found, BadData):
             if want.on_error == "raise" and not isinstance(found, NotShown):
-                raise UserError(f"{found}; data.on_error=skip leaves such frames out and counts them") from found
+                raise UserError(
+                    f"{found}; data.on_error=skip leaves such frames out and counts them"
+                ) from found
             left_out[found.cause] += 1
         elif found.pixels == 0:
             left_out["the mask vanishes at this image size"] += 1

@@ -1,4 +1,4 @@
-"""Resize a sample, so that camera, colour, depth and mask still agree to a fraction of a pixel."""
+"""Resize a sample, so that camera, color, depth and mask still agree to a fraction of a pixel."""
 
 import dataclasses
 
@@ -10,11 +10,15 @@ from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 
-_SMOOTH = 0.02  # neighbouring depths within this share of each other lie on one surface
+_SMOOTH = 0.02  # neighboring depths within this share of each other lie on one surface
 
 
-def network_size(height: int, width: int, image_width: int | None, image_height: int | None) -> tuple[int, int]:
-    """Return the (height, width) to resize an image to; a missing side keeps the aspect, none keeps the size."""
+def network_size(
+    height: int, width: int, image_width: int | None, image_height: int | None
+) -> tuple[int, int]:
+    """Return the (height, width) to resize an image to; a missing side keeps the aspect, none keeps
+    the size.
+    """
     if image_width is None and image_height is None:
         return height, width
     if image_width is None:
@@ -22,16 +26,21 @@ def network_size(height: int, width: int, image_width: int | None, image_height:
     if image_height is None:
         image_height = round(height * image_width / width)
     if min(image_width, image_height) < 8:
-        raise UserError(f"image size {image_width}x{image_height}: at least 8 pixels a side (data.image_width)")
+        raise UserError(
+            f"image size {image_width}x{image_height}: at least 8 pixels a side (data.image_width)"
+        )
     if abs(image_width / width - image_height / height) > 0.02 * image_width / width:
         raise UserError(
-            f"image size {image_width}x{image_height} would stretch {width}x{height}: give data.image_width alone"
+            f"image size {image_width}x{image_height} would stretch {width}x{height}: give "
+            f"data.image_width alone"
         )
     return image_height, image_width
 
 
 def resize(sample: Sample, height: int, width: int) -> Sample:
-    """Return the sample at another size: colour averaged, mask by majority, depth interpolated within surfaces only."""
+    """Return the sample at another size: color averaged, mask by majority, depth interpolated
+    within surfaces only.
+    """
     before = sample.mask.shape
     if before == (height, width):
         return sample
@@ -39,17 +48,24 @@ def resize(sample: Sample, height: int, width: int) -> Sample:
     K = torch.from_numpy(sample.intrinsics.astype(np.float64))
     return dataclasses.replace(
         sample,
-        rgb=cv2.resize(sample.rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
+        rgb=cv2.resize(
+            sample.rgb,
+            (width, height),
+            interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR,
+        ),
         depth=resize_depth(sample.depth, height, width),
         mask=resize_mask(sample.mask, height, width),
-        intrinsics=resize_intrinsics(K, width / before[1], height / before[0]).numpy().astype(np.float32),
+        intrinsics=resize_intrinsics(K, width / before[1], height / before[0])
+        .numpy()
+        .astype(np.float32),
     )
 
 
 def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return the pixels of which the mask covers more than half.  -> (height, width) bool.
 
-    Ties are decided as on a chess board: the nearest old pixel would shift masks by a sixth of a pixel at half the size.
+    Ties are decided as on a chess board: the nearest old pixel would shift masks by a sixth of a
+    pixel at half the size.
     """
     shrinks = height <= mask.shape[0] and width <= mask.shape[1]
     interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -59,10 +75,12 @@ def resize_mask(mask: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return depth read at the new pixels' centres: between known neighbours on one surface, else the nearest pixel.
+    """Return depth read at the new pixels' centers: between known neighbors on one surface, else
+    the nearest pixel.
 
-    Taking the nearest everywhere would shift surfaces by up to half an old pixel, the same way all over the image;
-    interpolating everywhere would invent surfaces between near and far.  (H, W) [m] -> (height, width) [m].
+    Taking the nearest everywhere would shift surfaces by up to half an old pixel, the same way all
+    over the image; interpolating everywhere would invent surfaces between near and far.  (H, W) [m]
+    -> (height, width) [m].
     """
     corners, fractions = [], []
     for new, old in ((height, depth.shape[0]), (width, depth.shape[1])):
@@ -73,7 +91,10 @@ def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
     (top, bottom), (left, right) = corners
     fy, fx = fractions[0][:, None], fractions[1][None, :]
     a, b, c, d = (depth[rows][:, columns] for rows in (top, bottom) for columns in (left, right))
-    low, high = np.minimum(np.minimum(a, b), np.minimum(c, d)), np.maximum(np.maximum(a, b), np.maximum(c, d))
+    low, high = (
+        np.minimum(np.minimum(a, b), np.minimum(c, d)),
+        np.maximum(np.maximum(a, b), np.maximum(c, d)),
+    )
     between = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
     nearest = np.where(fy <= 0.5, np.where(fx <= 0.5, a, b), np.where(fx <= 0.5, c, d))
     return np.where((low > 0) & (high - low <= _SMOOTH * low), between, nearest).astype(np.float32)

@@ -1,4 +1,6 @@
-"""What a mesh says of a mask: which share of the object is seen, and which pixel belongs to which of two instances."""
+"""What a mesh says of a mask: which share of the object is seen, and which pixel belongs to which
+of two instances.
+"""
 
 import threading
 from collections.abc import Sequence
@@ -9,13 +11,15 @@ import cv2
 import numpy as np
 
 from posefilter.data.frames import Sample
-from posefilter.data.meshes import Mesh, MeshStore
-from posefilter.data.render import EmbreeRenderer, render_depth
+from posefilter.meshes.store import Mesh, MeshStore
+from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
 
 @dataclass(eq=False)
 class Geometry:
-    """Render the objects of a mesh store; safe to call from threads, and to send to other processes."""
+    """Render the objects of a mesh store; safe to call from threads, and to send to other
+    processes.
+    """
 
     meshes: MeshStore
     without: set[str] = field(default_factory=set)  # classes whose mesh does not fit the dataset
@@ -23,10 +27,18 @@ class Geometry:
 
     def mesh(self, name: str) -> Mesh | None:
         """Return a class's mesh, None where there is none that fits."""
-        return self.meshes.load(name) if name in self.meshes.names() and name not in self.without else None
+        return (
+            self.meshes.load(name)
+            if name in self.meshes.names() and name not in self.without
+            else None
+        )
 
     def render(
-        self, meshes: Sequence[Mesh], poses: Sequence[np.ndarray], K: np.ndarray, shape: tuple[int, int]
+        self,
+        meshes: Sequence[Mesh],
+        poses: Sequence[np.ndarray],
+        K: np.ndarray,
+        shape: tuple[int, int],
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return depth (H, W) [m] and the index of the mesh seen (H, W), -1 for none."""
         if not hasattr(self._local, "renderer"):
@@ -34,17 +46,24 @@ class Geometry:
         return render_depth(meshes, poses, K, *shape, renderer=self._local.renderer)
 
     def visible_share(self, name: str, sample: Sample) -> float:
-        """Return mask pixels over those that the object would have alone in the frame; NaN without a mesh."""
+        """Return mask pixels over those that the object would have alone in the frame; NaN without
+        a mesh.
+        """
         mesh = self.mesh(name)
         if mesh is None:
             return float("nan")
         height, width = sample.mask.shape
-        _, index = self.render([mesh], [sample.camera_from_object], sample.intrinsics, (height, width))
+        _, index = self.render(
+            [mesh], [sample.camera_from_object], sample.intrinsics, (height, width)
+        )
         alone = int((index == 0).sum())
         return min(float(sample.mask.sum()) / alone, 1.0) if alone else float("nan")
 
-    def instances(self, name: str, poses: Sequence[np.ndarray], K: np.ndarray, mask: np.ndarray) -> list[np.ndarray] | None:
-        """Split the mask of one class into its instances': each pixel to the instance rendered there, or nearest.
+    def instances(
+        self, name: str, poses: Sequence[np.ndarray], K: np.ndarray, mask: np.ndarray
+    ) -> list[np.ndarray] | None:
+        """Split the mask of one class into its instances': each pixel to the instance rendered
+        there, or nearest.
 
         Returns None without a mesh.
         """
@@ -54,7 +73,10 @@ class Geometry:
         _, index = self.render([mesh] * len(poses), poses, K, (mask.shape[0], mask.shape[1]))
         nowhere = np.full(mask.shape, np.float32(mask.size))
         seen = [(index == k) for k in range(len(poses))]
-        reach = [cv2.distanceTransform(1 - s.astype(np.uint8), cv2.DIST_L2, 5) if s.any() else nowhere for s in seen]
+        reach = [
+            cv2.distanceTransform(1 - s.astype(np.uint8), cv2.DIST_L2, 5) if s.any() else nowhere
+            for s in seen
+        ]
         owner = np.argmin(np.stack(reach), axis=0)
         return [mask & (owner == k) for k in range(len(poses))]
 

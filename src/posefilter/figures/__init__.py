@@ -1,1 +1,4 @@
-"""Figures of what a filter sees and believes: arrays in, images out.  Nothing here knows Lightning."""
+"""Figures of what a filter sees and believes: arrays in, images out.
+
+Nothing here knows Lightning.
+"""

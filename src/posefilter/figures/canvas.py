@@ -1,4 +1,5 @@
-"""What every picture shares: colors, lines that show on any ground, lettering, rows and grids of tiles.
+"""What every picture shares: colors, lines that show on any ground, lettering, rows and grids of
+tiles.
 
 Pictures are (H, W, 3) uint8 RGB. Places are pixels (u, v) whose centers have integer coordinates.
 """
@@ -18,7 +19,8 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 Color = tuple[int, int, int]
-ESTIMATE: Color = (255, 80, 200)  # neither is a color that photographs of cartons and tables are full of
+# neither is a color that photographs of cartons and tables are full of
+ESTIMATE: Color = (255, 80, 200)
 TRUTH: Color = (70, 235, 120)
 AXES: tuple[Color, Color, Color] = ((235, 60, 50), (60, 190, 70), (70, 130, 255))  # x, y, z
 INK: Color = (32, 36, 44)
@@ -44,12 +46,20 @@ class View(NamedTuple):
     height: int
 
     def show(self, rgb: np.ndarray) -> np.ndarray:
-        """Return what is seen, gray beyond the photograph's edges.  (H, W, 3) uint8 -> (height, width, 3) uint8."""
+        """Return what is seen, gray beyond the photograph's edges.
+
+        (H, W, 3) uint8 -> (height, width, 3) uint8.
+        """
         a = 1 / self.scale
         back = np.array([[a, 0, self.left + a / 2], [0, a, self.top + a / 2]])
         how = (cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
-        out = cv2.warpAffine(rgb, back, (self.width, self.height), flags=how, borderMode=cv2.BORDER_REPLICATE)
-        for line, start, size in ((out, self.top, rgb.shape[0]), (out.swapaxes(0, 1), self.left, rgb.shape[1])):
+        out = cv2.warpAffine(
+            rgb, back, (self.width, self.height), flags=how, borderMode=cv2.BORDER_REPLICATE
+        )
+        for line, start, size in (
+            (out, self.top, rgb.shape[0]),
+            (out.swapaxes(0, 1), self.left, rgb.shape[1]),
+        ):
             at = start + (np.arange(len(line)) + 0.5) / self.scale
             line[(at < -0.5) | (at > size - 0.5)] = _BEYOND
         return np.asarray(out)
@@ -67,7 +77,9 @@ class View(NamedTuple):
 
     def finer(self, factor: int) -> "View":
         """Return the same part at a multiple of the size."""
-        return View(self.left, self.top, self.scale * factor, self.width * factor, self.height * factor)
+        return View(
+            self.left, self.top, self.scale * factor, self.width * factor, self.height * factor
+        )
 
 
 def full_view(height: int, width: int, shown: int) -> View:
@@ -77,9 +89,13 @@ def full_view(height: int, width: int, shown: int) -> View:
 
 
 def close_up(points: np.ndarray, height: int, width: int, shown: int, margin: float = 0.25) -> View:
-    """Return a view round places (P, 2) [px], as wide to high as the photograph, and no larger than it."""
+    """Return a view round places (P, 2) [px], as wide to high as the photograph, and no larger than
+    it.
+    """
     low, high = points.min(0), points.max(0)
-    reach = float(max(1.0, *((high - low) / 2 * (1 + 2 * margin) / [width, height] * max(width, height))))
+    reach = float(
+        max(1.0, *((high - low) / 2 * (1 + 2 * margin) / [width, height] * max(width, height)))
+    )
     share = min(1.0, 2 * reach / max(width, height))
     size = np.array([width, height]) * share
     corner = np.clip((low + high) / 2 - size / 2, -0.5, np.array([width, height]) - 0.5 - size)
@@ -88,10 +104,21 @@ def close_up(points: np.ndarray, height: int, width: int, shown: int, margin: fl
 
 
 def draw_lines(
-    picture: np.ndarray, paths: Sequence[np.ndarray], color: Color, width: int, closed: bool = False, halo: bool = True
+    picture: np.ndarray,
+    paths: Sequence[np.ndarray],
+    color: Color,
+    width: int,
+    closed: bool = False,
+    halo: bool = True,
 ) -> None:
-    """Draw anti-aliased lines, with a dark halo so that they show on any ground.  paths: each (P, 2) [px]."""
-    fixed = [np.round(np.clip(path, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(np.int32) for path in paths if len(path) > 1]
+    """Draw anti-aliased lines, with a dark halo so that they show on any ground.  paths: each (P,
+    2) [px].
+    """
+    fixed = [
+        np.round(np.clip(path, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(np.int32)
+        for path in paths
+        if len(path) > 1
+    ]
     if not fixed:
         return
     if halo:
@@ -99,8 +126,13 @@ def draw_lines(
     cv2.polylines(picture, fixed, closed, color, width, cv2.LINE_AA, _SHIFT)
 
 
-def draw_dots(picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radius: float | np.ndarray) -> None:
-    """Draw anti-aliased discs, later ones on top.  (P, 2) [px], (P, 3) uint8, one radius or (P,) [px]."""
+def draw_dots(
+    picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radius: float | np.ndarray
+) -> None:
+    """Draw anti-aliased discs, later ones on top.
+
+    (P, 2) [px], (P, 3) uint8, one radius or (P,) [px].
+    """
     at = np.round(np.clip(pixels, -_FARTHEST, _FARTHEST) * 2**_SHIFT).astype(int)
     sizes = np.broadcast_to(np.round(np.asarray(radius) * 2**_SHIFT).astype(int), len(at))
     for (u, v), color, size in zip(at.tolist(), colors.tolist(), sizes.tolist(), strict=True):
@@ -108,18 +140,29 @@ def draw_dots(picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radiu
 
 
 def stamp_dots(picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radius: int) -> None:
-    """Draw discs at whole pixels and without smooth rims, many at once, later ones on top.  (P, 2) [px], (P, 3) uint8."""
+    """Draw discs at whole pixels and without smooth rims, many at once, later ones on top.
+
+    (P, 2) [px], (P, 3) uint8.
+    """
     line = np.arange(-radius, radius + 1)
     disc = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
     disc = disc[(disc * disc).sum(1) <= radius * (radius + 0.5)]
-    at = (np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)[:, None] + disc).reshape(-1, 2)
+    at = (np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)[:, None] + disc).reshape(
+        -1, 2
+    )
     seen = ((at >= 0) & (at < [picture.shape[1], picture.shape[0]])).all(1)
     picture[at[seen, 1], at[seen, 0]] = np.repeat(colors, len(disc), axis=0)[seen]
 
 
 def halve(picture: np.ndarray) -> np.ndarray:
-    """Return a picture at half its size, each pixel the mean of four: what was drawn at twice the size is smooth."""
-    return np.asarray(cv2.resize(picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA))
+    """Return a picture at half its size, each pixel the mean of four: what was drawn at twice the
+    size is smooth.
+    """
+    return np.asarray(
+        cv2.resize(
+            picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA
+        )
+    )
 
 
 @cache
@@ -129,8 +172,11 @@ def load_font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), size)
 
 
-def draw_row(width: int, text: str, entries: Sequence[tuple[str, Color]] = (), size: int = 15) -> np.ndarray:
-    """Return a row of writing: text at the left, a legend of colored lines at the right.  -> (h, width, 3) uint8.
+def draw_row(
+    width: int, text: str, entries: Sequence[tuple[str, Color]] = (), size: int = 15
+) -> np.ndarray:
+    """Return a row of writing: text at the left, a legend of colored lines at the right.  -> (h,
+    width, 3) uint8.
 
     Writing that does not fit beside the legend goes on a line of its own.
     """
@@ -150,13 +196,21 @@ def draw_row(width: int, text: str, entries: Sequence[tuple[str, Color]] = (), s
 
 
 def arrange_grid(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> np.ndarray:
-    """Lay tiles out in rows, each row as high as its highest tile, each column as wide as the widest.  -> picture."""
+    """Lay tiles out in rows, each row as high as its highest tile, each column as wide as the
+    widest.  -> picture.
+    """
     columns = min(columns, len(tiles))
     width = max(tile.shape[1] for tile in tiles)
     rows = []
     for i in range(0, len(tiles), columns):
         row = np.full(
-            (max(t.shape[0] for t in tiles[i : i + columns]) + gap, columns * (width + gap) + gap, 3), 255, np.uint8
+            (
+                max(t.shape[0] for t in tiles[i : i + columns]) + gap,
+                columns * (width + gap) + gap,
+                3,
+            ),
+            255,
+            np.uint8,
         )
         for k, tile in enumerate(tiles[i : i + columns]):
             left = gap + k * (width + gap)
@@ -188,7 +242,9 @@ def to_png(picture: np.ndarray) -> bytes:
 
 
 def to_jpeg(picture: np.ndarray, quality: int = 85) -> bytes:
-    """Return a picture as the bytes of a JPEG, its colors as sharp as its brightness: lines are thin."""
+    """Return a picture as the bytes of a JPEG, its colors as sharp as its brightness: lines are
+    thin.
+    """
     stream = BytesIO()
     Image.fromarray(picture).save(stream, "JPEG", quality=quality, subsampling=0)
     return stream.getvalue()

@@ -5,7 +5,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from posefilter.figures.canvas import Color, arrange_grid
-from posefilter.figures.layout import DETAIL, WIDTH, add_caption, compose_figure, draw_legend, draw_text, tile_width
+from posefilter.figures.layout import (
+    DETAIL,
+    WIDTH,
+    add_caption,
+    compose_figure,
+    draw_legend,
+    draw_text,
+    tile_width,
+)
 from posefilter.figures.panels import Axis, draw_curve_panel
 from posefilter.metrics.registry import HIGHER, PERCENT, MetricInfo, find_metric
 
@@ -13,7 +21,9 @@ _LINE: Color = (43, 108, 176)
 _HEIGHT = 190  # [px] of a panel
 
 
-def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health") -> np.ndarray:
+def draw_health(
+    curves: Mapping[str, Sequence[float]], images: int, title: str = "Filter health"
+) -> np.ndarray:
     """Draw how the filter fares over its iterations, one panel a quantity.
 
     Args:
@@ -32,19 +42,35 @@ def draw_health(curves: Mapping[str, Sequence[float]], images: int, title: str =
         low, high = choose_bounds(info, numbers)
         y = Axis(info.unit, low, high, choose_ticks(low, high))
         places = np.arange(len(numbers), dtype=float)
-        panel = draw_curve_panel([(numbers, _LINE)], places, make_iteration_axis(len(numbers)), y, width, _HEIGHT, thick=3)
+        panel = draw_curve_panel(
+            [(numbers, _LINE)],
+            places,
+            make_iteration_axis(len(numbers)),
+            y,
+            width,
+            _HEIGHT,
+            thick=3,
+        )
         panels.append(add_caption(panel, info.label))
     return compose_figure(
-        title, draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL), arrange_grid(panels, 2)
+        title,
+        draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL),
+        arrange_grid(panels, 2),
     )
 
 
-def draw_shares(curves: Mapping[str, tuple[Sequence[float], Color]], title: str, foot: str) -> np.ndarray:
-    """Draw shares of the particles over the iterations, in percent, in one panel.  curves: numbers in [0, 1], a color."""
+def draw_shares(
+    curves: Mapping[str, tuple[Sequence[float], Color]], title: str, foot: str
+) -> np.ndarray:
+    """Draw shares of the particles over the iterations, in percent, in one panel.  curves: numbers
+    in [0, 1], a color.
+    """
     count = max(len(values) for values, _ in curves.values())
     lines = [(100 * np.asarray(values, float), color) for values, color in curves.values()]
     y = Axis("share of the particles [%]", -2, 102, (0, 25, 50, 75, 100))
-    panel = draw_curve_panel(lines, np.arange(count, dtype=float), make_iteration_axis(count), y, WIDTH, 380, thick=4)
+    panel = draw_curve_panel(
+        lines, np.arange(count, dtype=float), make_iteration_axis(count), y, WIDTH, 380, thick=4
+    )
     entries = [(name.replace("_", " "), color) for name, (_, color) in curves.items()]
     return compose_figure(title, panel, draw_legend(entries), draw_text(foot, DETAIL))
 
@@ -56,7 +82,9 @@ def make_iteration_axis(count: int) -> Axis:
 
 
 def choose_bounds(info: MetricInfo, values: np.ndarray) -> tuple[float, float]:
-    """Return where a panel ends: shares at 0 and 100, sizes at 0, the rest a little beyond its numbers."""
+    """Return where a panel ends: shares at 0 and 100, sizes at 0, the rest a little beyond its
+    numbers.
+    """
     if info.limits == PERCENT:
         return 0.0, 100.0
     good = values[np.isfinite(values)]
@@ -74,4 +102,7 @@ def choose_ticks(low: float, high: float, most: int = 4) -> tuple[float, ...]:
     rough = (high - low) / most
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * (1 - 1e-9))
-    return tuple(float(round(i * step, 12)) for i in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1))
+    return tuple(
+        float(round(i * step, 12))
+        for i in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)
+    )

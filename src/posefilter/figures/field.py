@@ -1,4 +1,6 @@
-"""Draw slices of the likelihood field: of poses about the truth, and of single points in the object's frame."""
+"""Draw slices of the likelihood field: of poses about the truth, and of single points in the
+object's frame.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,10 +8,34 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from posefilter.figures.canvas import AXES, ESTIMATE, TRUTH, Color, arrange_grid, draw_dots, full_view
-from posefilter.figures.layout import CAPTION, DETAIL, add_caption, compose_figure, draw_legend, draw_text, tile_width
+from posefilter.figures.canvas import (
+    AXES,
+    ESTIMATE,
+    TRUTH,
+    Color,
+    arrange_grid,
+    draw_dots,
+    full_view,
+)
+from posefilter.figures.layout import (
+    CAPTION,
+    DETAIL,
+    add_caption,
+    compose_figure,
+    draw_legend,
+    draw_text,
+    tile_width,
+)
 from posefilter.figures.overlay import list_axes
-from posefilter.figures.panels import SURFACE, Axis, Mark, draw_color_scale, draw_curve_panel, draw_heat_panel, map_colors
+from posefilter.figures.panels import (
+    SURFACE,
+    Axis,
+    Mark,
+    draw_color_scale,
+    draw_curve_panel,
+    draw_heat_panel,
+    map_colors,
+)
 
 PLANES = ((0, 1), (0, 2), (1, 2))  # of object axes
 _NAMES = "xyz"
@@ -23,7 +49,9 @@ class PoseField(NamedTuple):
 
     sigmas: tuple[float, ...]  # (L,) noise levels [m]
     reaches: tuple[float, ...]  # (L,) how far the slices go [m]
-    planes: np.ndarray  # (L, 3, G, G): plane (a, b); rows by the shift along axis b, columns by that along a, both rising
+    # (L, 3, G, G): plane (a, b); rows by the shift along axis b, columns by that along a, both
+    # rising
+    planes: np.ndarray
     degrees: np.ndarray  # (A,)
     turns: np.ndarray  # (L, 3, A): turned about each of the object's axes
 
@@ -54,16 +82,23 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
             x, y = (make_shift_axis(f"shift in {_NAMES[axis]} [mm]", reach) for axis in (a, b))
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
-                marks.append(Mark(1000 * float(estimate[a]), 1000 * float(estimate[b]), ESTIMATE, "square"))
+                marks.append(
+                    Mark(1000 * float(estimate[a]), 1000 * float(estimate[b]), ESTIMATE, "square")
+                )
             row.append(draw_heat_panel(color_scores(values, low), x, y, _COLUMN, marks))
         ends = draw_color_scale(f"{low:.3g}", "0", width=_COLUMN, size=DETAIL)
         rows[0][-1] = add_caption(np.concatenate([ends, rows[0][-1]]), f"{1000 * sigma:.3g} mm")
         x = Axis("turn [degrees]", -180, 180, (-180, 0, 180))
-        y = Axis("score", low, max(1.15 * max(float(own.max()), 0.0), -0.06 * low), (round_down(low), 0))
+        y = Axis(
+            "score", low, max(1.15 * max(float(own.max()), 0.0), -0.06 * low), (round_down(low), 0)
+        )
         lines = [(curve, color) for curve, color in zip(field.turns[k], AXES, strict=True)]
         rows[3].append(draw_curve_panel(lines, field.degrees, x, y, _COLUMN, 170))
     entries = [("truth", TRUTH), *([] if estimate is None else [("estimate", ESTIMATE)])]
-    entries += [("beats truth", _ABOVE), *((f"turn {name}" if name == "x" else name, c) for name, c in list_axes())]
+    entries += [
+        ("beats truth", _ABOVE),
+        *((f"turn {name}" if name == "x" else name, c) for name, c in list_axes()),
+    ]
     said = "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along the object's axes"
     parts = [
         draw_text("at noise levels of", CAPTION),
@@ -74,7 +109,10 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
 
 
 def color_scores(values: np.ndarray, low: float) -> np.ndarray:
-    """Return scores less the truth's as colors, `low` to 0, black where they are above.  (G, G) -> finer, (*, 3) uint8."""
+    """Return scores less the truth's as colors, `low` to 0, black where they are above.
+
+    (G, G) -> finer, (*, 3) uint8.
+    """
     side = (len(values) - 1) * _FINE + 1
     spots = np.linspace(0, len(values) - 1, side, dtype=np.float32)
     u, v = np.meshgrid(spots, spots)
@@ -85,7 +123,7 @@ def color_scores(values: np.ndarray, low: float) -> np.ndarray:
 
 
 def make_shift_axis(label: str, reach: float) -> Axis:
-    """Return an axis from -reach to reach [m] that is labeled in millimetres."""
+    """Return an axis from -reach to reach [m] that is labeled in millimeters."""
     tick = round_down(1000 * reach * 0.9)
     return Axis(label, -1000 * reach, 1000 * reach, (-tick, 0, tick))
 
@@ -95,14 +133,22 @@ def round_down(value: float) -> float:
     if value == 0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(abs(value)))
-    steps = [step for step in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9) if step * power <= abs(value) * (1 + 1e-9)]
+    steps = [
+        step
+        for step in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 9)
+        if step * power <= abs(value) * (1 + 1e-9)
+    ]
     return float(np.sign(value) * steps[-1] * power)
 
 
-def draw_point_field(fields: Sequence[PointField], rgb: np.ndarray, surface: np.ndarray, title: str) -> np.ndarray:
-    """Draw a row a slice, a column a noise level, below photographs of the points that they are about.
+def draw_point_field(
+    fields: Sequence[PointField], rgb: np.ndarray, surface: np.ndarray, title: str
+) -> np.ndarray:
+    """Draw a row a slice, a column a noise level, below photographs of the points that they are
+    about.
 
-    rgb (H, W, 3) uint8; surface (P, 3): points of the object's surface from its center [m]; those near a slice are shown.
+    rgb (H, W, 3) uint8; surface (P, 3): points of the object's surface from its center [m]; those
+    near a slice are shown.
     """
     pixels = {field.on: field.pixel for field in fields}
     photographs = [
@@ -120,14 +166,22 @@ def draw_point_field(fields: Sequence[PointField], rgb: np.ndarray, surface: np.
         most = max(float(np.abs(field.judged).max()), float(np.abs(field.own).max()), 1e-6)
         tiles = []
         for sigma, judged, own in zip(field.sigmas, field.judged, field.own, strict=True):
-            panel = draw_heat_panel(map_colors(judged, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots)
-            tiles.append(add_caption(add_caption(panel, f"at the ring: {own:+.2f}", DETAIL), f"{1000 * sigma:.3g} mm"))
+            panel = draw_heat_panel(
+                map_colors(judged, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots
+            )
+            tiles.append(
+                add_caption(
+                    add_caption(panel, f"at the ring: {own:+.2f}", DETAIL), f"{1000 * sigma:.3g} mm"
+                )
+            )
         place = f"plane {_NAMES[normal]} = {1000 * field.place[normal]:.0f} mm"
         parts += [
             draw_text(f"{'On' if field.on else 'Off'} it: {place}, at noise levels of", CAPTION),
             arrange_grid(tiles, len(tiles)),
         ]
-        parts.append(draw_color_scale(f"judged: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION))
+        parts.append(
+            draw_color_scale(f"judged: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION)
+        )
     entries = [("where the truth puts it", TRUTH), ("surface near the slice", SURFACE)]
     return compose_figure(title, *parts, draw_legend(entries))
 

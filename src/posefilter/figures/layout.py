@@ -1,7 +1,7 @@
 """Figures that are read in small: one width for all, and one scale of letters.
 
-TensorBoard's cards show a figure at half its width, and take every second pixel rather than the mean of two: there a title
-and a legend are read, captions nearly so; detail is for the whole size.
+TensorBoard's cards show a figure at half its width, and take every second pixel rather than the
+mean of two: there a title and a legend are read, captions nearly so; detail is for the whole size.
 """
 
 import math
@@ -27,7 +27,8 @@ def tile_width(columns: int) -> int:
 
 
 def compose_figure(title: str, *parts: np.ndarray) -> np.ndarray:
-    """Put parts below each other, each in the middle of the figure, under a title.  -> (h, WIDTH, 3) uint8.
+    """Put parts below each other, each in the middle of the figure, under a title.  -> (h, WIDTH,
+    3) uint8.
 
     title: its first line is the title, in bold; what follows is said below it.
     """
@@ -70,7 +71,9 @@ def wrap_text(text: str, letters: ImageFont.FreeTypeFont, width: float) -> list[
 
 
 def cut_text(text: str, size: int, width: int) -> str:
-    """Return the end of a name, as much of it as fits on one line: what tells frames apart stands at their names' end."""
+    """Return the end of a name, as much of it as fits on one line: what tells frames apart stands
+    at their names' end.
+    """
     letters = load_font(size)
     for start in range(len(text)):
         cut = text if start == 0 else "…" + text[start:]
@@ -83,11 +86,17 @@ def format_length(length: float) -> str:
     """Return a length [m] in words: in millimeters, or in meters where these get long."""
     if length < 0.9995:
         return f"{1000 * length:.3g} mm"
-    return "missed" if math.isinf(length) else f"{length:.2f} m" if length < 100 else f"{length:.0f} m"
+    return (
+        "missed" if math.isinf(length) else f"{length:.2f} m" if length < 100 else f"{length:.0f} m"
+    )
 
 
-def draw_legend(entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: int = TITLE) -> np.ndarray:
-    """Return what colors mean, each a stroke of the color before its word, in as many lines as that needs.  -> picture."""
+def draw_legend(
+    entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: int = TITLE
+) -> np.ndarray:
+    """Return what colors mean, each a stroke of the color before its word, in as many lines as that
+    needs.  -> picture.
+    """
     letters = load_font(size)
     line, stroke = round(size * _LEADING), max(4, size // 4)
     places, left, row = [], GAP, 0
@@ -106,8 +115,12 @@ def draw_legend(entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: 
     return np.asarray(image)
 
 
-def draw_scale(before: str, ramp: np.ndarray, after: str, width: int = WIDTH, size: int = TITLE) -> np.ndarray:
-    """Return a scale of colors: what it starts from, the colors (n, 3) uint8, what it ends at.  -> picture."""
+def draw_scale(
+    before: str, ramp: np.ndarray, after: str, width: int = WIDTH, size: int = TITLE
+) -> np.ndarray:
+    """Return a scale of colors: what it starts from, the colors (n, 3) uint8, what it ends at.  ->
+    picture.
+    """
     letters = load_font(size)
     line = round(size * _LEADING)
     left = round(GAP + letters.getlength(before) + 10)
@@ -118,7 +131,9 @@ def draw_scale(before: str, ramp: np.ndarray, after: str, width: int = WIDTH, si
     pen.text((right + 10, line / 2), after, fill=INK, font=letters, anchor="lm")
     out = np.asarray(image).copy()
     if right > left:
-        out[size // 4 : -size // 4, left:right] = ramp[np.linspace(0, len(ramp) - 1, right - left).round().astype(int)]
+        out[size // 4 : -size // 4, left:right] = ramp[
+            np.linspace(0, len(ramp) - 1, right - left).round().astype(int)
+        ]
     return out
 
 

@@ -1,12 +1,30 @@
-"""Draw what a network says of every cell of an image: where the object is, which of its points, and where to look."""
+"""Draw what a network says of every cell of an image: where the object is, which of its points, and
+where to look.
+"""
 
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from posefilter.figures.canvas import TRUTH, Color, View, arrange_grid, draw_dots, draw_lines, full_view, halve
-from posefilter.figures.layout import DETAIL, add_caption, compose_figure, draw_legend, draw_text, tile_width
+from posefilter.figures.canvas import (
+    TRUTH,
+    Color,
+    View,
+    arrange_grid,
+    draw_dots,
+    draw_lines,
+    full_view,
+    halve,
+)
+from posefilter.figures.layout import (
+    DETAIL,
+    add_caption,
+    compose_figure,
+    draw_legend,
+    draw_text,
+    tile_width,
+)
 from posefilter.figures.overlay import Shape, list_axes, outline_object, trace_outline
 from posefilter.figures.panels import draw_color_scale, map_colors
 from posefilter.figures.particles import draw_many_axes, draw_particles, draw_weight_scale
@@ -26,25 +44,48 @@ class Proposals(NamedTuple):
 
 
 def draw_proposals(
-    said: Proposals, rgb: np.ndarray, K: np.ndarray, truth: np.ndarray, shape: Shape, radius: float, title: str
+    said: Proposals,
+    rgb: np.ndarray,
+    K: np.ndarray,
+    truth: np.ndarray,
+    shape: Shape,
+    radius: float,
+    title: str,
 ) -> np.ndarray:
-    """Draw the chance map, the object's points as colors beside the true ones, and poses drawn from them."""
+    """Draw the chance map, the object's points as colors beside the true ones, and poses drawn from
+    them.
+    """
     view = full_view(rgb.shape[0], rgb.shape[1], tile_width(2))
     edge = outline_object(truth, shape, view.camera(K), view.height, view.width)
     chance = draw_heat_map(rgb, said.chance, view)
     draw_lines(chance, edge, TRUTH, 2, closed=True)
     drawn = view.finer(2).show(rgb)
     draw_many_axes(drawn, view.finer(2).place(said.axes), 0.8)
-    draw_dots(drawn, view.finer(2).place(said.axes[:, 0]), np.tile(np.array([_PROPOSED]), (len(said.axes), 1)), 5)
+    draw_dots(
+        drawn,
+        view.finer(2).place(said.axes[:, 0]),
+        np.tile(np.array([_PROPOSED]), (len(said.axes), 1)),
+        5,
+    )
     drawn = halve(drawn)
     draw_lines(drawn, edge, TRUTH, 2, closed=True)
-    mean = f"{1000 * said.error:.0f} mm off on average" if np.isfinite(said.error) else "of the object's own frame"
+    mean = (
+        f"{1000 * said.error:.0f} mm off on average"
+        if np.isfinite(said.error)
+        else "of the object's own frame"
+    )
     tiles = [
         add_caption(add_caption(chance, "that a cell shows the object", DETAIL), "chance"),
         add_caption(add_caption(drawn, "from these maps", DETAIL), f"{len(said.axes)} poses drawn"),
-        add_caption(add_caption(draw_point_map(said.coordinates, said.chance, view), mean, DETAIL), "points, predicted"),
         add_caption(
-            add_caption(draw_point_map(said.true, said.on.astype(float), view), "by depth and pose", DETAIL), "points, true"
+            add_caption(draw_point_map(said.coordinates, said.chance, view), mean, DETAIL),
+            "points, predicted",
+        ),
+        add_caption(
+            add_caption(
+                draw_point_map(said.true, said.on.astype(float), view), "by depth and pose", DETAIL
+            ),
+            "points, true",
         ),
     ]
     entries = [("true outline", TRUTH), ("pose's center", _PROPOSED), *list_axes()]
@@ -59,17 +100,25 @@ def draw_proposals(
 
 
 def draw_point_map(points: np.ndarray, chance: np.ndarray, view: View) -> np.ndarray:
-    """Return object points (h, w, 3) in [-1, 1] as colors, the fainter the less likely the object.  -> picture."""
+    """Return object points (h, w, 3) in [-1, 1] as colors, the fainter the less likely the object.
+    -> picture.
+    """
     paint = (np.clip(points, -1, 1) + 1) / 2
     share = np.clip(chance, 0, 1)[..., None]
     cells = (255 * (paint * share + 0.13 * (1 - share))).round().astype(np.uint8)
     return np.asarray(cv2.resize(cells, (view.width, view.height), interpolation=cv2.INTER_NEAREST))
 
 
-def draw_heat_map(rgb: np.ndarray, values: np.ndarray, view: View, name: str = "magma") -> np.ndarray:
-    """Return a photograph in gray below a map (h, w) in [0, 1] whose cells lie evenly over it.  -> picture."""
+def draw_heat_map(
+    rgb: np.ndarray, values: np.ndarray, view: View, name: str = "magma"
+) -> np.ndarray:
+    """Return a photograph in gray below a map (h, w) in [0, 1] whose cells lie evenly over it.  ->
+    picture.
+    """
     ground = view.show(rgb).mean(-1, keepdims=True)
-    cells = cv2.resize(map_colors(values, 0, 1, name), (view.width, view.height), interpolation=cv2.INTER_NEAREST)
+    cells = cv2.resize(
+        map_colors(values, 0, 1, name), (view.width, view.height), interpolation=cv2.INTER_NEAREST
+    )
     return np.asarray(0.35 * ground + 0.65 * cells).round().astype(np.uint8)
 
 
@@ -81,7 +130,8 @@ def draw_relevance(
     last: tuple[np.ndarray, np.ndarray],
     title: str,
 ) -> np.ndarray:
-    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last cloud: pixels (N, 2), weights (N,) each.
+    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last cloud: pixels (N, 2),
+    weights (N,) each.
 
     mask (H, W) bool: the object's visible part, whose rim is drawn.
     """
@@ -92,9 +142,15 @@ def draw_relevance(
     tiles = []
     for name, (pixels, weights) in (("first", first), ("last", last)):
         picture = draw_particles(rgb, pixels, weights, half)
-        draw_lines(picture, [half.place(line) for line in trace_outline(mask)], TRUTH, 2, closed=True)
+        draw_lines(
+            picture, [half.place(line) for line in trace_outline(mask)], TRUTH, 2, closed=True
+        )
         tiles.append(add_caption(picture, f"the {name} cloud"))
-    foot = [draw_legend([("rim of the mask", TRUTH)]), draw_color_scale("relevance: 0", "1", "magma"), draw_weight_scale()]
+    foot = [
+        draw_legend([("rim of the mask", TRUTH)]),
+        draw_color_scale("relevance: 0", "1", "magma"),
+        draw_weight_scale(),
+    ]
     return compose_figure(title, add_caption(heat, mean), arrange_grid(tiles, 2), *foot)
 
 
@@ -102,5 +158,7 @@ def average_relevance(relevance: np.ndarray, mask: np.ndarray) -> float:
     """Return the mean relevance of a mask's pixels, NaN where it has none.  (h, w), (H, W) bool."""
     if not mask.any():
         return float("nan")
-    full = cv2.resize(relevance.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    full = cv2.resize(
+        relevance.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_NEAREST
+    )
     return float(full[mask].mean())

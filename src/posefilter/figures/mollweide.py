@@ -1,4 +1,6 @@
-"""A map of the sphere on which areas are true (Mollweide), and colors for the third angle of a rotation."""
+"""A map of the sphere on which areas are true (Mollweide), and colors for the third angle of a
+rotation.
+"""
 
 import math
 from functools import cache
@@ -16,15 +18,20 @@ _GRID: Color = (205, 209, 214)
 _WORDS: Color = (120, 126, 136)
 _RIM = 0.01  # of the width, left free beside the map
 # the projection's auxiliary angle, tabled: 2 t + sin 2 t = pi sin(latitude)
-_ANGLE = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 721)) * np.pi / 2  # denser at the poles, where it is steep
+# denser at the poles, where it is steep
+_ANGLE = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 721)) * np.pi / 2
 _LATITUDE = np.arcsin(np.clip((2 * _ANGLE + np.sin(2 * _ANGLE)) / np.pi, -1, 1))
 
 
-def map_to_sphere(rotations: torch.Tensor, axis: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return where an axis of the object points, and the turn about it.  (*, 3, 3) camera_from_object -> (*) x 3 [rad].
+def map_to_sphere(
+    rotations: torch.Tensor, axis: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return where an axis of the object points, and the turn about it.  (*, 3, 3)
+    camera_from_object -> (*) x 3 [rad].
 
-    Longitude: 0 towards the camera, positive to the image's right; latitude: positive upwards in the image; tilt: the angle
-    of the object's next axis from "up" at that point of the sphere, clockwise as seen from outside it.
+    Longitude: 0 towards the camera, positive to the image's right; latitude: positive upwards in
+    the image; tilt: the angle of the object's next axis from "up" at that point of the sphere,
+    clockwise as seen from outside it.
     """
     direction, other = rotations[..., axis], rotations[..., (axis + 1) % 3]
     longitude = torch.atan2(direction[..., 0], -direction[..., 2])
@@ -35,7 +42,10 @@ def map_to_sphere(rotations: torch.Tensor, axis: int) -> tuple[torch.Tensor, tor
 
 
 def project_to_map(longitude: np.ndarray, latitude: np.ndarray, width: int) -> np.ndarray:
-    """Return where places are on a map of `width` and half as high.  (P,), (P,) [rad] -> (P, 2) [px]."""
+    """Return where places are on a map of `width` and half as high.
+
+    (P,), (P,) [rad] -> (P, 2) [px].
+    """
     angle = np.interp(latitude, _LATITUDE, _ANGLE)
     reach = (0.5 - _RIM) * width
     u = reach * np.asarray(longitude) / np.pi * np.cos(angle)
@@ -43,7 +53,9 @@ def project_to_map(longitude: np.ndarray, latitude: np.ndarray, width: int) -> n
 
 
 def draw_blank_map(width: int) -> np.ndarray:
-    """Return the empty map: its rim, meridians and parallels, and where they lie as the camera sees it.  -> picture."""
+    """Return the empty map: its rim, meridians and parallels, and where they lie as the camera sees
+    it.  -> picture.
+    """
     return _draw_blank(width).copy()
 
 
@@ -52,12 +64,19 @@ def _draw_blank(width: int) -> np.ndarray:
     picture = np.full((width // 2, width, 3), PAPER, np.uint8)
     line = np.linspace(-np.pi / 2, np.pi / 2, 91)
     meridians = [
-        project_to_map(np.full(91, np.deg2rad(degrees)), line, width) for degrees in (-135, -90, -45, 0, 45, 90, 135)
+        project_to_map(np.full(91, np.deg2rad(degrees)), line, width)
+        for degrees in (-135, -90, -45, 0, 45, 90, 135)
     ]
-    parallels = [project_to_map(2 * line, np.full(91, np.deg2rad(degrees)), width) for degrees in (-60, -30, 0, 30, 60)]
+    parallels = [
+        project_to_map(2 * line, np.full(91, np.deg2rad(degrees)), width)
+        for degrees in (-60, -30, 0, 30, 60)
+    ]
     draw_lines(picture, meridians + parallels, _GRID, max(1, width // 600), halo=False)
     rim = np.concatenate(
-        [project_to_map(np.full(91, np.pi), line, width), project_to_map(np.full(91, -np.pi), line[::-1], width)]
+        [
+            project_to_map(np.full(91, np.pi), line, width),
+            project_to_map(np.full(91, -np.pi), line[::-1], width),
+        ]
     )
     draw_lines(picture, [rim], INK, max(2, width // 400), closed=True, halo=False)
     image = Image.fromarray(picture)

@@ -7,8 +7,6 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from posefilter.data.mesh import Mesh
-from posefilter.data.render import EmbreeRenderer, render_depth
 from posefilter.figures.canvas import (
     AXES,
     ESTIMATE,
@@ -21,6 +19,8 @@ from posefilter.figures.canvas import (
     draw_row,
     full_view,
 )
+from posefilter.meshes.mesh import Mesh
+from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
 Shape = Mesh | np.ndarray | Tensor  # a mesh, or the (V, 3) vertices of a convex hull [m]
 WIDTH = 640  # [px] at least
@@ -38,15 +38,31 @@ def draw_overlay(
     label: str = "estimate",
     width: int = WIDTH,
 ) -> np.ndarray:
-    """Draw where a pose puts the object, and where the truth does; caption and legend are on a row below the photograph.
+    """Draw where a pose puts the object, and where the truth does; caption and legend are on a row
+    below the photograph.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]; width: of the result at least [px].
-    -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W).
+    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]; width: of the
+    result at least [px]. -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W).
     """
-    picture = draw_poses(rgb, K, pose, shape, full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1])), color, truth)
+    picture = draw_poses(
+        rgb,
+        K,
+        pose,
+        shape,
+        full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1])),
+        color,
+        truth,
+    )
     entries = [(label, color), *list_axes()]
     return np.concatenate(
-        [picture, draw_row(picture.shape[1], caption, entries if truth is None else [("truth", TRUTH), *entries])]
+        [
+            picture,
+            draw_row(
+                picture.shape[1],
+                caption,
+                entries if truth is None else [("truth", TRUTH), *entries],
+            ),
+        ]
     )
 
 
@@ -62,7 +78,8 @@ def draw_poses(
 ) -> np.ndarray:
     """Return the same without writing, of the part of the photograph that `view` shows.
 
-    coarse: pixels that a mesh's outline may miss its silhouette by; rays are cast that much more sparsely.
+    coarse: pixels that a mesh's outline may miss its silhouette by; rays are cast that much more
+    sparsely.
     """
     picture = view.show(rgb)
     shown = view.camera(K)
@@ -72,16 +89,31 @@ def draw_poses(
     return picture
 
 
-def view_poses(poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, height: int, width: int, shown: int) -> View:
+def view_poses(
+    poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, height: int, width: int, shown: int
+) -> View:
     """Return a close-up of where poses put the object; the whole frame where that is nowhere."""
-    bounds = get_bounds(shape)
-    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    box_head = get_bounds(shape)
+    corners = np.array(
+        [
+            [box_head[i, 0], box_head[j, 1], box_head[k, 2]]
+            for i in (0, 1)
+            for j in (0, 1)
+            for k in (0, 1)
+        ]
+    )
     found = []
     for pose in poses:
         camera = corners @ pose[:3, :3].T + pose[:3, 3]
         if np.isfinite(camera).all() and (camera[:, 2] > _NEAR).all():
-            found.append(np.clip(_project(camera, np.asarray(K, np.float64)), 0, [width - 1, height - 1]))
-    return close_up(np.concatenate(found), height, width, shown, margin=0.12) if found else full_view(height, width, shown)
+            found.append(
+                np.clip(_project(camera, np.asarray(K, np.float64)), 0, [width - 1, height - 1])
+            )
+    return (
+        close_up(np.concatenate(found), height, width, shown, margin=0.12)
+        if found
+        else full_view(height, width, shown)
+    )
 
 
 def list_axes() -> list[tuple[str, Color]]:
@@ -90,19 +122,36 @@ def list_axes() -> list[tuple[str, Color]]:
 
 
 def draw_pose(
-    picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, color: Color, width: int = 2, coarse: int = 1
+    picture: np.ndarray,
+    K: np.ndarray,
+    pose: np.ndarray,
+    shape: Shape,
+    color: Color,
+    width: int = 2,
+    coarse: int = 1,
 ) -> None:
-    """Draw a pose's outline and axes into a picture, in place.  Poses that are not finite draw nothing."""
+    """Draw a pose's outline and axes into a picture, in place.
+
+    Poses that are not finite draw nothing.
+    """
     if not np.isfinite(pose).all():
         return
     draw_lines(
-        picture, outline_object(pose, shape, K, picture.shape[0], picture.shape[1], coarse), color, width, closed=True
+        picture,
+        outline_object(pose, shape, K, picture.shape[0], picture.shape[1], coarse),
+        color,
+        width,
+        closed=True,
     )
     draw_axes(picture, K, pose, shape, color, width)
 
 
-def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, color: Color, width: int = 2) -> None:
-    """Draw the object's axes at the center of its box: x red, y green, z blue, the farthest first; knobs in `color`."""
+def draw_axes(
+    picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape, color: Color, width: int = 2
+) -> None:
+    """Draw the object's axes at the center of its box: x red, y green, z blue, the farthest first;
+    knobs in `color`.
+    """
     low, high = get_bounds(shape)
     length = 0.3 * float(np.linalg.norm(high - low))
     ends = (low + high) / 2 + length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
@@ -119,10 +168,14 @@ def draw_axes(picture: np.ndarray, K: np.ndarray, pose: np.ndarray, shape: Shape
 def outline_object(
     pose: np.ndarray, shape: Shape, K: np.ndarray, height: int, width: int, coarse: int = 1
 ) -> list[np.ndarray]:
-    """Return the closed lines round the object: a mesh's silhouette, or the projected hull.  -> each (P, 2) [px]."""
+    """Return the closed lines round the object: a mesh's silhouette, or the projected hull.  ->
+    each (P, 2) [px].
+    """
     if isinstance(shape, Mesh):
         view = View(-0.5, -0.5, 1 / coarse, -(-width // coarse), -(-height // coarse))
-        found = trace_outline(render_silhouette(shape, pose, view.camera(K), view.height, view.width))
+        found = trace_outline(
+            render_silhouette(shape, pose, view.camera(K), view.height, view.width)
+        )
         if coarse > 1:  # straight edges are no stairs
             found = [cv2.approxPolyDP(line, 0.7, closed=True)[:, 0] for line in found]
         return [(line + 0.5) * coarse - 0.5 for line in found]
@@ -132,15 +185,22 @@ def outline_object(
     return [cv2.convexHull(_project(camera, K).astype(np.float32))[:, 0]]
 
 
-def render_silhouette(mesh: Mesh, pose: np.ndarray, K: np.ndarray, height: int, width: int) -> np.ndarray:
+def render_silhouette(
+    mesh: Mesh, pose: np.ndarray, K: np.ndarray, height: int, width: int
+) -> np.ndarray:
     """Return which pixels the mesh covers, were it alone in the frame.  -> (H, W) bool."""
     depth, _ = render_depth([mesh], [pose], K, height, width, _renderer())
     return depth > 0
 
 
 def trace_outline(mask: np.ndarray) -> list[np.ndarray]:
-    """Return the closed lines through the outermost pixels of a mask, and of its holes.  (H, W) bool -> each (P, 2) [px]."""
-    found: Sequence[np.ndarray] = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    """Return the closed lines through the outermost pixels of a mask, and of its holes.
+
+    (H, W) bool -> each (P, 2) [px].
+    """
+    found: Sequence[np.ndarray] = cv2.findContours(
+        mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE
+    )[0]
     return [line[:, 0] for line in found]
 
 
@@ -148,13 +208,15 @@ def get_vertices(shape: Shape) -> np.ndarray:
     """Return the points that bound the object.  -> (V, 3) [m]."""
     if isinstance(shape, Mesh):
         return shape.vertices
-    return np.asarray(shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape, np.float64)
+    return np.asarray(
+        shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape, np.float64
+    )
 
 
 def get_bounds(shape: Shape) -> np.ndarray:
     """Return the least and greatest corners of the object's box.  -> (2, 3) [m]."""
     if isinstance(shape, Mesh):
-        return shape.bounds
+        return shape.box_head
     return np.stack([get_vertices(shape).min(0), get_vertices(shape).max(0)])
 
 
@@ -163,7 +225,9 @@ def _project(camera: np.ndarray, K: np.ndarray) -> np.ndarray:
 
 
 def _clip_to_front(points: np.ndarray) -> np.ndarray:
-    """Cut the convex hull of camera points (V, 3) [m] at the near plane: those before it, and where edges pierce it."""
+    """Cut the convex hull of camera points (V, 3) [m] at the near plane: those before it, and where
+    edges pierce it.
+    """
     before = points[:, 2] >= _NEAR
     if before.all():
         return points

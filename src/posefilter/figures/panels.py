@@ -1,6 +1,8 @@
-"""Small plots with a frame, ticks and labels, drawn straight onto pixels: a hundred times sooner than a plotting library.
+"""Small plots with a frame, ticks and labels, drawn straight onto pixels: a hundred times sooner
+than a plotting library.
 
-Round a panel's plot are margins for the ticks and the labels; what it shows is said above it (`headed`).
+Round a panel's plot are margins for the ticks and the labels; what it shows is said above it
+(`headed`).
 """
 
 from collections.abc import Sequence
@@ -47,17 +49,25 @@ def map_colors(values: np.ndarray, low: float, high: float, name: str = "viridis
 
 
 def draw_heat_panel(
-    cells: np.ndarray, x: Axis, y: Axis, width: int, marks: Sequence[Mark] = (), dots: np.ndarray | None = None
+    cells: np.ndarray,
+    x: Axis,
+    y: Axis,
+    width: int,
+    marks: Sequence[Mark] = (),
+    dots: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw a grid of colors (G, G, 3) uint8, row i at the i-th of even values of y from `low` to `high`, upwards.
+    """Draw a grid of colors (G, G, 3) uint8, row i at the i-th of even values of y from `low` to
+    `high`, upwards.
 
-    The cells' centers run from end to end of the axes, and smoothing lies between them. dots: (P, 2) places that are
-    pricked in. -> picture, its square plot as large as `width` allows.
+    The cells' centers run from end to end of the axes, and smoothing lies between them. dots: (P,
+    2) places that are pricked in. -> picture, its square plot as large as `width` allows.
     """
     size = width - LEFT - RIGHT
     plot = cv2.resize(cells[::-1], (size, size), interpolation=cv2.INTER_NEAREST)
     if dots is not None and len(dots):
-        draw_dots(plot, _locate(dots, x, y, size), np.tile(np.array([SURFACE]), (len(dots), 1)), 1.2)
+        draw_dots(
+            plot, _locate(dots, x, y, size), np.tile(np.array([SURFACE]), (len(dots), 1)), 1.2
+        )
     for mark in marks:
         at = _locate(np.array([[mark.x, mark.y]]), x, y, size)[0]
         draw_mark(plot, np.clip(at, _REACH, size - 1 - _REACH), mark.color, mark.shape)
@@ -65,30 +75,59 @@ def draw_heat_panel(
 
 
 def draw_curve_panel(
-    lines: Sequence[tuple[np.ndarray, Color]], places: np.ndarray, x: Axis, y: Axis, width: int, height: int, thick: int = 2
+    lines: Sequence[tuple[np.ndarray, Color]],
+    places: np.ndarray,
+    x: Axis,
+    y: Axis,
+    width: int,
+    height: int,
+    thick: int = 2,
 ) -> np.ndarray:
-    """Draw curves (P,) each over the same places (P,); what lies beyond the axes is cut at their ends.
+    """Draw curves (P,) each over the same places (P,); what lies beyond the axes is cut at their
+    ends.
 
     width, height: of the whole panel [px].
     """
     plot = _draw_rules(x, y, width, height)
     for values, color in lines:
-        path = _locate(np.stack([places, np.clip(values, y.low, y.high)], 1), x, y, plot.shape[1], plot.shape[0])
+        path = _locate(
+            np.stack([places, np.clip(values, y.low, y.high)], 1),
+            x,
+            y,
+            plot.shape[1],
+            plot.shape[0],
+        )
         draw_lines(plot, [path], color, thick, halo=False)
     return add_frame(plot, x, y)
 
 
 def draw_histogram_panel(
-    mass: np.ndarray, edges: np.ndarray, marks: Sequence[tuple[float, Color]], x: Axis, y: Axis, width: int, height: int
+    mass: np.ndarray,
+    edges: np.ndarray,
+    marks: Sequence[tuple[float, Color]],
+    x: Axis,
+    y: Axis,
+    width: int,
+    height: int,
 ) -> np.ndarray:
-    """Draw a histogram (M,) between edges (M + 1,), and upright lines; width, height: of the whole panel [px]."""
+    """Draw a histogram (M,) between edges (M + 1,), and upright lines; width, height: of the whole
+    panel [px].
+    """
     plot = _draw_rules(x, y, width, height)
-    corners = _locate(np.stack([edges, np.append(mass, 0)], 1), x, y, plot.shape[1], plot.shape[0]).round().astype(int)
-    for share, (left, top), right in zip(mass, corners[:-1].tolist(), corners[1:, 0].tolist(), strict=True):
+    corners = (
+        _locate(np.stack([edges, np.append(mass, 0)], 1), x, y, plot.shape[1], plot.shape[0])
+        .round()
+        .astype(int)
+    )
+    for share, (left, top), right in zip(
+        mass, corners[:-1].tolist(), corners[1:, 0].tolist(), strict=True
+    ):
         if share > 0:
             plot[max(top, 0) :, left : max(right, left + 1)] = _MASS
     for value, color in marks:
-        (u, _), (_, low) = _locate(np.array([[value, y.high], [value, y.low]]), x, y, plot.shape[1], plot.shape[0])
+        (u, _), (_, low) = _locate(
+            np.array([[value, y.high], [value, y.low]]), x, y, plot.shape[1], plot.shape[0]
+        )
         draw_lines(plot, [np.array([[u, 0], [u, low]])], color, 2)
     return add_frame(plot, x, y)
 
@@ -128,7 +167,9 @@ def add_frame(plot: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
     return np.asarray(image)
 
 
-def draw_color_scale(before: str, after: str, name: str = "viridis", width: int = WIDTH, size: int = TITLE) -> np.ndarray:
+def draw_color_scale(
+    before: str, after: str, name: str = "viridis", width: int = WIDTH, size: int = TITLE
+) -> np.ndarray:
     """Return a scale of a map's colors between what its ends mean."""
     return draw_scale(before, map_colors(np.linspace(0, 1, 256), 0, 1, name), after, width, size)
 
@@ -136,21 +177,42 @@ def draw_color_scale(before: str, after: str, name: str = "viridis", width: int 
 def arrange_row(parts: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
     """Put pictures side by side, on white where one is lower; `width` pads or cuts the whole."""
     height = max(part.shape[0] for part in parts)
-    padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0)), constant_values=255) for p in parts]
+    padded = [
+        np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0)), constant_values=255) for p in parts
+    ]
     row = np.concatenate(padded, axis=1)
     if width is None:
         return row
-    return np.pad(row[:, :width], ((0, 0), (0, max(0, width - row.shape[1])), (0, 0)), constant_values=255)
+    return np.pad(
+        row[:, :width], ((0, 0), (0, max(0, width - row.shape[1])), (0, 0)), constant_values=255
+    )
 
 
 def draw_mark(
-    picture: np.ndarray, at: np.ndarray, color: Color, shape: str = "ring", reach: float = 0, width: int = 2
+    picture: np.ndarray,
+    at: np.ndarray,
+    color: Color,
+    shape: str = "ring",
+    reach: float = 0,
+    width: int = 2,
 ) -> None:
-    """Draw a ring or a square round a place (2,) [px], in place; reach: how far it goes from there (0: as in panels)."""
+    """Draw a ring or a square round a place (2,) [px], in place; reach: how far it goes from there
+    (0: as in panels).
+    """
     reach = reach or (_REACH if shape == "ring" else 2 * _REACH / 3)
-    turn = np.linspace(0, 2 * np.pi, 33)[:-1] if shape == "ring" else np.pi / 4 + np.arange(4) * np.pi / 2
+    turn = (
+        np.linspace(0, 2 * np.pi, 33)[:-1]
+        if shape == "ring"
+        else np.pi / 4 + np.arange(4) * np.pi / 2
+    )
     length = reach if shape == "ring" else reach * 2**0.5
-    draw_lines(picture, [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)], color, width, closed=True)
+    draw_lines(
+        picture,
+        [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)],
+        color,
+        width,
+        closed=True,
+    )
 
 
 def _locate(places: np.ndarray, x: Axis, y: Axis, width: int, height: int = 0) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""Draw clouds of particles on the image, colored by weight: one step, or a row of steps over the filter's run."""
+"""Draw clouds of particles on the image, colored by weight: one step, or a row of steps over the
+filter's run.
+"""
 
 import math
 
@@ -7,8 +9,15 @@ import numpy as np
 import torch
 from matplotlib import colormaps
 
-from posefilter.contracts import Space
-from posefilter.figures.canvas import AXES, View, arrange_grid, close_up, draw_dots, full_view, halve
+from posefilter.figures.canvas import (
+    AXES,
+    View,
+    arrange_grid,
+    close_up,
+    draw_dots,
+    full_view,
+    halve,
+)
 from posefilter.figures.layout import (
     CAPTION,
     DETAIL,
@@ -25,34 +34,47 @@ from posefilter.figures.overlay import list_axes
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.types import Cloud, Trace
+from posefilter.protocols import Space
+from posefilter.types import Particles, Trace
 
 _WEIGHT = colormaps["plasma"]
 _REACH = 10.0  # the colors span weights from 1 / _REACH to _REACH times the mean
 
 
 def color_by_weight(weights: np.ndarray) -> np.ndarray:
-    """Return colors by weight over the mean weight, logarithmic, the same scale in every picture.  (N,) -> (N, 3) uint8."""
+    """Return colors by weight over the mean weight, logarithmic, the same scale in every picture.
+
+    (N,) -> (N, 3) uint8.
+    """
     ratio = np.maximum(weights * len(weights), 1e-12)
     level = np.clip((np.log(ratio) / math.log(_REACH) + 1) / 2, 0, 1)
     return np.asarray(_WEIGHT(level)[:, :3] * 255).round().astype(np.uint8)
 
 
-def draw_particles(rgb: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View) -> np.ndarray:
+def draw_particles(
+    rgb: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View
+) -> np.ndarray:
     """Draw particles on a faded photograph, the heaviest on top.
 
-    rgb (H, W, 3) uint8; pixels (N, 2) [px]; weights (N,) summing to 1. -> (view.height, view.width, 3) uint8.
+    rgb (H, W, 3) uint8; pixels (N, 2) [px]; weights (N,) summing to 1. -> (view.height, view.width,
+    3) uint8.
     """
     return draw_particles_on(draw_background(rgb, view), pixels, weights, view)
 
 
 def draw_background(rgb: np.ndarray, view: View) -> np.ndarray:
-    """Return the faded photograph that particles are drawn on, at twice the size: OpenCV's smallest discs are no discs."""
+    """Return the faded photograph that particles are drawn on, at twice the size: OpenCV's smallest
+    discs are no discs.
+    """
     return view.finer(2).show(fade(rgb, 0.4))
 
 
 def draw_particles_on(
-    below: np.ndarray, pixels: np.ndarray, weights: np.ndarray, view: View, axes: np.ndarray | None = None
+    below: np.ndarray,
+    pixels: np.ndarray,
+    weights: np.ndarray,
+    view: View,
+    axes: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draw the same on a `ground` that is there already.
 
@@ -62,7 +84,12 @@ def draw_particles_on(
     if axes is not None:
         draw_many_axes(picture, fine.place(axes))
     order = np.argsort(weights, kind="stable")
-    draw_dots(picture, fine.place(pixels[order]), color_by_weight(weights)[order], max(3.0, fine.width / 200))
+    draw_dots(
+        picture,
+        fine.place(pixels[order]),
+        color_by_weight(weights)[order],
+        max(3.0, fine.width / 200),
+    )
     return halve(picture)
 
 
@@ -82,25 +109,37 @@ def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.6) 
     cv2.addWeighted(layer, opacity, picture, 1 - opacity, 0, picture)
 
 
-def project_axes(poses: torch.Tensor, center: torch.Tensor, length: float, K: torch.Tensor) -> np.ndarray:
-    """Return where poses put the center and the ends of the axes.  (M, 4, 4), (3,) [m], (3, 3) -> (M, 4, 2) [px]."""
+def project_axes(
+    poses: torch.Tensor, center: torch.Tensor, length: float, K: torch.Tensor
+) -> np.ndarray:
+    """Return where poses put the center and the ends of the axes.
+
+    (M, 4, 4), (3,) [m], (3, 3) -> (M, 4, 2) [px].
+    """
     ends = center + length * torch.cat([torch.zeros(1, 3), torch.eye(3)]).to(center)
     return project(torch.stack([origin_of(poses, end) for end in ends], dim=1), K).numpy()
 
 
-def draw_iterations(rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = "") -> np.ndarray:
-    """Draw the clouds of one image at several of the filter's steps, the first and the last included.
+def draw_iterations(
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = ""
+) -> np.ndarray:
+    """Draw the clouds of one image at several of the filter's steps, the first and the last
+    included.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are dots, at eight steps. Those
-    in pose space are dots at the object's center, with the axes of a few drawn by weight, at four steps: on the whole
-    photograph, and beside it on a close-up of the object, since the last clouds are too small to be seen otherwise.
+    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are
+    dots, at eight steps. Those in pose space are dots at the object's center, with the axes of a
+    few drawn by weight, at four steps: on the whole photograph, and beside it on a close-up of the
+    object, since the last clouds are too small to be seen otherwise.
     """
     height, wide = rgb.shape[:2]
     width = tile_width(2)
     frame = full_view(height, wide, width)
     parts: list[np.ndarray] = []
     if isinstance(space, PoseSpace):
-        steps = [PoseStep(K, trace, image, number, space) for number in choose_steps(len(trace.clouds), 4)]
+        steps = [
+            PoseStep(K, trace, image, number, space)
+            for number in choose_steps(len(trace.particles), 4)
+        ]
         views = (frame, close_up(steps[-1].extent(), height, wide, width, margin=0.1))
         grounds = [draw_background(rgb, view) for view in views]
         for one in steps:
@@ -109,13 +148,20 @@ def draw_iterations(rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, sp
         parts.append(draw_legend(list_axes()))
     else:
         below, tiles = draw_background(rgb, frame), []
-        for number in choose_steps(len(trace.clouds), 8):
-            cloud = trace.clouds[number]
-            state, weights = cloud.state[image].detach().cpu().numpy(), normalize_weights(cloud, image).numpy()
+        for number in choose_steps(len(trace.particles), 8):
+            particles = trace.particles[number]
+            state, weights = (
+                particles.state[image].detach().cpu().numpy(),
+                normalize_weights(particles, image).numpy(),
+            )
             off = measure_off_frame(state, height, wide)
-            said = describe_effective(trace, image, number) + (f", {off:.0%} off the frame" if off else "")
+            said = describe_effective(trace, image, number) + (
+                f", {off:.0%} off the frame" if off else ""
+            )
             tile = add_caption(draw_particles_on(below, state, weights, frame), said, DETAIL)
-            tiles.append(add_caption(tile, f"step {number}: {describe_noise(trace, image, number, 'px')}"))
+            tiles.append(
+                add_caption(tile, f"step {number}: {describe_noise(trace, image, number, 'px')}")
+            )
         parts.append(arrange_grid(tiles, 2))
     return compose_figure(title or "Particles by iteration", *parts, draw_weight_scale())
 
@@ -131,7 +177,7 @@ def describe_step(trace: Trace, image: int, number: int, unit: str) -> str:
 
 
 def describe_noise(trace: Trace, image: int, number: int, unit: str) -> str:
-    """Tell a step's noise level, in mm of what is kept in metres, or in px."""
+    """Tell a step's noise level, in mm of what is kept in meters, or in px."""
     sigma = trace.steps[number].sigma
     level = float(sigma if sigma.ndim == 0 else sigma[image]) * (1000 if unit == "mm" else 1)
     return f"noise {level:.3g} {unit}"
@@ -139,13 +185,13 @@ def describe_noise(trace: Trace, image: int, number: int, unit: str) -> str:
 
 def describe_effective(trace: Trace, image: int, number: int) -> str:
     """Tell the effective share of a step's particles."""
-    weights = normalize_weights(trace.clouds[number], image)
+    weights = normalize_weights(trace.particles[number], image)
     return f"{float(1 / weights.square().sum() / len(weights)):.0%} effective"
 
 
-def normalize_weights(cloud: Cloud, image: int) -> torch.Tensor:
+def normalize_weights(particles: Particles, image: int) -> torch.Tensor:
     """Return one image's weights, summing to 1.  -> (N,) float64."""
-    return torch.softmax(cloud.log_weights[image].detach().cpu().double(), 0)
+    return torch.softmax(particles.log_weights[image].detach().cpu().double(), 0)
 
 
 def choose_steps(count: int, most: int) -> list[int]:
@@ -156,19 +202,29 @@ def choose_steps(count: int, most: int) -> list[int]:
 class PoseStep:
     """One step of a filter whose particles are poses, projected."""
 
-    def __init__(self, K: np.ndarray, trace: Trace, image: int, number: int, space: PoseSpace) -> None:
+    def __init__(
+        self, K: np.ndarray, trace: Trace, image: int, number: int, space: PoseSpace
+    ) -> None:
         camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
         center = torch.tensor(space.center, dtype=torch.float64)
-        state = trace.clouds[number].state[image].detach().cpu().double()
-        weights = normalize_weights(trace.clouds[number], image)
+        state = trace.particles[number].state[image].detach().cpu().double()
+        weights = normalize_weights(trace.particles[number], image)
         self.weights = weights.numpy()
         self.pixels = project(origin_of(state, center), camera).numpy()
-        self.axes = project_axes(state[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera)
-        self.reach = space.radius * float(camera[0, 0]) / max(float(weights @ origin_of(state, center)[:, 2]), 0.05)
+        self.axes = project_axes(
+            state[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
+        )
+        self.reach = (
+            space.radius
+            * float(camera[0, 0])
+            / max(float(weights @ origin_of(state, center)[:, 2]), 0.05)
+        )
         self.caption = describe_step(trace, image, number, "mm")
 
     def extent(self) -> np.ndarray:
-        """Return two corners that hold the object, as the mean of the cloud has it.  -> (2, 2) [px]."""
+        """Return two corners that hold the object, as the mean of the cloud has it.  -> (2, 2)
+        [px].
+        """
         middle = self.weights @ self.pixels
         return np.stack([middle - 0.7 * self.reach, middle + 0.7 * self.reach])
 
@@ -178,7 +234,10 @@ class PoseStep:
 
 
 def choose_by_weight(weights: torch.Tensor, count: int) -> torch.Tensor:
-    """Choose particles by weight, without a random draw: systematic, from the middle of each share.  (N,) -> (count,)."""
+    """Choose particles by weight, without a random draw: systematic, from the middle of each share.
+
+    (N,) -> (count,).
+    """
     at = (torch.arange(count, dtype=weights.dtype) + 0.5) / count
     return torch.searchsorted(weights.cumsum(0), at).clamp(max=len(weights) - 1)
 

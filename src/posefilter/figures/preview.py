@@ -1,10 +1,13 @@
-"""Draw some frames of a dataset: the photograph with the object's visible part outlined, and the depth below it."""
+"""Draw some frames of a dataset: the photograph with the object's visible part outlined, and the
+depth below it.
+"""
 
 import cv2
 import numpy as np
 from matplotlib import colormaps
 
-from posefilter.data.frames import BadData, Reader, Sample
+from posefilter.data.frames import Reader, Sample
+from posefilter.errors import BadData
 from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_lines, draw_row, load_font
 from posefilter.figures.overlay import trace_outline
 
@@ -14,7 +17,8 @@ _UNKNOWN = (40, 40, 40)
 
 
 def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray:
-    """Return `count` frames, spread evenly over the dataset, each with its depth below it.  -> picture.
+    """Return `count` frames, spread evenly over the dataset, each with its depth below it.  ->
+    picture.
 
     Frames that cannot be read are left out; raises IndexError where that leaves none.
     """
@@ -30,7 +34,9 @@ def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray:
     tiles = [draw_frame(sample, name, float(near), float(far)) for name, sample in found]
     figure = arrange_grid([tiles[0], *tiles[1:]], len(tiles))
     head = draw_row(figure.shape[1], title, [("visible part", TRUTH)], size=18)
-    return np.concatenate([head, figure, draw_depth_scale(figure.shape[1], float(near), float(far))])
+    return np.concatenate(
+        [head, figure, draw_depth_scale(figure.shape[1], float(near), float(far))]
+    )
 
 
 def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray:
@@ -38,14 +44,27 @@ def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray
     height, width = sample.mask.shape
     scale = _TILE / width
     size = (_TILE, round(height * scale))
-    photo = cv2.resize(sample.rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    draw_lines(photo, [(line + 0.5) * scale - 0.5 for line in trace_outline(sample.mask)], TRUTH, 1, closed=True)
+    photo = cv2.resize(
+        sample.rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    )
+    draw_lines(
+        photo,
+        [(line + 0.5) * scale - 0.5 for line in trace_outline(sample.mask)],
+        TRUTH,
+        1,
+        closed=True,
+    )
     share = (np.clip(sample.depth, near, far) - near) / max(far - near, 1e-9)
     depth = (_DEPTH(share)[..., :3] * 255).astype(np.uint8)
     depth[sample.depth <= 0] = _UNKNOWN
     gap = np.full((4, _TILE, 3), PAPER, np.uint8)
     return np.concatenate(
-        [draw_row(_TILE, name, size=14), photo, gap, cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)]
+        [
+            draw_row(_TILE, name, size=14),
+            photo,
+            gap,
+            cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST),
+        ]
     )
 
 
@@ -54,7 +73,9 @@ def draw_depth_scale(width: int, near: float, far: float) -> np.ndarray:
     text, bar, size = f"depth: {near:.2f} m", 160, 15
     left = int(18 + load_font(size).getlength(text))
     figure = draw_row(width, f"{text}{' ' * 48}", [("unknown", _UNKNOWN)], size).copy()
-    figure[6:-6, left : left + bar] = (_DEPTH(np.linspace(0, 1, bar))[None, :, :3] * 255).astype(np.uint8)
+    figure[6:-6, left : left + bar] = (_DEPTH(np.linspace(0, 1, bar))[None, :, :3] * 255).astype(
+        np.uint8
+    )
     end = draw_row(90, f"{far:.2f} m", size=size)
     figure[:, left + bar : left + bar + 90] = end
     return figure

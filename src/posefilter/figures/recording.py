@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import torch
 
-from posefilter.data.mesh import Mesh
 from posefilter.errors import UserError
 from posefilter.figures.canvas import AXES, ESTIMATE
 from posefilter.figures.particles import choose_by_weight, color_by_weight
 from posefilter.figures.view_data import Hypothesis, Moment, ViewData
+from posefilter.meshes.mesh import Mesh
 
 TIMELINE = "step"
 _FAINT = 70  # opacity of the modes that are not the estimate, of 255
@@ -29,10 +29,12 @@ def check_viewer() -> None:
 
 
 def record(shown: ViewData, path: Path) -> None:
-    """Write a .rrd file: photograph, depth cloud and estimate's box throughout; particles over the steps; modes at the end.
+    """Write a .rrd file: photograph, depth cloud and estimate's box throughout; particles over the
+    steps; modes at the end.
 
-    Everything is in the camera's frame (x right, y down, z ahead), in metres. On the time line `step`, one a step of the
-    filter, the one after the last is the belief. Raises UserError where the library is missing.
+    Everything is in the camera's frame (x right, y down, z ahead), in meters. On the time line
+    `step`, one a step of the filter, the one after the last is the belief. Raises UserError where
+    the library is missing.
     """
     check_viewer()
     rr: Any = importlib.import_module("rerun")
@@ -45,21 +47,35 @@ def record(shown: ViewData, path: Path) -> None:
     for number, moment in enumerate(shown.moments):
         stream.set_time(TIMELINE, sequence=number)
         _log_particles(rr, stream, shown, moment)
-    _log_hypothesis(rr, stream, "estimate", shown.estimate, shown, make_textured(rr, shown.mesh), ESTIMATE)
+    _log_hypothesis(
+        rr, stream, "estimate", shown.estimate, shown, make_textured(rr, shown.mesh), ESTIMATE
+    )
     for number, other in enumerate(shown.others, start=1):
-        _log_hypothesis(rr, stream, f"modes/{number}", other, shown, make_faint(rr, shown.mesh), _OTHER)
+        _log_hypothesis(
+            rr, stream, f"modes/{number}", other, shown, make_faint(rr, shown.mesh), _OTHER
+        )
     stream.flush()
     stream.disconnect()
 
 
 def _log_scene(rr: Any, stream: Any, shown: ViewData) -> None:
-    """Log what does not change: the photograph and its camera, the cloud, the estimate's box, and what it all is."""
+    """Log what does not change: the photograph and its camera, the cloud, the estimate's box, and
+    what it all is.
+    """
     height, width = shown.rgb.shape[:2]
     stream.log("/", rr.ViewCoordinates.RDF, static=True)
-    camera = rr.Pinhole(image_from_camera=shift_to_corners(shown.K), resolution=[width, height], image_plane_distance=0.1)
+    camera = rr.Pinhole(
+        image_from_camera=shift_to_corners(shown.K),
+        resolution=[width, height],
+        image_plane_distance=0.1,
+    )
     stream.log("photograph", camera, rr.Image(shown.rgb, color_model="RGB"), static=True)
-    stream.log("cloud", rr.Points3D(shown.points, colors=shown.colors, radii=0.6 * shown.footprints), static=True)
-    low, high = shown.mesh.bounds
+    stream.log(
+        "cloud",
+        rr.Points3D(shown.points, colors=shown.colors, radii=0.6 * shown.footprints),
+        static=True,
+    )
+    low, high = shown.mesh.box_head
     size = {"centers": [(low + high) / 2], "half_sizes": [(high - low) / 2]}
     box = rr.Boxes3D(**size, colors=[ESTIMATE], fill_mode="majorwireframe")
     stream.log("estimate_box", _placed(rr, shown.estimate.pose), box, static=True)
@@ -75,7 +91,9 @@ def _log_particles(rr: Any, stream: Any, shown: ViewData, moment: Moment) -> Non
     stream.log("particles/centers", dots, rr.AnyValues(weight=moment.weights))
     chosen = choose_by_weight(torch.from_numpy(moment.weights), _WITH_AXES).unique().numpy()
     lines, line_colors = _axes(moment.poses[chosen], shown)
-    stream.log("particles/axes", rr.LineStrips3D(lines, colors=line_colors, radii=[shown.radius / 150]))
+    stream.log(
+        "particles/axes", rr.LineStrips3D(lines, colors=line_colors, radii=[shown.radius / 150])
+    )
     on_image = rr.Points2D(moment.pixels + 0.5, colors=colors, radii=[shown.rgb.shape[1] / 250])
     stream.log("photograph/particles", on_image, rr.AnyValues(weight=moment.weights))
     stream.log("filter/effective", rr.Scalars(100 * moment.effective))
@@ -83,7 +101,9 @@ def _log_particles(rr: Any, stream: Any, shown: ViewData, moment: Moment) -> Non
         stream.log("filter/noise", rr.Scalars(moment.sigma))
 
 
-def _axes(poses: np.ndarray, shown: ViewData) -> tuple[list[np.ndarray], list[tuple[int, int, int]]]:
+def _axes(
+    poses: np.ndarray, shown: ViewData
+) -> tuple[list[np.ndarray], list[tuple[int, int, int]]]:
     """Return the axes of poses (M, 4, 4) as 3 M lines from the object's center, and their colors."""
     ends = shown.center + 0.35 * shown.radius * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     camera = ends @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
@@ -91,12 +111,20 @@ def _axes(poses: np.ndarray, shown: ViewData) -> tuple[list[np.ndarray], list[tu
 
 
 def _log_hypothesis(
-    rr: Any, stream: Any, entity: str, one: Hypothesis, shown: ViewData, mesh: Any, color: tuple[int, int, int]
+    rr: Any,
+    stream: Any,
+    entity: str,
+    one: Hypothesis,
+    shown: ViewData,
+    mesh: Any,
+    color: tuple[int, int, int],
 ) -> None:
     """Log the mesh where a hypothesis puts it, with its weight."""
     stream.log(entity, _placed(rr, one.pose), mesh, rr.AnyValues(weight=one.weight))
     text = f"{entity.replace('modes/', 'mode ')}: {one.weight:.0%} of the belief"
-    label = rr.Points3D([shown.center], labels=[text], colors=[color], radii=[shown.radius / 100], show_labels=True)
+    label = rr.Points3D(
+        [shown.center], labels=[text], colors=[color], radii=[shown.radius / 100], show_labels=True
+    )
     stream.log(f"{entity}/weight", label)
 
 
@@ -105,7 +133,9 @@ def _placed(rr: Any, pose: np.ndarray) -> Any:
 
 
 def make_textured(rr: Any, mesh: Mesh) -> Any:
-    """Return the mesh as it looks: corner by corner, since seams give one vertex several texture coordinates."""
+    """Return the mesh as it looks: corner by corner, since seams give one vertex several texture
+    coordinates.
+    """
     parts: dict[str, Any] = {
         "vertex_positions": mesh.vertices[mesh.faces].reshape(-1, 3),
         "triangle_indices": np.arange(3 * len(mesh.faces)).reshape(-1, 3),
@@ -117,8 +147,11 @@ def make_textured(rr: Any, mesh: Mesh) -> Any:
         return rr.Mesh3D(**parts, albedo_factor=[*mesh.texture[0, 0].tolist(), 255])
     texture, size = mesh.texture, max(mesh.texture.shape[:2])
     if size > _TEXTURE:
-        texture = cv2.resize(texture, None, fx=_TEXTURE / size, fy=_TEXTURE / size, interpolation=cv2.INTER_AREA)
-    from_top = mesh.corner_uv.reshape(-1, 2) * [1, -1] + [0, 1]  # ours count from the bottom, as in OBJ
+        texture = cv2.resize(
+            texture, None, fx=_TEXTURE / size, fy=_TEXTURE / size, interpolation=cv2.INTER_AREA
+        )
+    # ours count from the bottom, as in OBJ
+    from_top = mesh.corner_uv.reshape(-1, 2) * [1, -1] + [0, 1]
     return rr.Mesh3D(**parts, vertex_texcoords=from_top, albedo_texture=texture)
 
 
@@ -136,7 +169,9 @@ def make_faint(rr: Any, mesh: Mesh) -> Any:
 
 
 def shift_to_corners(K: np.ndarray) -> np.ndarray:
-    """Return the camera matrix for pixels whose corners, not their centers, have integer coordinates.  (3, 3) [px]."""
+    """Return the camera matrix for pixels whose corners, not their centers, have integer
+    coordinates.  (3, 3) [px].
+    """
     out = np.array(K, np.float64)
     out[:2, 2] += 0.5
     return out
@@ -151,26 +186,38 @@ def describe(shown: ViewData) -> str:
         "| pose | weight | center x, y, z [mm] | from the estimate [mm] | turned by |",
         "|---|---|---|---|---|",
     ]
-    for name, one in [("estimate", shown.estimate), *((f"mode {i}", m) for i, m in enumerate(shown.others, start=1))]:
-        center, best = (p[:3, :3] @ shown.center + p[:3, 3] for p in (one.pose, shown.estimate.pose))
+    for name, one in [
+        ("estimate", shown.estimate),
+        *((f"mode {i}", m) for i, m in enumerate(shown.others, start=1)),
+    ]:
+        center, best = (
+            p[:3, :3] @ shown.center + p[:3, 3] for p in (one.pose, shown.estimate.pose)
+        )
         cosine = (np.trace(one.pose[:3, :3].T @ shown.estimate.pose[:3, :3]) - 1) / 2
         place = ", ".join(f"{1000 * x:.0f}" for x in center)
         turn = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
-        lines.append(f"| {name} | {one.weight:.1%} | {place} | {1000 * np.linalg.norm(center - best):.1f} | {turn:.1f}° |")
+        lines.append(
+            f"| {name} | {one.weight:.1%} | {place} | "
+            f"{1000 * np.linalg.norm(center - best):.1f} | {turn:.1f}° |"
+        )
     if shown.left_out > 0:
         lines += ["", f"Lighter modes, not drawn: {shown.left_out:.1%} of the weight."]
     lines += [
         "",
-        f"Time line `{TIMELINE}`: 0 to {steps - 1} are the filter's steps, {steps} is the belief that it ends with. A dot"
-        " is where a particle puts the object's center, dark for light weights and yellow for heavy ones; red, green and"
+        f"Time line `{TIMELINE}`: 0 to {steps - 1} are the filter's steps, {steps} is the belief "
+        f"that it ends with. A dot"
+        " is where a particle puts the object's center, dark for light weights and yellow for "
+        "heavy ones; red, green and"
         " blue are the object's x, y and z. The box is the estimate's, at every step."
-        " Camera frame: x right, y down, z ahead, metres.",
+        " Camera frame: x right, y down, z ahead, meters.",
     ]
     return "\n".join(lines)
 
 
 def _layout(shown: ViewData) -> Any:
-    """Return how the viewer lays it all out: space on the left, seen from beside the camera; the rest on the right."""
+    """Return how the viewer lays it all out: space on the left, seen from beside the camera; the
+    rest on the right.
+    """
     rrb: Any = importlib.import_module("rerun.blueprint")
     pose = shown.estimate.pose
     target = pose[:3, :3] @ shown.center + pose[:3, 3]
@@ -179,14 +226,20 @@ def _layout(shown: ViewData) -> Any:
         origin="/",
         contents=["+ /**", "- /photograph/**", "+ /photograph", "- /filter/**", "- /about"],
         name="Depth cloud, particles and modes",
-        eye_controls=rrb.EyeControls3D(position=target + aside, look_target=target, eye_up=[0, -1, 0]),
+        eye_controls=rrb.EyeControls3D(
+            position=target + aside, look_target=target, eye_up=[0, -1, 0]
+        ),
     )
     height, width = shown.rgb.shape[:2]
-    bounds = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
-    image = rrb.Spatial2DView(origin="/photograph", name="Particles on the photograph", visual_bounds=bounds)
+    box_head = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
+    image = rrb.Spatial2DView(
+        origin="/photograph", name="Particles on the photograph", visual_bounds=box_head
+    )
     noise = rrb.TimeSeriesView(origin="/filter/noise", name="Noise level")
     effective = rrb.TimeSeriesView(origin="/filter/effective", name="Effective particles")
     words = rrb.TextDocumentView(origin="/about", name="What is shown")
     side = rrb.Vertical(image, rrb.Horizontal(noise, effective), words, row_shares=[6, 3, 4])
     time = rrb.TimePanel(timeline=TIMELINE, fps=2.0, state="collapsed")
-    return rrb.Blueprint(rrb.Horizontal(space, side, column_shares=[3, 2]), time, collapse_panels=True)
+    return rrb.Blueprint(
+        rrb.Horizontal(space, side, column_shares=[3, 2]), time, collapse_panels=True
+    )

@@ -1,4 +1,6 @@
-"""Draw particles that are pixels on their way over an image, and what they see on it: the paper's figures 2 and 4."""
+"""Draw particles that are pixels on their way over an image, and what they see on it: the paper's
+figures 2 and 4.
+"""
 
 import numpy as np
 import torch
@@ -23,41 +25,60 @@ def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return touches(torch.from_numpy(mask)[None, None], places)[0].numpy().reshape(pixels.shape[:-1])
 
 
-def draw_trajectories(rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, most: int = 100) -> np.ndarray:
-    """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off it).
+def draw_trajectories(
+    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, most: int = 100
+) -> np.ndarray:
+    """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off
+    it).
 
-    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `most` of which are drawn. Half a frame more is shown on
-    each side where a particle has left it.
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `most` of which are drawn. Half a
+    frame more is shown on each side where a particle has left it.
     """
     H, W = mask.shape
     path = states[:, :most]
     on = find_hits(mask, path[-1])
     left = bool(((path < -0.5) | (path > [W - 0.5, H - 0.5])).any())
-    view = View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W)) if left else full_view(H, W, WIDTH)
+    view = (
+        View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
+        if left
+        else full_view(H, W, WIDTH)
+    )
     picture = view.show(rgb)
-    draw_lines(picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True)
+    draw_lines(
+        picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True
+    )
     for end, color in ((False, OFF), (True, ON)):
         chosen = view.place(path[:, on == end])
         draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
         draw_dots(picture, chosen[0], np.tile(np.array([START]), (chosen.shape[1], 1)), 2)
         draw_dots(picture, chosen[-1], np.tile(np.array([color]), (chosen.shape[1], 1)), 3.5)
     said = f"{len(states)} steps: {on.mean():.0%} end on the object"
-    return compose_figure(title, draw_text(said, CAPTION), picture, draw_legend([("start", START), *_ENDS]))
+    return compose_figure(
+        title, draw_text(said, CAPTION), picture, draw_legend([("start", START), *_ENDS])
+    )
 
 
 def draw_glimpses(
-    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, patches: np.ndarray, title: str, most: int = 8
+    rgb: np.ndarray,
+    mask: np.ndarray,
+    states: np.ndarray,
+    patches: np.ndarray,
+    title: str,
+    most: int = 8,
 ) -> np.ndarray:
     """Draw what a few particles saw, a row a particle, below their way over the image.
 
-    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, n, 2) [px]; patches (T, n, k, k, 3) uint8. Frames are green where the
-    particle stands on the object, and red where not. most: steps that are shown, the first and the last among them.
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, n, 2) [px]; patches (T, n, k, k, 3) uint8.
+    Frames are green where the particle stands on the object, and red where not. most: steps that
+    are shown, the first and the last among them.
     """
     n, k = patches.shape[1:3]
     on = find_hits(mask, states)
     view = full_view(mask.shape[0], mask.shape[1], WIDTH)
     picture = view.show(rgb)
-    draw_lines(picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True)
+    draw_lines(
+        picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True
+    )
     for i in range(n):
         way = view.place(states[:, i])
         draw_lines(picture, [way], TRUTH if on[-1, i] else OFF, 2)
@@ -66,9 +87,22 @@ def draw_glimpses(
         draw_label(picture, str(i + 1), way[-1])
     shown = choose_steps(len(states), most)
     size = min(90, (WIDTH - _NUMBER) // len(shown))
-    rows = [arrange_row([draw_text("", CAPTION, _NUMBER), *(draw_text(f"step {t}", DETAIL, size) for t in shown)])]
+    rows = [
+        arrange_row(
+            [
+                draw_text("", CAPTION, _NUMBER),
+                *(draw_text(f"step {t}", DETAIL, size) for t in shown),
+            ]
+        )
+    ]
     for i in range(n):
-        cells = [np.pad(draw_text(str(i + 1), CAPTION, _NUMBER), ((size // 5, 0), (0, 0), (0, 0)), constant_values=255)]
+        cells = [
+            np.pad(
+                draw_text(str(i + 1), CAPTION, _NUMBER),
+                ((size // 5, 0), (0, 0), (0, 0)),
+                constant_values=255,
+            )
+        ]
         for t in shown:
             cell = np.full((size, size, 3), 255, np.uint8)
             cell[2:-2, 2:-2] = ON if on[t, i] else OFF
@@ -76,7 +110,9 @@ def draw_glimpses(
             cells.append(cell)
         rows.append(arrange_row(cells))
     said = draw_text(f"what each saw: {k} x {k} samples", CAPTION)
-    return compose_figure(title, picture, draw_legend([("start", START), *_ENDS]), said, np.concatenate(rows))
+    return compose_figure(
+        title, picture, draw_legend([("start", START), *_ENDS]), said, np.concatenate(rows)
+    )
 
 
 def enlarge(patch: np.ndarray, size: int) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""What the 3-D view shows, as plain arrays: a run of the filter on one image, in the camera's frame.
+"""What the 3-D view shows, as plain arrays: a run of the filter on one image, in the camera's
+frame.
 
 Nothing here knows how it is displayed; figures/recording.py writes it to a file.
 """
@@ -10,18 +11,19 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from posefilter.contracts import Space
-from posefilter.data.mesh import Mesh, creased_normals
 from posefilter.figures.canvas import to_image
 from posefilter.figures.overlay import Shape, get_vertices
 from posefilter.filters.modes import find_modes
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.protocols import Space
 from posefilter.types import Batch, ObjectModel, Trace
 
 _GREY = 170
-_APART = 0.1  # of the diameter: poses nearer to each other than this are one hypothesis, as ADD < 0.1 d has it
+# of the diameter: poses nearer to each other than this are one hypothesis, as ADD < 0.1 d has it
+_APART = 0.1
 _LEAST = 0.01  # of the weight: lighter modes are not shown
 _MOST = 8  # modes that are shown, the estimate's not counted
 
@@ -67,21 +69,29 @@ class ViewData(NamedTuple):
 def collect_view_data(
     trace: Trace, batch: Batch, model: ObjectModel, space: Space, shape: Shape, image: int = 0
 ) -> ViewData:
-    """Gather what is shown of one of a trace's images.  shape: the object's mesh, or the vertices of its hull [m]."""
+    """Gather what is shown of one of a trace's images.  shape: the object's mesh, or the vertices
+    of its hull [m].
+    """
     K = batch.intrinsics[image].detach().cpu().double()
     center = model.center.detach().cpu().double()
     points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
-    estimate, others, left_out = find_hypotheses(poses, belief.log_weights[image].detach().cpu(), best, model)
+    estimate, others, left_out = find_hypotheses(
+        poses, belief.log_weights[image].detach().cpu(), best, model
+    )
     unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
     moments = []
-    for cloud, reading, step in zip(trace.clouds, trace.readings, trace.steps, strict=True):
-        pixels = None if isinstance(space, PoseSpace) else cloud.state[image]
+    for particles, output, step in zip(trace.particles, trace.outputs, trace.steps, strict=True):
+        pixels = None if isinstance(space, PoseSpace) else particles.state[image]
         sigma = float(step.sigma if step.sigma.ndim == 0 else step.sigma[image]) * unit
-        moments.append(make_moment(reading.pose[image], cloud.log_weights[image], pixels, center, K, sigma))
-    last = None if isinstance(space, PoseSpace) else trace.clouds[-1].state[image]
-    moments.append(make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None))
+        moments.append(
+            make_moment(output.pose[image], particles.log_weights[image], pixels, center, K, sigma)
+        )
+    last = None if isinstance(space, PoseSpace) else trace.particles[-1].state[image]
+    moments.append(
+        make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None)
+    )
     return ViewData(
         name=model.name,
         rgb=to_image(batch.rgb[image]),
@@ -102,9 +112,17 @@ def collect_view_data(
 
 
 def make_moment(
-    poses: Tensor, log_weights: Tensor, pixels: Tensor | None, center: Tensor, K: Tensor, sigma: float | None
+    poses: Tensor,
+    log_weights: Tensor,
+    pixels: Tensor | None,
+    center: Tensor,
+    K: Tensor,
+    sigma: float | None,
 ) -> Moment:
-    """Return the particles of one step.  (N, 4, 4), (N,), (N, 2) [px]; pixels None: where the poses put the center."""
+    """Return the particles of one step.
+
+    (N, 4, 4), (N,), (N, 2) [px]; pixels None: where the poses put the center.
+    """
     poses = poses.detach().cpu().double()
     weights = torch.softmax(log_weights.detach().cpu().double(), 0)
     centers = origin_of(poses, center)
@@ -114,11 +132,16 @@ def make_moment(
 
 
 def color_points(rgb: Tensor, depth: Tensor, K: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Back-project the pixels whose depth is known.  (3, H, W), (1, H, W) [m], (3, 3) -> (P, 3) [m], (P, 3) uint8."""
+    """Back-project the pixels whose depth is known.
+
+    (3, H, W), (1, H, W) [m], (3, 3) -> (P, 3) [m], (P, 3) uint8.
+    """
     z = depth[0].detach().cpu().double()
     known = z > 0
     pixels = pixel_grid(*z.shape).double()[known]
-    return back_project(pixels, z[known], K.detach().cpu().double()).numpy(), to_image(rgb)[known.numpy()]
+    return back_project(pixels, z[known], K.detach().cpu().double()).numpy(), to_image(rgb)[
+        known.numpy()
+    ]
 
 
 def find_hypotheses(
@@ -126,8 +149,9 @@ def find_hypotheses(
 ) -> tuple[Hypothesis, tuple[Hypothesis, ...], float]:
     """Return the estimate, the belief's other modes, and the weight in modes too light to be shown.
 
-    The estimate stands for the mode of the particle nearest to it, and has that one's weight; where no particle is within a
-    tenth of the diameter (a refinement led away from them all) it has none. (N, 4, 4), (N,), (4, 4).
+    The estimate stands for the mode of the particle nearest to it, and has that one's weight; where
+    no particle is within a tenth of the diameter (a refinement led away from them all) it has none.
+    (N, 4, 4), (N,), (4, 4).
     """
     space = PoseSpace((*model.center.tolist(),), model.radius)
     apart = _APART * model.diameter
@@ -152,7 +176,8 @@ def make_mesh(shape: Shape, name: str) -> Mesh:
         hull = ConvexHull(vertices, qhull_options="QJ")
     faces = hull.simplices.astype(np.int64)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0  # Qhull's triangles turn either way
+    # Qhull's triangles turn either way
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
     faces[inward] = faces[inward][:, ::-1]
     plain = np.full((1, 1, 3), _GREY, np.uint8)
     return Mesh(name, vertices, faces, None, plain, None, creased_normals(vertices, faces))

@@ -1,8 +1,10 @@
-"""Candidate poses that a likelihood learns from by contrast, and the persistent particles that find its faults.
+"""Candidate poses that a likelihood learns from by contrast, and the persistent particles that find
+its faults.
 
-A likelihood trained on the truth and its neighbours alone scores absurd poses high, since it never saw them. So candidates
-come from everywhere, and some from the likelihood's own filter: particles that live on from visit to visit of a frame,
-advancing one step of an annealed filter each time (persistent chains, Tieleman 2008).
+A likelihood trained on the truth and its neighbors alone scores absurd poses high, since it never
+saw them. So candidates come from everywhere, and some from the likelihood's own filter: particles
+that live on from visit to visit of a frame, advancing one step of an annealed filter each time
+(persistent chains, Tieleman 2008).
 """
 
 import math
@@ -12,33 +14,48 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.initialise import draw_from_depth
-from posefilter.filters.propose import half_turns
+from posefilter.filters.initialize import draw_from_depth
+from posefilter.filters.propagate import half_turns
 from posefilter.geometry.pose import invert, origin_of, pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import Batch, ObjectModel
 
 
-def from_depth(batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None) -> Tensor:
+def from_depth(
+    batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None
+) -> Tensor:
     """Draw poses at measured points of a batch; see `draw_from_depth`.  -> (B, count, 4, 4)."""
     return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
 
 
-def jiggle(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0) -> Tensor:
-    """Perturb poses by Gaussian moves of size sigma.  (B, N, 4, 4), (B, N) [m] -> (B, N, 4, 4); `turn` scales the turns."""
+def jiggle(
+    poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0
+) -> Tensor:
+    """Perturb poses by Gaussian moves of size sigma.
+
+    (B, N, 4, 4), (B, N) [m] -> (B, N, 4, 4); `turn` scales the turns.
+    """
     scale = space.noise_scale(sigma)
     scale = torch.cat([scale[..., :3], scale[..., 3:] * turn], dim=-1)
-    return space.move(poses, scale * torch.randn(scale.shape, generator=generator, device=poses.device))
+    return space.move(
+        poses, scale * torch.randn(scale.shape, generator=generator, device=poses.device)
+    )
 
 
 def around_truth(
-    batch: Batch, model: ObjectModel, space: PoseSpace, each: int, sigma: Sequence[float], generator: Generator
+    batch: Batch,
+    model: ObjectModel,
+    space: PoseSpace,
+    each: int,
+    sigma: Sequence[float],
+    generator: Generator,
 ) -> Tensor:
-    """Draw the candidates that need the truth: it itself first, then `each` of every kind.  -> (B, 1 + 4.5 each, 4, 4).
+    """Draw the candidates that need the truth: it itself first, then `each` of every kind.  -> (B,
+    1 + 4.5 each, 4, 4).
 
-    Kinds: perturbed at every scale; from depth on the object; from depth anywhere; right place with a random rotation (half
-    as many); half turns, slightly perturbed.
+    Kinds: perturbed at every scale; from depth on the object; from depth anywhere; right place with
+    a random rotation (half as many); half turns, slightly perturbed.
     """
     B = len(batch.rgb)
     device = batch.rgb.device
@@ -52,42 +69,66 @@ def around_truth(
     anywhere = from_depth(batch, space, each, generator)
     few = each // 2
     placed = jiggle(truth.expand(B, few, 4, 4), size[:, :few] * 0.5, space, generator, turn=0.0)
-    turned = pose_about(random_rotation(B, few, generator=generator, device=device), origin_of(placed, center), center)
+    turned = pose_about(
+        random_rotation(B, few, generator=generator, device=device),
+        origin_of(placed, center),
+        center,
+    )
     flipped = jiggle(half_turns(same, space, generator), size * 0.3, space, generator)
     return torch.cat([truth, near, on, anywhere, turned, flipped], dim=1)
 
 
 class PersistentParticles(nn.Module):
-    """A few particles a training frame, kept between visits; a frame's noise level falls to `sharpest` with each of them.
+    """A few particles a training frame, kept between visits; a frame's noise level falls to
+    `sharpest` with each of them.
 
-    They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera was rolled or zoomed by
-    augmentation finds them where they were.
+    They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera
+    was rolled or zoomed by augmentation finds them where they were.
     """
 
-    def __init__(self, particles: int = 16, levels: int = 12, sharpest: float = 0.004, step: float = 0.4) -> None:
+    def __init__(
+        self, particles: int = 16, levels: int = 12, sharpest: float = 0.004, step: float = 0.4
+    ) -> None:
         super().__init__()
         if particles < 1 or levels < 2:
-            raise UserError(f"lesson: levels={levels} must be 2 or more, particles={particles} 1 or more, or 0 for none")
+            raise UserError(
+                f"lesson: levels={levels} must be 2 or more, particles={particles} 1 "
+                f"or more, or 0 for none"
+            )
         self.particles, self.levels, self.sharpest, self.step = particles, levels, sharpest, step
         self._poses: dict[int, Tensor] = {}
         self._level: dict[int, int] = {}
 
     def recall(self, batch: Batch, fresh: Tensor, start: float) -> tuple[Tensor, Tensor]:
-        """Return each frame's particles (B, M, 4, 4) and noise level (B,) [m]; new frames take the fresh ones, at start."""
+        """Return each frame's particles (B, M, 4, 4) and noise level (B,) [m]; new frames take the
+        fresh ones, at start.
+        """
         rows = []
         for row, frame in enumerate(batch.frame_id.tolist()):
             kept = self._poses.get(frame)
-            rows.append(fresh[row] if kept is None else batch.camera_from_object[row] @ kept.to(fresh.device))
-        level = torch.tensor([self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device)
+            rows.append(
+                fresh[row]
+                if kept is None
+                else batch.camera_from_object[row] @ kept.to(fresh.device)
+            )
+        level = torch.tensor(
+            [self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device
+        )
         return torch.stack(rows), start * (self.sharpest / start) ** (level / (self.levels - 1))
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a run needs to go on: frames (F,), their levels (F,) and particles (F, M, 4, 4)."""
+        """Return what a run needs to go on: frames (F,), their levels (F,) and particles (F, M, 4,
+        4).
+        """
         if not self._poses:
             return {}
         frames = sorted(self._poses)
         levels = torch.tensor([self._level[frame] for frame in frames])
-        return {"frames": torch.tensor(frames), "levels": levels, "poses": torch.stack([self._poses[f] for f in frames])}
+        return {
+            "frames": torch.tensor(frames),
+            "levels": levels,
+            "poses": torch.stack([self._poses[f] for f in frames]),
+        }
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on from what `state` returned."""
@@ -108,11 +149,17 @@ class PersistentParticles(nn.Module):
         space: PoseSpace,
         generator: Generator,
     ) -> None:
-        """Take one filter step where `used` (B,): resample by the scores at sigma, perturb, lower the noise level."""
-        parents = torch.multinomial(torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator)
-        children = poses.gather(1, parents[..., None, None].expand(-1, -1, 4, 4))
+        """Take one filter step where `used` (B,): resample by the scores at sigma, perturb, lower
+        the noise level.
+        """
+        ancestors = torch.multinomial(
+            torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator
+        )
+        resampled = poses.gather(1, ancestors[..., None, None].expand(-1, -1, 4, 4))
         size = (self.step * sigma)[:, None].expand(-1, self.particles)
-        relative = invert(batch.camera_from_object)[:, None] @ jiggle(children, size, space, generator)
+        relative = invert(batch.camera_from_object)[:, None] @ jiggle(
+            resampled, size, space, generator
+        )
         for row, frame in enumerate(batch.frame_id.tolist()):
             if not bool(used[row]):
                 continue

@@ -1,22 +1,30 @@
-"""Drawing children from a weighted cloud.  Each keeps the weighted mean: exactly or in expectation (tests/laws)."""
+"""Drawing children from a weighted cloud.
+
+Each keeps the weighted mean: exactly or in expectation (tests/laws).
+"""
 
 import math
 
 import torch
 from torch import Generator, Tensor
 
-from posefilter.contracts import Resample, Space
 from posefilter.errors import UserError
-from posefilter.types import Children, Cloud
+from posefilter.protocols import Resample, Space
+from posefilter.types import Particles, Resampled
 
 
 def effective_size(log_weights: Tensor) -> Tensor:
-    """Return the effective sample size 1 / sum w^2, from 1 (one particle has it all) to N (all alike).  (B, N) -> (B,)."""
+    """Return the effective sample size 1 / sum w^2, from 1 (one particle has it all) to N (all
+    alike).  (B, N) -> (B,).
+    """
     return torch.exp(-torch.logsumexp(2 * log_weights, dim=1))
 
 
 def draw(log_weights: Tensor, places: Tensor) -> Tensor:
-    """Look up whose share of the weight each place falls into.  (B, M) normalised, (B, N) in [0, 1) -> (B, N) int64."""
+    """Look up whose share of the weight each place falls into.
+
+    (B, M) normalized, (B, N) in [0, 1) -> (B, N) int64.
+    """
     sums = log_weights.detach().double().exp().cumsum(1)
     places = places.double() * sums[:, -1:]
     found = torch.searchsorted(sums, places.clamp_max(sums[:, -1:] * (1 - 1e-15)), right=True)
@@ -24,26 +32,39 @@ def draw(log_weights: Tensor, places: Tensor) -> Tensor:
 
 
 class Fair:
-    """Base of the classic schemes: a child's parent is drawn by weight, and all children start alike.
+    """Base of the classic schemes: a child's parent is drawn by weight, and all children start
+    alike.
 
     Without gradient to the weights: which parent is drawn is a choice, not a function.
     """
 
-    def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
         """Return children of equal weight."""
-        places = self.places(len(cloud.log_weights), particles, generator, cloud.log_weights.device)
-        parents = draw(cloud.log_weights, places)
-        return Children(parents, cloud.log_weights.new_full(parents.shape, -math.log(particles)))
+        places = self.places(
+            len(particles.log_weights), count, generator, particles.log_weights.device
+        )
+        ancestors = draw(particles.log_weights, places)
+        return Resampled(
+            ancestors, particles.log_weights.new_full(ancestors.shape, -math.log(count))
+        )
 
-    def places(self, rows: int, particles: int, generator: Generator, device: torch.device) -> Tensor:
+    def places(
+        self, rows: int, particles: int, generator: Generator, device: torch.device
+    ) -> Tensor:
         """Return where on the unit interval to look, (rows, particles)."""
         raise NotImplementedError
 
 
 class Multinomial(Fair):
-    """Independent draws: the textbook's bootstrap filter (Gordon et al. 1993), with the largest variance."""
+    """Independent draws: the textbook's bootstrap filter (Gordon et al. 1993), with the largest
+    variance.
+    """
 
-    def places(self, rows: int, particles: int, generator: Generator, device: torch.device) -> Tensor:
+    def places(
+        self, rows: int, particles: int, generator: Generator, device: torch.device
+    ) -> Tensor:
         """Return independent uniform places."""
         return torch.rand(rows, particles, generator=generator, device=device)
 
@@ -51,27 +72,34 @@ class Multinomial(Fair):
 class Stratified(Fair):
     """One uniform draw in each N-th of the unit interval (Kitagawa 1996)."""
 
-    def places(self, rows: int, particles: int, generator: Generator, device: torch.device) -> Tensor:
+    def places(
+        self, rows: int, particles: int, generator: Generator, device: torch.device
+    ) -> Tensor:
         """Return one uniform place in each stratum."""
         u = torch.rand(rows, particles, generator=generator, device=device)
         return (torch.arange(particles, device=device) + u) / particles
 
 
 class Systematic(Fair):
-    """A comb with one random offset (Carpenter et al. 1999): a particle of weight w has floor(N w) or ceil(N w) children."""
+    """A comb with one random offset (Carpenter et al. 1999): a particle of weight w has floor(N w)
+    or ceil(N w) children.
+    """
 
-    def places(self, rows: int, particles: int, generator: Generator, device: torch.device) -> Tensor:
+    def places(
+        self, rows: int, particles: int, generator: Generator, device: torch.device
+    ) -> Tensor:
         """Return a comb with an offset an image."""
         u = torch.rand(rows, 1, generator=generator, device=device)
         return (torch.arange(particles, device=device) + u) / particles
 
 
 class Soft:
-    """Draw from a mixture of the weights (share alpha) and the uniform, and weigh the children by what that distorts.
+    """Draw from a mixture of the weights (share alpha) and the uniform, and weigh the children by
+    what that distorts.
 
-    Their weights w / q carry the gradient back to the parents' (Karkus et al. 2018). Here q is held fixed in it: then the
-    gradient of a weighted mean is right in expectation, even at alpha = 1 (Scibior and Wood 2021); else it is not.
-    alpha: 1 is fair, 0 ignores weights.
+    Their weights w / q carry the gradient back to the parents' (Karkus et al. 2018). Here q is held
+    fixed in it: then the gradient of a weighted mean is right in expectation, even at alpha = 1
+    (Scibior and Wood 2021); else it is not. alpha: 1 is fair, 0 ignores weights.
     """
 
     def __init__(self, alpha: float = 0.5) -> None:
@@ -80,28 +108,40 @@ class Soft:
         self.alpha = alpha
         self.scheme = Systematic()
 
-    def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
-        """Return children whose weights are normalised."""
-        log_w = cloud.log_weights
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
+        """Return children whose weights are normalized."""
+        log_w = particles.log_weights
         mixed = self.alpha * log_w.detach().exp() + (1 - self.alpha) / log_w.shape[1]
         log_q = mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
-        parents = self.scheme(cloud._replace(log_weights=log_q), particles, space, generator).parents
-        return Children(parents, torch.log_softmax((log_w - log_q).gather(1, parents), dim=1))
+        ancestors = self.scheme(
+            particles._replace(log_weights=log_q), count, space, generator
+        ).ancestors
+        return Resampled(ancestors, torch.log_softmax((log_w - log_q).gather(1, ancestors), dim=1))
 
 
-class Never:
+class NoResampling:
     """Keep every particle and its weight."""
 
-    def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
         """Return each particle as its own child."""
-        B, M = cloud.log_weights.shape
-        if particles != M:
-            raise UserError(f"resample=never cannot turn {M} particles into {particles}: leave filter.first_particles out")
-        return Children(torch.arange(M, device=cloud.state.device).expand(B, M), cloud.log_weights)
+        B, M = particles.log_weights.shape
+        if count != M:
+            raise UserError(
+                f"resample=none cannot turn {M} particles into {count}: leave "
+                f"filter.first_particles out"
+            )
+        return Resampled(
+            torch.arange(M, device=particles.state.device).expand(B, M), particles.log_weights
+        )
 
 
 class BelowESS:
-    """Resample an image's cloud only where its effective sample size is below a share of its particles; else keep it.
+    """Resample an image's cloud only where its effective sample size is below a share of its
+    particles; else keep it.
 
     Each image of a batch decides for itself. A cloud whose size must change is always resampled.
     """
@@ -109,16 +149,20 @@ class BelowESS:
     def __init__(self, resampler: Resample, threshold: float = 0.5) -> None:
         self.resampler, self.threshold = resampler, threshold
 
-    def __call__(self, cloud: Cloud, particles: int, space: Space, generator: Generator) -> Children:
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
         """Return children, of which those of rich clouds are their parents with their weights."""
-        drawn = self.resampler(cloud, particles, space, generator)
-        M = cloud.log_weights.shape[1]
-        if particles != M:
+        drawn = self.resampler(particles, count, space, generator)
+        M = particles.log_weights.shape[1]
+        if count != M:
             return drawn
-        poor = (effective_size(cloud.log_weights) < self.threshold * M)[:, None]
-        kept = Never()(cloud, particles, space, generator)
+        poor = (effective_size(particles.log_weights) < self.threshold * M)[:, None]
+        kept = NoResampling()(particles, count, space, generator)
         shares = drawn.shares
         if shares is not None:
-            shares = torch.where(poor[..., None], shares, torch.eye(M, dtype=shares.dtype, device=shares.device))
-        parents = torch.where(poor, drawn.parents, kept.parents)
-        return Children(parents, torch.where(poor, drawn.log_weights, kept.log_weights), shares)
+            shares = torch.where(
+                poor[..., None], shares, torch.eye(M, dtype=shares.dtype, device=shares.device)
+            )
+        ancestors = torch.where(poor, drawn.ancestors, kept.ancestors)
+        return Resampled(ancestors, torch.where(poor, drawn.log_weights, kept.log_weights), shares)

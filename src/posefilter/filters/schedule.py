@@ -15,7 +15,9 @@ class Constant:
 
 
 class Geometric:
-    """Sigma falls (or rises) from `start` at the first step to `stop` at the last by a constant factor."""
+    """Sigma falls (or rises) from `start` at the first step to `stop` at the last by a constant
+    factor.
+    """
 
     def __init__(self, start: float, stop: float) -> None:
         if not (start > 0 and stop > 0):

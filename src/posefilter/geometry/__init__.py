@@ -1,1 +1,3 @@
-"""Pure functions on tensors: rotations, rigid transforms, cameras and the spaces that particles live in."""
+"""Pure functions on tensors: rotations, rigid transforms, cameras and the spaces that particles
+live in.
+"""

@@ -1,4 +1,7 @@
-"""Pinhole cameras.  Axes: x right, y down, z forward (OpenCV).  A pixel's centre has integer coordinates (u, v)."""
+"""Pinhole cameras.
+
+Axes: x right, y down, z forward (OpenCV).  A pixel's center has integer coordinates (u, v).
+"""
 
 import torch
 from torch import Tensor
@@ -12,7 +15,8 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
 def project(points: Tensor, K: Tensor) -> Tensor:
     """Project camera points to pixels.  (*, P, 3) [m], (*, 3, 3) [px] -> (*, P, 2) [px] as (u, v).
 
-    Points at or behind the camera's plane are projected as if they lay 1 mm before it; callers that care test z.
+    Points at or behind the camera's plane are projected as if they lay 1 mm before it; callers that
+    care test z.
     """
     z = points[..., 2:].clamp_min(1e-3)
     focal = torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :]
@@ -28,12 +32,19 @@ def rays(pixels: Tensor, K: Tensor) -> Tensor:
 
 
 def back_project(pixels: Tensor, depth: Tensor, K: Tensor) -> Tensor:
-    """Lift pixels to camera points.  (*, P, 2) [px], (*, P) z-depth [m], (*, 3, 3) [px] -> (*, P, 3) [m]."""
+    """Lift pixels to camera points.
+
+    (*, P, 2) [px], (*, P) z-depth [m], (*, 3, 3) [px] -> (*, P, 3) [m].
+    """
     return rays(pixels, K) * depth[..., None]
 
 
-def pixel_grid(height: int, width: int, stride: int = 1, device: torch.device | None = None) -> Tensor:
-    """Return the pixels at the centre of each stride x stride cell.  -> (height // stride, width // stride, 2) [px]."""
+def pixel_grid(
+    height: int, width: int, stride: int = 1, device: torch.device | None = None
+) -> Tensor:
+    """Return the pixels at the center of each stride x stride cell.  -> (height // stride, width //
+    stride, 2) [px].
+    """
     offset = (stride - 1) / 2
     v = torch.arange(height // stride, device=device) * stride + offset
     u = torch.arange(width // stride, device=device) * stride + offset
@@ -41,7 +52,9 @@ def pixel_grid(height: int, width: int, stride: int = 1, device: torch.device | 
 
 
 def resize_intrinsics(K: Tensor, scale_x: float, scale_y: float) -> Tensor:
-    """Return the camera matrix of an image resized by (scale_x, scale_y), pixel centres at integers.  (*, 3, 3) [px]."""
+    """Return the camera matrix of an image resized by (scale_x, scale_y), pixel centers at
+    integers.  (*, 3, 3) [px].
+    """
     out = K.clone()
     out[..., 0, :] *= scale_x
     out[..., 1, :] *= scale_y
@@ -51,7 +64,10 @@ def resize_intrinsics(K: Tensor, scale_x: float, scale_y: float) -> Tensor:
 
 
 def crop_intrinsics(K: Tensor, left: float, top: float) -> Tensor:
-    """Return the camera matrix of an image whose pixel (0, 0) was (left, top) before.  (*, 3, 3) [px]."""
+    """Return the camera matrix of an image whose pixel (0, 0) was (left, top) before.
+
+    (*, 3, 3) [px].
+    """
     out = K.clone()
     out[..., 0, 2] -= left
     out[..., 1, 2] -= top

@@ -17,10 +17,11 @@ def nearest_fragment(points: Tensor, centers: Tensor) -> Tensor:
 
 
 def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
-    """Choose `count` points far from each other (farthest point sampling).  (P, 3) -> (count, 3), their mean reach.
+    """Choose `count` points far from each other (farthest point sampling).  (P, 3) -> (count, 3),
+    their mean reach.
 
-    The reach is the mean distance of all points to the nearest chosen one, in the points' unit, and never 0. A set with
-    fewer points gives some of them more than once.
+    The reach is the mean distance of all points to the nearest chosen one, in the points' unit, and
+    never 0. A set with fewer points gives some of them more than once.
     """
     distance = (points - points.mean(0)).norm(dim=-1)
     chosen, nearest = [], torch.full_like(distance, torch.inf)
@@ -33,18 +34,21 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
 
 
 def may_be_object(points: Tensor) -> Tensor:
-    """Tell which measured points can be of the object.  (*, 3) over the radius, from the object's centre -> (*) bool.
+    """Tell which measured points can be of the object.  (*, 3) over the radius, from the object's
+    center -> (*) bool.
 
-    A fifth beyond its bounding ball is left to the sensor's error; farther off, a mask's pixel shows what lies behind.
+    A fifth beyond its bounding ball is left to the sensor's error; farther off, a mask's pixel
+    shows what lies behind.
     """
     return points.norm(dim=-1) < 1.2
 
 
 def cut_once(centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float) -> None:
-    """Fill buffers (K, 3) and () by cutting a surface into K fragments, over the radius, from the centre; once.
+    """Fill buffers (K, 3) and () by cutting a surface into K fragments, over the radius, from the
+    center; once.
 
-    points: (P, 3) of the surface [m]; center: (3,) and radius [m]. Filled buffers stay: what was learned is about their
-    fragments, whatever points it is judged by later.
+    points: (P, 3) of the surface [m]; center: (3,) and radius [m]. Filled buffers stay: what was
+    learned is about their fragments, whatever points it is judged by later.
     """
     if bool(centers.any()):
         return
@@ -56,9 +60,11 @@ def cut_once(centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, rad
 def fragment_errors(
     log_share: Tensor, place: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the surprise at the true fragments, and the L1 error of the places in them, in units of their reach.
+    """Return the surprise at the true fragments, and the L1 error of the places in them, in units
+    of their reach.
 
-    (B, *, K), (B, *, K, 3), (B, K, 3) and the true points (B, *, 3) over the radius, from the centre -> (B, *), (B, *).
+    (B, *, K), (B, *, K, 3), (B, K, 3) and the true points (B, *, 3) over the radius, from the
+    center -> (B, *), (B, *).
     """
     fragment = nearest_fragment(truth, centers)
     surprise = -log_share.gather(-1, fragment[..., None])[..., 0]

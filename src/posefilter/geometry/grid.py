@@ -1,4 +1,6 @@
-"""An even, nested grid over SO(3): HEALPix on the sphere times the circle, by Hopf coordinates (Yershova et al. 2010)."""
+"""An even, nested grid over SO(3): HEALPix on the sphere times the circle, by Hopf coordinates
+(Yershova et al. 2010).
+"""
 
 import math
 
@@ -7,20 +9,26 @@ from torch import Tensor
 
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
 
-_FACE_RING = (2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4)  # each base face's southern corner, in rings of nside (Gorski et al. 2005)
-_FACE_MERIDIAN = (1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7)  # each base face's centre, in units of pi / 4
+# each base face's southern corner, in rings of nside (Gorski et al. 2005)
+_FACE_RING = (2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4)
+_FACE_MERIDIAN = (1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7)  # each base face's center, in units of pi / 4
 
 
 def healpix_directions(face: Tensor, x: Tensor, y: Tensor, nside: int) -> tuple[Tensor, Tensor]:
-    """Return (cos of the polar angle, azimuth [rad]) of HEALPix cells' centres (Gorski et al. 2005).  (*) int64 -> (*) x 2.
+    """Return (cos of the polar angle, azimuth [rad]) of HEALPix cells' centers (Gorski et al.
+    2005).  (*) int64 -> (*) x 2.
 
-    face: 0 to 11; x, y: the cell within it, towards the north-east and the north-west, 0 to nside - 1.
+    face: 0 to 11; x, y: the cell within it, towards the north-east and the north-west, 0 to nside -
+    1.
     """
     ring = torch.tensor(_FACE_RING)[face] * nside - x - y - 1
     north, south = ring < nside, ring > 3 * nside
-    cap = torch.where(north, ring, torch.where(south, 4 * nside - ring, nside))  # a quarter of the cells in this ring
+    # a quarter of the cells in this ring
+    cap = torch.where(north, ring, torch.where(south, 4 * nside - ring, nside))
     polar = cap.double().square() / (3 * nside**2)
-    z = torch.where(north, 1 - polar, torch.where(south, polar - 1, (2 * nside - ring) * 2 / (3 * nside)))
+    z = torch.where(
+        north, 1 - polar, torch.where(south, polar - 1, (2 * nside - ring) * 2 / (3 * nside))
+    )
     azimuth = (torch.tensor(_FACE_MERIDIAN)[face] * cap + x - y) * math.pi / (4 * cap.double())
     return z, azimuth
 
@@ -28,14 +36,18 @@ def healpix_directions(face: Tensor, x: Tensor, y: Tensor, nside: int) -> tuple[
 def so3_grid(level: int) -> Tensor:
     """Return 72 x 8^level rotations, evenly spread.  -> (72 * 8**level, 3, 3) float32.
 
-    A random rotation lies 28, 14, 7 and 3.5 degrees from the nearest of levels 0 to 3 on average, and at most twice that.
-    Nested: cell i of one level is cut into cells 8 i to 8 i + 7 of the next. Cells at the south pole are slivers, whose
-    parts lie up to 50 degrees apart.
+    A random rotation lies 28, 14, 7 and 3.5 degrees from the nearest of levels 0 to 3 on average,
+    and at most twice that. Nested: cell i of one level is cut into cells 8 i to 8 i + 7 of the
+    next. Cells at the south pole are slivers, whose parts lie up to 50 degrees apart.
     """
-    cells = torch.cartesian_prod(torch.arange(12), torch.arange(1), torch.arange(1), torch.arange(6))  # face, x, y, turn
+    cells = torch.cartesian_prod(
+        torch.arange(12), torch.arange(1), torch.arange(1), torch.arange(6)
+    )  # face, x, y, turn
     halves = torch.tensor([[0, a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
     for _ in range(level):
-        cells = (cells * torch.tensor([1, 2, 2, 2])).repeat_interleave(8, 0) + halves.repeat(len(cells), 1)
+        cells = (cells * torch.tensor([1, 2, 2, 2])).repeat_interleave(8, 0) + halves.repeat(
+            len(cells), 1
+        )
     face, x, y, turn = cells.unbind(-1)
     z, azimuth = healpix_directions(face, x, y, 2**level)
     half_polar = torch.acos(z) / 2

@@ -1,4 +1,7 @@
-"""Rigid transforms as homogeneous matrices (*, 4, 4).  `a_from_b` maps b into a, so neighbours cancel when multiplied."""
+"""Rigid transforms as homogeneous matrices (*, 4, 4).
+
+`a_from_b` maps b into a, so neighbors cancel when multiplied.
+"""
 
 import torch
 from torch import Tensor
@@ -10,7 +13,9 @@ def make_pose(rotation: Tensor, translation: Tensor) -> Tensor:
     """Assemble a pose.  (*, 3, 3), (*, 3) [m] -> (*, 4, 4); leading shapes broadcast."""
     lead = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     top = torch.cat([rotation.expand(*lead, 3, 3), translation.expand(*lead, 3)[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(*lead, 1, 4)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(
+        *lead, 1, 4
+    )
     return torch.cat([top, bottom], dim=-2)
 
 
@@ -32,7 +37,9 @@ def invert(a_from_b: Tensor) -> Tensor:
 
 def transform(a_from_b: Tensor, points_b: Tensor) -> Tensor:
     """Map points of frame b into frame a.  (*, 4, 4), (*, P, 3) [m] -> (*, P, 3) [m]."""
-    return points_b @ rotation_of(a_from_b).transpose(-1, -2) + translation_of(a_from_b)[..., None, :]
+    return (
+        points_b @ rotation_of(a_from_b).transpose(-1, -2) + translation_of(a_from_b)[..., None, :]
+    )
 
 
 def origin_of(pose: Tensor, point: Tensor) -> Tensor:
@@ -41,24 +48,30 @@ def origin_of(pose: Tensor, point: Tensor) -> Tensor:
 
 
 def pose_about(rotation: Tensor, center_camera: Tensor, center_object: Tensor) -> Tensor:
-    """Return the pose that turns by `rotation` and brings `center_object` to `center_camera`.  -> (*, 4, 4)."""
+    """Return the pose that turns by `rotation` and brings `center_object` to `center_camera`.  ->
+    (*, 4, 4).
+    """
     return make_pose(rotation, center_camera - rotation @ center_object)
 
 
 def move_about(pose: Tensor, tangent: Tensor, center_object: Tensor) -> Tensor:
-    """Move poses by tangent vectors: turn about the object's centre in its own frame, shift in the camera's axes.
+    """Move poses by tangent vectors: turn about the object's center in its own frame, shift in the
+    camera's axes.
 
-    (*, 4, 4), (*, 6) as [shift [m], turn [rad]], (3,) [m] -> (*, 4, 4). Turning about the centre rather than the frame's
-    origin keeps the two parts independent, wherever a mesh's author put the origin.
+    (*, 4, 4), (*, 6) as [shift [m], turn [rad]], (3,) [m] -> (*, 4, 4). Turning about the center
+    rather than the frame's origin keeps the two parts independent, wherever a mesh's author put the
+    origin.
     """
     rotation = rotation_of(pose) @ exp_so3(tangent[..., 3:])
     return pose_about(rotation, origin_of(pose, center_object) + tangent[..., :3], center_object)
 
 
 def fit_rigid(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-    """Return the rigid transform target_from_source of least weighted squares (Kabsch 1976; Umeyama 1991, no scale).
+    """Return the rigid transform target_from_source of least weighted squares (Kabsch 1976; Umeyama
+    1991, no scale).
 
-    (*, P, 3), (*, P, 3) [m], (*, P) >= 0 -> (*, 4, 4). Degenerate sets give some rotation that attains the minimum.
+    (*, P, 3), (*, P, 3) [m], (*, P) >= 0 -> (*, 4, 4). Degenerate sets give some rotation that
+    attains the minimum.
     """
     w = (weights / weights.sum(-1, keepdim=True).clamp_min(1e-12))[..., None]
     mean_s = (w * source).sum(-2, keepdim=True)

@@ -1,6 +1,8 @@
-"""Rotations: matrices (*, 3, 3) are the one form the code computes with; every other form is converted here.
+"""Rotations: matrices (*, 3, 3) are the one form the code computes with; every other form is
+converted here.
 
-Conventions: active rotations, column vectors (x' = R x), radians, quaternions as (x, y, z, w) with unit norm.
+Conventions: active rotations, column vectors (x' = R x), radians, quaternions as (x, y, z, w) with
+unit norm.
 """
 
 import math
@@ -22,7 +24,10 @@ def hat(v: Tensor) -> Tensor:
 
 
 def exp_so3(rotvec: Tensor) -> Tensor:
-    """Map a rotation vector to its matrix (Rodrigues), differentiable at zero.  (*, 3) [rad] -> (*, 3, 3)."""
+    """Map a rotation vector to its matrix (Rodrigues), differentiable at zero.
+
+    (*, 3) [rad] -> (*, 3, 3).
+    """
     square = (rotvec * rotvec).sum(-1)[..., None, None]
     small = square < _SMALL**2
     safe = torch.where(small, torch.ones_like(square), square)
@@ -34,7 +39,10 @@ def exp_so3(rotvec: Tensor) -> Tensor:
 
 
 def log_so3(R: Tensor) -> Tensor:
-    """Map a rotation matrix to its rotation vector with angle in [0, pi].  (*, 3, 3) -> (*, 3) [rad]."""
+    """Map a rotation matrix to its rotation vector with angle in [0, pi].
+
+    (*, 3, 3) -> (*, 3) [rad].
+    """
     quat = quat_xyzw_from_matrix(R)
     quat = torch.where(quat[..., 3:] < 0, -quat, quat)
     vector, w = quat[..., :3], quat[..., 3:]
@@ -45,7 +53,7 @@ def log_so3(R: Tensor) -> Tensor:
 
 
 def matrix_from_quat_xyzw(quat_xyzw: Tensor) -> Tensor:
-    """Convert quaternions (normalised here) to matrices.  (*, 4) -> (*, 3, 3)."""
+    """Convert quaternions (normalized here) to matrices.  (*, 4) -> (*, 3, 3)."""
     x, y, z, w = F.normalize(quat_xyzw, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -56,7 +64,10 @@ def matrix_from_quat_xyzw(quat_xyzw: Tensor) -> Tensor:
 
 
 def quat_xyzw_from_matrix(R: Tensor) -> Tensor:
-    """Convert matrices to unit quaternions, whichever of the four forms is best conditioned.  (*, 3, 3) -> (*, 4)."""
+    """Convert matrices to unit quaternions, whichever of the four forms is best conditioned.
+
+    (*, 3, 3) -> (*, 4).
+    """
     m = R.flatten(-2).unbind(-1)
     trace = m[0] + m[4] + m[8]
     choices = torch.stack(
@@ -74,14 +85,19 @@ def quat_xyzw_from_matrix(R: Tensor) -> Tensor:
 
 
 def matrix_from_6d(six: Tensor) -> Tensor:
-    """Orthonormalise two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).  (*, 6) -> (*, 3, 3)."""
+    """Orthonormalize two columns by Gram-Schmidt (Zhou et al. 2019, eq. 15).
+
+    (*, 6) -> (*, 3, 3).
+    """
     a, b = six[..., :3], six[..., 3:]
     x = F.normalize(a, dim=-1)
     y = F.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 
-def random_rotation(*shape: int, generator: torch.Generator | None = None, device: torch.device | None = None) -> Tensor:
+def random_rotation(
+    *shape: int, generator: torch.Generator | None = None, device: torch.device | None = None
+) -> Tensor:
     """Draw rotations uniformly (Haar) from SO(3).  -> (*shape, 3, 3)."""
     return matrix_from_quat_xyzw(torch.randn(*shape, 4, generator=generator, device=device))
 
@@ -89,14 +105,17 @@ def random_rotation(*shape: int, generator: torch.Generator | None = None, devic
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
     """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*) in [0, pi] [rad].
 
-    Through the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which stays exact where the arc cosine does not.
+    Through the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which stays exact where the arc cosine
+    does not.
     """
     chord = torch.linalg.matrix_norm(a - b)
     return 2 * torch.asin((chord / (2 * math.sqrt(2))).clamp(max=1.0))
 
 
 class _Procrustes(torch.autograd.Function):
-    """The nearest rotation, with its own derivative: autograd's for the SVD is NaN where singular values are alike."""
+    """The nearest rotation, with its own derivative: autograd's for the SVD is NaN where singular
+    values are alike.
+    """
 
     @staticmethod
     def forward(ctx: Any, M: Tensor) -> Tensor:
@@ -119,5 +138,8 @@ class _Procrustes(torch.autograd.Function):
 
 
 def project_to_so3(M: Tensor) -> Tensor:
-    """Return the rotation nearest to M in the Frobenius norm (orthogonal Procrustes).  (*, 3, 3) -> (*, 3, 3)."""
+    """Return the rotation nearest to M in the Frobenius norm (orthogonal Procrustes).
+
+    (*, 3, 3) -> (*, 3, 3).
+    """
     return _Procrustes.apply(M)

@@ -1,4 +1,7 @@
-"""The two spaces that particles live in.  A space knows how to perturb, average and measure its states."""
+"""The two spaces that particles live in.
+
+A space knows how to perturb, average and measure its states.
+"""
 
 from dataclasses import dataclass
 
@@ -34,9 +37,10 @@ class PixelSpace:
 
 @dataclass(frozen=True)
 class PoseSpace:
-    """Particles are poses (4, 4), perturbed about the object's centre; a turn counts as the shift it gives at the radius.
+    """Particles are poses (4, 4), perturbed about the object's center; a turn counts as the shift
+    it gives at the radius.
 
-    center: the object's centre in its own frame [m]; radius: of its bounding sphere [m].
+    center: the object's center in its own frame [m]; radius: of its bounding sphere [m].
     """
 
     center: tuple[float, float, float]
@@ -45,16 +49,22 @@ class PoseSpace:
     max_turn: float = 1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
-        """Move poses about the object's centre.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""
+        """Move poses about the object's center.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""
         return move_about(state, tangent, state.new_tensor(self.center))
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
-        """Return the spread an axis of a move whose size is sigma [m].  (*) -> (*, 6) as [m, m, m, rad, rad, rad]."""
+        """Return the spread an axis of a move whose size is sigma [m].
+
+        (*) -> (*, 6) as [m, m, m, rad, rad, rad].
+        """
         turn = (sigma / self.radius).clamp(max=self.max_turn)
         return torch.stack([sigma] * 3 + [turn] * 3, dim=-1)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
-        """Return the weighted mean: of the centres, and the chordal mean of the rotations.  (*, N, 4, 4) -> (*, 4, 4)."""
+        """Return the weighted mean: of the centers, and the chordal mean of the rotations.
+
+        (*, N, 4, 4) -> (*, 4, 4).
+        """
         c = state.new_tensor(self.center)
         w = weights[..., None]
         center = (w * origin_of(state, c)).sum(-2)
@@ -62,7 +72,10 @@ class PoseSpace:
         return pose_about(R, center, c)
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return shift [m] and turn x radius [m], added in quadrature.  (*, 4, 4) x 2 -> (*) [m]."""
+        """Return shift [m] and turn x radius [m], added in quadrature.
+
+        (*, 4, 4) x 2 -> (*) [m].
+        """
         c = a.new_tensor(self.center)
         shift = (origin_of(a, c) - origin_of(b, c)).norm(dim=-1)
         turn = angle_between(rotation_of(a), rotation_of(b)) * self.radius

@@ -1,4 +1,6 @@
-"""Votes: measured points and likely object points, a few at a time, fix a rigid transform (Kabsch 1976)."""
+"""Votes: measured points and likely object points, a few at a time, fix a rigid transform (Kabsch
+1976).
+"""
 
 import torch
 from torch import Generator, Tensor
@@ -22,14 +24,15 @@ def draw_votes(
 ) -> Tensor:
     """Draw poses from what is seen at measured points.  -> (B, count, 4, 4) camera_from_object [m].
 
-    point: (B, n, 3) in the camera [m]; weight: (B, n) >= 0, how much each is believed, 0 where it was not measured;
-    share: (B, n, K) of each fragment; place: (B, n, K, 3) the object's point if it is that fragment, over the radius,
-    from the centre (3,) [m]; radius: [m].
+    point: (B, n, 3) in the camera [m]; weight: (B, n) >= 0, how much each is believed, 0 where it
+    was not measured; share: (B, n, K) of each fragment; place: (B, n, K, 3) the object's point if
+    it is that fragment, over the radius, from the center (3,) [m]; radius: [m].
 
-    A seed is drawn by weight x its surest fragment's share, and one of its fragments by their shares; `votes` more points
-    likewise within 2 radii of it, their fragments by shares x agreement: a rigid object keeps distances, so a part as
-    far from the seed's as the measured points are apart is likelier. Their weighted Kabsch fit is one pose. Where all
-    weights of an image are 0 the poses mean nothing.
+    A seed is drawn by weight x its surest fragment's share, and one of its fragments by their
+    shares; `votes` more points likewise within 2 radii of it, their fragments by shares x
+    agreement: a rigid object keeps distances, so a part as far from the seed's as the measured
+    points are apart is likelier. Their weighted Kabsch fit is one pose. Where all weights of an
+    image are 0 the poses mean nothing.
     """
     B = len(point)
     weight = weight * share.amax(-1)
@@ -38,7 +41,9 @@ def draw_votes(
     at = _rows(point, seed)
     near = torch.cdist(at, point) < 2 * radius
     local = weight[:, None] * near + 1e-12 * (weight[:, None] > 0)
-    rest = torch.multinomial(local.flatten(0, 1), votes, replacement=True, generator=generator).unflatten(0, (B, count))
+    rest = torch.multinomial(
+        local.flatten(0, 1), votes, replacement=True, generator=generator
+    ).unflatten(0, (B, count))
     first = pick_fragment(_rows(place, seed), _draw(_rows(share, seed), generator))
     apart = (_rows(point, rest) - at[:, :, None]).norm(dim=-1) / radius
     options = _rows(place, rest)  # (B, count, votes, K, 3)

@@ -11,12 +11,15 @@ from posefilter.types import Batch, ObjectModel, Trace
 class TowardsObject:
     """The displacement that would bring each particle onto the object.
 
-    target: nearest (the mask's nearest pixel: zero for a particle that is on it) or center (the mask's centroid).
-    margin_px: how far inside the mask's rim `nearest` aims, where the mask is wide enough. reach: the longest displacement
-    asked for in one step, in frame widths; a farther target is approached along the straight line.
+    target: nearest (the mask's nearest pixel: zero for a particle that is on it) or center (the
+    mask's centroid). margin_px: how far inside the mask's rim `nearest` aims, where the mask is
+    wide enough. reach: the longest displacement asked for in one step, in frame widths; a farther
+    target is approached along the straight line.
     """
 
-    def __init__(self, target: str = "nearest", margin_px: int = 0, reach: float = float("inf")) -> None:
+    def __init__(
+        self, target: str = "nearest", margin_px: int = 0, reach: float = float("inf")
+    ) -> None:
         if target not in ("nearest", "center"):
             raise UserError(f"label.target={target!r} is unknown: choose nearest or center")
         self.target = target
@@ -26,7 +29,7 @@ class TowardsObject:
     @torch.no_grad()
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N, 2) [px], without gradient."""
-        states = torch.stack([cloud.state for cloud in trace.clouds])
+        states = torch.stack([particles.state for particles in trace.particles])
         if self.target == "center":
             goal = center_of(batch.mask)[:, None].expand_as(states)
         else:

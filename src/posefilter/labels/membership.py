@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from posefilter.geometry.deviation import deviation, thin
 from posefilter.geometry.lookup import touches
+from posefilter.geometry.pose_error import deviation, thin
 from posefilter.types import Batch, ObjectModel, Trace
 
 
@@ -16,15 +16,21 @@ class OnObject:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N) in {0, 1}."""
-        counts = [cloud.state.shape[1] for cloud in trace.clouds]
-        met = touches(batch.mask, torch.cat([cloud.state for cloud in trace.clouds], dim=1), self.size).float()
+        counts = [particles.state.shape[1] for particles in trace.particles]
+        met = touches(
+            batch.mask,
+            torch.cat([particles.state for particles in trace.particles], dim=1),
+            self.size,
+        ).float()
         return torch.stack(met.split(counts, dim=1))
 
 
 class Quality:
-    """exp(-ADD / scale) on the object, 0 off it: a likelihood trained on it is the confidence in the particle's pose too.
+    """exp(-ADD / scale) on the object, 0 off it: a likelihood trained on it is the confidence in
+    the particle's pose too.
 
-    scale: in object diameters. The idea: a detection's score that is trained to be its quality (Li et al. 2020).
+    scale: in object diameters. The idea: a detection's score that is trained to be its quality (Li
+    et al. 2020).
     """
 
     def __init__(self, size: int = 1, scale: float = 0.1, points: int = 64) -> None:
@@ -36,5 +42,7 @@ class Quality:
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N) in [0, 1], without gradient."""
         points = thin(model.points, self.points).to(batch.rgb)
-        off = torch.stack([deviation(reading.pose, batch.camera_from_object, points) for reading in trace.readings])
+        off = torch.stack(
+            [deviation(output.pose, batch.camera_from_object, points) for output in trace.outputs]
+        )
         return self.on_object(trace, batch, model) * torch.exp(-off / (self.scale * model.diameter))

@@ -8,10 +8,11 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 class PaperPoints:
-    """+100 on the surface in its own colour, 0 for possible occluders and foreign colours, -100 behind the surface.
+    """+100 on the surface in its own color, 0 for possible occluders and foreign colors, -100
+    behind the surface.
 
-    Reads a cloud of samples (B, N, 4): pixel u, v, offset behind the observed surface [m], and 1 where the sample kept the
-    pixel's colour, 0 where its colour is random.
+    Reads a cloud of samples (B, N, 4): pixel u, v, offset behind the observed surface [m], and 1
+    where the sample kept the pixel's color, 0 where its color is random.
     """
 
     def __init__(self, tolerance: float = 0.01, on: float = 100.0, behind: float = -100.0) -> None:
@@ -19,10 +20,14 @@ class PaperPoints:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return labels (1, B, N)."""
-        if trace.clouds[-1].state.dim() != 3:
+        if trace.particles[-1].state.dim() != 3:
             raise UserError(
-                "loss=regression judges points along rays, not poses: choose lesson=labelled_rays, or loss=contrast"
+                "loss=regression judges points along rays, not poses: choose "
+                "candidate_sampler=labeled_rays, or loss=contrast"
             )
-        offset, own_colour = trace.clouds[-1].state[..., 2], trace.clouds[-1].state[..., 3] > 0.5
+        offset, own_color = (
+            trace.particles[-1].state[..., 2],
+            trace.particles[-1].state[..., 3] > 0.5,
+        )
         label = torch.where(offset > self.tolerance, self.behind, 0.0)
-        return torch.where((offset.abs() <= self.tolerance) & own_colour, self.on, label)[None]
+        return torch.where((offset.abs() <= self.tolerance) & own_color, self.on, label)[None]

@@ -1,15 +1,19 @@
-"""Losses on the particle's likelihood.  `log_likelihood` is the log probability that the particle is on the object."""
+"""Losses on the particle's likelihood.
+
+`log_likelihood` is the log probability that the particle is on the object.
+"""
 
 import torch
 from torch import Tensor
 
-from posefilter.contracts import Label
 from posefilter.errors import UserError
+from posefilter.protocols import Label
 from posefilter.types import Batch, ObjectModel, Trace
 
 
 def log_not(log_p: Tensor) -> Tensor:
-    """Return log(1 - p) from log p = logsigmoid(logit), exact at both ends, its slope in the logit too, up to a logit of 80.
+    """Return log(1 - p) from log p = logsigmoid(logit), exact at both ends, its slope in the logit
+    too, up to a logit of 80.
 
     Beyond, where even log p is all but denormal, it stays finite and has no slope.
     """
@@ -20,12 +24,13 @@ def said(trace: Trace, steps: str) -> Tensor:
     """Return the likelihoods of the last reading, or of all: (S, B, N)."""
     if steps not in ("last", "all"):
         raise UserError(f"loss.steps={steps!r} is unknown: choose last or all")
-    readings = trace.readings if steps == "all" else trace.readings[-1:]
-    return torch.stack([reading.log_likelihood for reading in readings])
+    outputs = trace.outputs if steps == "all" else trace.outputs[-1:]
+    return torch.stack([output.log_likelihood for output in outputs])
 
 
 class Bce:
-    """Binary cross-entropy against a label in [0, 1] (the paper, eq. 3, whose minus sign is restored).
+    """Binary cross-entropy against a label in [0, 1] (the paper, eq. 3, whose minus sign is
+    restored).
 
     steps: last (the prediction that the filter ends with) or all.
     """
@@ -49,7 +54,9 @@ class BalancedBce(Bce):
     """The same, with particles on the object and off it counting half each, however few either are."""
 
     def weigh(self, log_p: Tensor, y: Tensor) -> Tensor:
-        """Return weights that sum to 1/2 over y > 0 and to 1/2 over y = 0 (or to 1 over the only kind there is)."""
+        """Return weights that sum to 1/2 over y > 0 and to 1/2 over y = 0 (or to 1 over the only
+        kind there is).
+        """
         on = (y > 0).to(y.dtype)
         share = on.sum((0, 2), keepdim=True)
         rest = (1 - on).sum((0, 2), keepdim=True)
@@ -58,12 +65,16 @@ class BalancedBce(Bce):
 
 
 class Focal(Bce):
-    """Focal loss: cross-entropy x |y - p|^gamma, and alpha on the object against 1 - alpha off it (Lin et al. 2017).
+    """Focal loss: cross-entropy x |y - p|^gamma, and alpha on the object against 1 - alpha off it
+    (Lin et al. 2017).
 
-    With labels between 0 and 1 it is the quality focal loss (Li et al. 2020). The modulation takes part in the gradient.
+    With labels between 0 and 1 it is the quality focal loss (Li et al. 2020). The modulation takes
+    part in the gradient.
     """
 
-    def __init__(self, label: Label, steps: str = "all", gamma: float = 2.0, alpha: float = 0.25) -> None:
+    def __init__(
+        self, label: Label, steps: str = "all", gamma: float = 2.0, alpha: float = 0.25
+    ) -> None:
         super().__init__(label, steps)
         self.gamma = gamma
         self.alpha = alpha
@@ -74,4 +85,6 @@ class Focal(Bce):
         y = self.label(trace, batch, model)[-len(log_p) :]
         entropy = -(y * log_p + (1 - y) * log_not(log_p))
         side = torch.where(y > 0, self.alpha, 1 - self.alpha)
-        return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean((0, 2))
+        return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean(
+            (0, 2)
+        )

@@ -2,14 +2,16 @@
 
 from torch import Tensor
 
-from posefilter.contracts import Label
+from posefilter.protocols import Label
 from posefilter.types import Batch, ObjectModel, Trace
 
 
 class Regression:
-    """Weighted mean squared error between what the network says of each sample and its label, over `scale`.
+    """Weighted mean squared error between what the network says of each sample and its label, over
+    `scale`.
 
-    The paper states neither the error (ours: squares) nor a scale; its labels of +-100 make plain squares of 10^4.
+    The paper states neither the error (ours: squares) nor a scale; its labels of +-100 make plain
+    squares of 10^4.
     """
 
     def __init__(self, label: Label, scale: float = 100.0) -> None:
@@ -18,5 +20,5 @@ class Regression:
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return the error an image, (B,)."""
         target = self.label(trace, batch, model)[-1]
-        error = ((trace.readings[-1].log_likelihood - target) / self.scale) ** 2
-        return (error * trace.clouds[-1].log_weights.exp()).sum(1)
+        error = ((trace.outputs[-1].log_likelihood - target) / self.scale) ** 2
+        return (error * trace.particles[-1].log_weights.exp()).sum(1)

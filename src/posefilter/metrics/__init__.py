@@ -1,1 +1,3 @@
-"""Measures of estimates and beliefs: pure functions, and torchmetrics classes that collect them over a test."""
+"""Measures of estimates and beliefs: pure functions, and torchmetrics classes that collect them
+over a test.
+"""

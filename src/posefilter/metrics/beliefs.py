@@ -1,4 +1,7 @@
-"""Measures of a belief: how sure it is, and whether it has a right to be.  Poses (B, N, 4, 4), log weights (B, N)."""
+"""Measures of a belief: how sure it is, and whether it has a right to be.
+
+Poses (B, N, 4, 4), log weights (B, N).
+"""
 
 import torch
 from torch import Tensor
@@ -11,12 +14,16 @@ from posefilter.metrics.errors import add
 
 
 def entropy(log_weights: Tensor) -> Tensor:
-    """Return the entropy of the weights [nat]: 0 where one particle has them all, log N where all are alike.  -> (B,)."""
+    """Return the entropy of the weights [nat]: 0 where one particle has them all, log N where all
+    are alike.  -> (B,).
+    """
     return -torch.special.xlogy(log_weights.exp(), log_weights.exp()).sum(1)
 
 
 def spread(poses: Tensor, log_weights: Tensor, space: PoseSpace) -> tuple[Tensor, Tensor]:
-    """Return the weighted root mean square distance from the mean pose: of centres (B,) [m], of rotations (B,) [rad]."""
+    """Return the weighted root mean square distance from the mean pose: of centers (B,) [m], of
+    rotations (B,) [rad].
+    """
     center = poses.new_tensor(space.center)
     weights = log_weights.exp()
     mean = space.mean(poses, weights)[:, None]
@@ -25,17 +32,25 @@ def spread(poses: Tensor, log_weights: Tensor, space: PoseSpace) -> tuple[Tensor
     return (weights * shift).sum(1).sqrt(), (weights * turn).sum(1).sqrt()
 
 
-def mass_within(poses: Tensor, log_weights: Tensor, truth: Tensor, points: Tensor, threshold: float) -> Tensor:
-    """Return the share of the weight on poses whose ADD to the truth (B, 4, 4) is below `threshold` [m].  -> (B,)."""
+def mass_within(
+    poses: Tensor, log_weights: Tensor, truth: Tensor, points: Tensor, threshold: float
+) -> Tensor:
+    """Return the share of the weight on poses whose ADD to the truth (B, 4, 4) is below `threshold`
+    [m].  -> (B,).
+    """
     return (log_weights.exp() * (add(poses, truth[:, None], points) < threshold)).sum(1)
 
 
-def rank_of_truth(poses: Tensor, log_weights: Tensor, truth: Tensor, space: PoseSpace, chunk: int = 1 << 20) -> Tensor:
-    """Return the share of the belief that lies deeper in the belief than the truth does.  (B, 4, 4) truth -> (B,) in [0, 1].
+def rank_of_truth(
+    poses: Tensor, log_weights: Tensor, truth: Tensor, space: PoseSpace, chunk: int = 1 << 20
+) -> Tensor:
+    """Return the share of the belief that lies deeper in the belief than the truth does.  (B, 4, 4)
+    truth -> (B,) in [0, 1].
 
-    Depth is nearness to all the rest: the mean distance to the (other) particles. Were truths drawn from such beliefs, ranks
-    would be uniform on [0, 1], so a credible region of mass p would hold the truth in a share p of the images; ranks near 1
-    tell of beliefs that are too sure, or wrong. chunk: distances held at once.
+    Depth is nearness to all the rest: the mean distance to the (other) particles. Were truths drawn
+    from such beliefs, ranks would be uniform on [0, 1], so a credible region of mass p would hold
+    the truth in a share p of the images; ranks near 1 tell of beliefs that are too sure, or wrong.
+    chunk: distances held at once.
     """
     weights = log_weights.exp()
     rows = max(1, chunk // log_weights.numel())
@@ -48,5 +63,8 @@ def rank_of_truth(poses: Tensor, log_weights: Tensor, truth: Tensor, space: Pose
 
 
 def on_object(mask: Tensor, pixels: Tensor) -> Tensor:
-    """Return the share of the particles whose pixel is on the mask.  (B, 1, H, W) bool, (B, N, 2) [px] -> (B,)."""
+    """Return the share of the particles whose pixel is on the mask.
+
+    (B, 1, H, W) bool, (B, N, 2) [px] -> (B,).
+    """
     return touches(mask, pixels).to(pixels.dtype).mean(1)

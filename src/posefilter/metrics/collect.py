@@ -9,7 +9,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from posefilter.geometry.boxes import box_iou
-from posefilter.geometry.deviation import thin
+from posefilter.geometry.pose_error import thin
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s
@@ -23,7 +23,9 @@ def joined(state: Any) -> Tensor:
 
 
 class PoseErrors(Metric):
-    """ADD and ADD-S of every instance that was there; a missed one, or a pose that is not finite, is infinitely wrong."""
+    """ADD and ADD-S of every instance that was there; a missed one, or a pose that is not finite,
+    is infinitely wrong.
+    """
 
     full_state_update = False
     add: list[Tensor]
@@ -37,10 +39,18 @@ class PoseErrors(Metric):
         for name in ("add", "add_s", "diameter"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
-    def update(self, poses: Tensor, truth: Tensor, object_id: Tensor | None = None, found: Tensor | None = None) -> None:
-        """Collect (B, 4, 4) estimates and truths, camera_from_object [m]; errors are kept in their order.
+    def update(
+        self,
+        poses: Tensor,
+        truth: Tensor,
+        object_id: Tensor | None = None,
+        found: Tensor | None = None,
+    ) -> None:
+        """Collect (B, 4, 4) estimates and truths, camera_from_object [m]; errors are kept in their
+        order.
 
-        object_id (B,): index into `models` (the only one if None); found (B,) bool: False where there is no estimate.
+        object_id (B,): index into `models` (the only one if None); found (B,) bool: False where
+        there is no estimate.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
         good = poses.isfinite().flatten(1).all(1)
@@ -109,15 +119,24 @@ class ParticlesOnObject(Average):
 class BeliefQuality(Metric):
     """How sure the beliefs are, and whether they have a right to be.
 
-    entropy [nat] of the weights; effective_particles 1 / sum w^2; spread_m and spread_rad about the mean; mass_01d and
-    mass_2cm, the weight on poses within 0.1 diameters and 2 cm (ADD) of the truth; rank, the mean share of the belief that
-    lies deeper in it than the truth (0.5 if calibrated); coverage_50 and coverage_90, in percent, the images in which that
-    share is at most 0.5 and 0.9 (50 and 90 if calibrated, less if too sure).
+    entropy [nat] of the weights; effective_particles 1 / sum w^2; spread_m and spread_rad about the
+    mean; mass_01d and mass_2cm, the weight on poses within 0.1 diameters and 2 cm (ADD) of the
+    truth; rank, the mean share of the belief that lies deeper in it than the truth (0.5 if
+    calibrated); coverage_50 and coverage_90, in percent, the images in which that share is at most
+    0.5 and 0.9 (50 and 90 if calibrated, less if too sure).
     """
 
     full_state_update = False
     rows: list[Tensor]
-    names = ("entropy", "effective_particles", "spread_m", "spread_rad", "mass_01d", "mass_2cm", "rank")
+    names = (
+        "entropy",
+        "effective_particles",
+        "spread_m",
+        "spread_rad",
+        "mass_01d",
+        "mass_2cm",
+        "rank",
+    )
 
     def __init__(self, models: Sequence[ObjectModel], points: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -126,7 +145,9 @@ class BeliefQuality(Metric):
         self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(self, belief: Belief, truth: Tensor, object_id: Tensor | None = None) -> None:
-        """Collect beliefs and the truth (B, 4, 4); object_id (B,): index into `models`, the only one if None."""
+        """Collect beliefs and the truth (B, 4, 4); object_id (B,): index into `models`, the only
+        one if None.
+        """
         ids = torch.zeros(len(truth), dtype=torch.int64) if object_id is None else object_id
         for index in ids.unique().tolist():
             here = (ids == index).to(truth.device)

@@ -11,9 +11,11 @@ _CHUNK = 1 << 20  # points held at once
 
 
 def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
-    """Return ADD, the mean distance of corresponding points (Hinterstoisser et al. 2012; the paper, eq. 1).
+    """Return ADD, the mean distance of corresponding points (Hinterstoisser et al. 2012; the paper,
+    eq. 1).
 
-    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m], in the poses' precision.
+    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m], in the
+    poses' precision.
     """
     lead = torch.broadcast_shapes(poses.shape[:-2], truth.shape[:-2])
     turn = (rotation_of(poses) - rotation_of(truth)).expand(*lead, 3, 3).reshape(-1, 3, 3)
@@ -28,11 +30,14 @@ def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
 
 
 class NearestPoint:
-    """Looks up how far places are from the nearest of an object's points: one k-d tree an object, on the CPU."""
+    """Looks up how far places are from the nearest of an object's points: one k-d tree an object,
+    on the CPU.
+    """
 
     def __init__(self, points: Tensor) -> None:
         self.tree = cKDTree(points.detach().cpu().double().numpy(), leafsize=16)
-        # Looked up in the tree's own order, one query's neighbours lie in the cache that the last one has filled.
+        # Looked up in the tree's own order, one query's neighbors lie in the cache that the last
+        # one has filled.
         self.points = torch.from_numpy(np.ascontiguousarray(self.tree.data[self.tree.indices]))
 
     def distance(self, places: Tensor) -> Tensor:
@@ -41,15 +46,20 @@ class NearestPoint:
 
 
 def add_s(poses: Tensor, truth: Tensor, points: Tensor | NearestPoint) -> Tensor:
-    """Return ADD-S: the mean distance of each *true* point to the nearest *estimated* one (the YCB-Video toolbox).
+    """Return ADD-S: the mean distance of each *true* point to the nearest *estimated* one (the
+    YCB-Video toolbox).
 
-    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m]. Distances do not change under rigid
-    transforms, so true points are carried into the estimate's object frame, where one tree serves every pose.
-    The paper's eq. 2 goes from estimated points to true ones; published figures go the way that stands here.
+    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m]. Distances
+    do not change under rigid transforms, so true points are carried into the estimate's object
+    frame, where one tree serves every pose. The paper's eq. 2 goes from estimated points to true
+    ones; published figures go the way that stands here.
     """
     near = points if isinstance(points, NearestPoint) else NearestPoint(points)
     guess_from_true = invert(poses.detach().cpu().double()) @ truth.detach().cpu().double()
     lead = guess_from_true.shape[:-2]
     rows = max(1, _CHUNK // len(near.points))
-    parts = [near.distance(transform(some, near.points)).mean(-1) for some in guess_from_true.reshape(-1, 4, 4).split(rows)]
+    parts = [
+        near.distance(transform(some, near.points)).mean(-1)
+        for some in guess_from_true.reshape(-1, 4, 4).split(rows)
+    ]
     return (torch.cat(parts).view(lead) if parts else guess_from_true.new_zeros(lead)).to(poses)

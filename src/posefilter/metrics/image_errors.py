@@ -13,7 +13,9 @@ FILE = "errors.csv"
 
 
 class ImageError(NamedTuple):
-    """One row of errors.csv; NaN where something is not known, infinite errors where the object was missed."""
+    """One row of errors.csv; NaN where something is not known, infinite errors where the object was
+    missed.
+    """
 
     scene_id: int
     im_id: int
@@ -30,7 +32,9 @@ class ImageError(NamedTuple):
 
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
-    """Write errors.csv: every digit kept, so that metrics come out of it as they are in metrics.json."""
+    """Write errors.csv: every digit kept, so that metrics come out of it as they are in
+    metrics.json.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -84,7 +84,9 @@ def _describe_errors(name: str, label: str) -> tuple[MetricInfo, ...]:
 
 _METRICS = (
     MetricInfo("instances", "images", form=".0f"),
-    MetricInfo("missed", "missed", form=".0f", direction=LOWER, meaning="images without a finite pose"),
+    MetricInfo(
+        "missed", "missed", form=".0f", direction=LOWER, meaning="images without a finite pose"
+    ),
     *_describe_errors("add", "ADD"),
     *_describe_errors("add_s", "ADD-S"),
     MetricInfo("iou", "box IoU", form=".3f", direction=HIGHER, limits=(-0.03, 1.03)),
@@ -221,7 +223,9 @@ _METRICS = (
     MetricInfo("signs/off_frame", "off the frame", "%", ".1f", LOWER, 100.0, PERCENT, "off frame"),
     MetricInfo("signs/near_edge", "at an edge", "%", ".1f", LOWER, 100.0, PERCENT),
     MetricInfo("signs/near_corner", "in a corner", "%", ".1f", LOWER, 100.0, PERCENT),
-    MetricInfo("signs/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"),
+    MetricInfo(
+        "signs/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"
+    ),
     MetricInfo(
         "signs/pairwise_cosine",
         "agreement of the displacements",
@@ -258,14 +262,18 @@ _METRICS = (
     MetricInfo("training/steps", "training steps", form=".0f", short="steps"),
     MetricInfo("training/tested_step", "tested step", form=".0f"),
     MetricInfo("training/seconds_per_step", "time per training step", "s", ".3g", LOWER),
-    MetricInfo("training/cpu_seconds_per_step", "processor time per training step", "s", ".3g", LOWER),
+    MetricInfo(
+        "training/cpu_seconds_per_step", "processor time per training step", "s", ".3g", LOWER
+    ),
     MetricInfo("train/total", "loss", form=".3g", direction=LOWER),
     MetricInfo("score", "score", form=".1f", direction=HIGHER, limits=PERCENT),
     MetricInfo("best_score", "best score", form=".1f", direction=HIGHER, limits=PERCENT),
     # the filter, iteration by iteration
     MetricInfo("filter/ess", "effective particles", "%", ".0f", factor=100.0, limits=PERCENT),
     MetricInfo("filter/spread_m", "spread of the centers", "mm", ".1f", factor=1000.0),
-    MetricInfo("filter/spread_rad", "spread of the rotations", "degrees", ".1f", factor=180 / math.pi),
+    MetricInfo(
+        "filter/spread_rad", "spread of the rotations", "degrees", ".1f", factor=180 / math.pi
+    ),
     MetricInfo("filter/spread_px", "spread", "px", ".1f"),
     MetricInfo("filter/sigma_m", "noise level", "mm", ".1f", factor=1000.0),
     MetricInfo("filter/sigma_px", "noise level", "px", ".1f"),

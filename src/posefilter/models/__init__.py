@@ -1,1 +1,3 @@
-"""The methods: each a LightningModule, short, since base.py holds every hook and the pieces are injected."""
+"""The methods: each a LightningModule, short, since base.py holds every hook and the pieces are
+injected.
+"""

@@ -1,4 +1,6 @@
-"""What every method shares as a LightningModule: every Lightning hook lives here, so that a method's own file is short."""
+"""What every method shares as a LightningModule: every Lightning hook lives here, so that a
+method's own file is short.
+"""
 
 import logging
 import math
@@ -12,7 +14,6 @@ from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from posefilter.contracts import Loss, Space
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.boxes import box_of_pose
@@ -23,7 +24,8 @@ from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject,
 from posefilter.metrics.scores import overall
 from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.models.checks import check_estimate
-from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.protocols import Loss, Space
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 log = logging.getLogger(__name__)
 _PATIENCE = 20  # steps
@@ -33,10 +35,11 @@ _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 class PoseEstimator(LightningModule):
     """A method, the filter that runs it, and the loss it learns from.
 
-    filter: run at validation and test; train_filter: rolled out in training where that differs; loss: judges a training
-    trace, one value an image; optimizer: given (name, parameter) pairs; scheduler: given the optimizer and the number of
-    steps, advanced each step; seed: with the epoch and the batch's number it decides every random draw. Which object it is
-    about, `adopt` tells.
+    filter: run at validation and test; train_filter: rolled out in training where that differs;
+    loss: judges a training trace, one value an image; optimizer: given (name, parameter) pairs;
+    scheduler: given the optimizer and the number of steps, advanced each step; seed: with the epoch
+    and the batch's number it decides every random draw. Which object it is about, `set_object`
+    tells.
     """
 
     legal_losses: ClassVar[tuple[str, ...]] = ()
@@ -67,15 +70,17 @@ class PoseEstimator(LightningModule):
         raise NotImplementedError(f"{type(self).__name__} must say where its particles live")
 
     @property
-    def memory_width(self) -> int:
-        """Return L, the width of a particle's memory."""
+    def latent_width(self) -> int:
+        """Return L, the width of a particle's latent."""
         return 0
 
-    def observe(self, batch: Batch) -> Any:
+    def encode(self, batch: Batch) -> Any:
         """Look at the images once."""
         raise NotImplementedError(f"{type(self).__name__} must say what it keeps of an image")
 
-    def read(self, scene: Any, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+    def measure(
+        self, scene: Any, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
         """Judge every particle of a cloud."""
         raise NotImplementedError(f"{type(self).__name__} must say what it makes of a particle")
 
@@ -83,10 +88,13 @@ class PoseEstimator(LightningModule):
     def model(self) -> ObjectModel:
         """Return what the method knows of its object.  Raises UserError before it was told."""
         if self._object_model is None:
-            raise UserError("the method does not know its object yet: give it data, or a checkpoint that holds one")
+            raise UserError(
+                "the method does not know its object yet: give it data, or a "
+                "checkpoint that holds one"
+            )
         return self._object_model
 
-    def adopt(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Learn which object it is about, and make the metrics for it."""
         self._object_model = model
         self.scores = nn.ModuleDict({"iou": BoxIoU(), "particles_on_object": ParticlesOnObject()})
@@ -101,10 +109,13 @@ class PoseEstimator(LightningModule):
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
         return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
 
-    # -- training ------------------------------------------------------------------------------------------------------
+    # -- training ---------------------------------------------------------------------------------
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the losses by name, (B,) each; their sum is minimised.  Here: the chosen one, of one roll-out."""
+        """Return the losses by name, (B,) each; their sum is minimized.
+
+        Here: the chosen one, of one roll-out.
+        """
         return {"loss": self.loss(self.train_filter(batch, self, generator), batch, self.model)}
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
@@ -113,7 +124,9 @@ class PoseEstimator(LightningModule):
         means = {name: value.mean() for name, value in losses.items()}
         total = torch.stack(list(means.values())).sum()
         if not bool(total.isfinite()):
-            raise FloatingPointError(f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }")
+            raise FloatingPointError(
+                f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
+            )
         for name, value in means.items():
             self.watch(name, value.detach())
         if self._trainer is not None:
@@ -128,24 +141,36 @@ class PoseEstimator(LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Build the optimizer and its schedule over the run's steps."""
-        optimizer = self.make_optimizer((name, p) for name, p in self.named_parameters() if p.requires_grad)
+        optimizer = self.make_optimizer(
+            (name, p) for name, p in self.named_parameters() if p.requires_grad
+        )
         if self.make_scheduler is None:
             return optimizer
         scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
 
     def configure_gradient_clipping(
-        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip each part's gradient by its own norm: a wild step of one network must not shrink another's.
+        """Clip each part's gradient by its own norm: a wild step of one network must not shrink
+        another's.
 
-        A part whose gradient's norm is not finite is left as it is by this step, with a warning; also where nothing is
-        clipped. Raises FloatingPointError after 20 such steps in a row, of any part, since no more would be learned.
+        A part whose gradient's norm is not finite is left as it is by this step, with a warning;
+        also where nothing is clipped. Raises FloatingPointError after 20 such steps in a row, of
+        any part, since no more would be learned.
         """
         lost = []
         for name, part in self.named_children():
             parameters = [p for p in part.parameters() if p.grad is not None]
-            if parameters and not bool(nn.utils.clip_grad_norm_(parameters, gradient_clip_val or math.inf).isfinite()):
+            if parameters and not bool(
+                nn.utils.clip_grad_norm_(parameters, gradient_clip_val or math.inf).isfinite()
+            ):
                 lost.append(name)
                 for parameter in parameters:
                     parameter.grad = None  # zeros would still move it, by momentum
@@ -154,15 +179,20 @@ class PoseEstimator(LightningModule):
         if lost and self.lost in (1, 10, 100, 1000, 10_000):
             at = self.global_step
             log.warning(
-                "step %d does not teach %s, the %d. so far: its gradient is not finite", at, ", ".join(lost), self.lost
+                "step %d does not teach %s, the %d. so far: its gradient is not finite",
+                at,
+                ", ".join(lost),
+                self.lost,
             )
         if self.lost_in_a_row == _PATIENCE:
             raise FloatingPointError(
-                f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: a roll-out's can grow "
-                "with each step; choose place_gradient=stopped or train_filter=short (image space), or fewer filter.steps"
+                f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: "
+                f"a roll-out's can grow "
+                "with each step; choose place_gradient=stopped or train_filter=short (image "
+                "space), or fewer filter.steps"
             )
 
-    # -- validation and test -------------------------------------------------------------------------------------------
+    # -- validation and test ----------------------------------------------------------------------
 
     def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]  # callbacks look at it
         """Run the filter and collect its errors."""
@@ -186,24 +216,37 @@ class PoseEstimator(LightningModule):
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors to the metrics."""
         height, width = batch.rgb.shape[-2:]
-        truth = box_of_pose(batch.camera_from_object, self.model.hull, batch.intrinsics, height, width)
+        truth = box_of_pose(
+            batch.camera_from_object, self.model.hull, batch.intrinsics, height, width
+        )
         self.scores["iou"].update(self.box(trace, batch), truth)
-        self.scores["particles_on_object"].update(batch.mask, self.particle_pixels(trace.clouds[-1], batch))
+        self.scores["particles_on_object"].update(
+            batch.mask, self.particle_pixels(trace.particles[-1], batch)
+        )
         if self.tells_pose:
             self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
-            self.scores["by_visibility"].collect(trace.belief.best, batch.camera_from_object, batch.visibility)
+            self.scores["by_visibility"].collect(
+                trace.belief.best, batch.camera_from_object, batch.visibility
+            )
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
-        """Return the bounding box that the run ends with, (B, 4) [px]: where the estimate puts the object's hull."""
+        """Return the bounding box that the run ends with, (B, 4) [px]: where the estimate puts the
+        object's hull.
+        """
         height, width = batch.rgb.shape[-2:]
         return box_of_pose(trace.belief.best, self.model.hull, batch.intrinsics, height, width)
 
-    def particle_pixels(self, cloud: Cloud, batch: Batch) -> Tensor:
-        """Return where in the image particles are, (B, N, 2) [px]: a pose is where it puts the object's centre."""
+    def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
+        """Return where in the image particles are, (B, N, 2) [px]: a pose is where it puts the
+        object's center.
+        """
         if not isinstance(self.space, PoseSpace):
-            return cloud.state
-        return project(origin_of(cloud.state, self.model.center.to(cloud.state.device)), batch.intrinsics)
+            return particles.state
+        return project(
+            origin_of(particles.state, self.model.center.to(particles.state.device)),
+            batch.intrinsics,
+        )
 
     def results(self) -> dict[str, Any]:
         """Return what was collected since the last reset, in the form of metrics.json."""
@@ -243,17 +286,19 @@ class PoseEstimator(LightningModule):
         """Log the metrics."""
         self.log_dict({f"test/{name}": value for name, value in flatten(self.results()).items()})
 
-    # -- checkpoints ---------------------------------------------------------------------------------------------------
+    # -- checkpoints ------------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Carry the object along, as plain tensors, numbers and strings."""
         checkpoint["recipe"] = self.recipe
         checkpoint["object_model"] = dict(self.model._asdict())
-        checkpoint["state_dict"] = {k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("scores.")}
+        checkpoint["state_dict"] = {
+            k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("scores.")
+        }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take the object from the checkpoint."""
-        self.adopt(ObjectModel(**checkpoint["object_model"]))
+        self.set_object(ObjectModel(**checkpoint["object_model"]))
 
 
 def score_of(results: dict[str, Any]) -> float:

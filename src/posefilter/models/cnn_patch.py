@@ -4,8 +4,10 @@ from posefilter.models.image_space import ImageSpace
 
 
 class CnnPatch(ImageSpace):
-    """Each particle sees its patch through three convolutions, and tells an offset and a likelihood, but no pose."""
+    """Each particle sees its patch through three convolutions, and tells an offset and a
+    likelihood, but no pose.
+    """
 
     legal_losses = ("chamfer", "offset", "bce", "balanced_bce", "focal")
     tells_pose = False
-    place_width = 0
+    position_width = 0

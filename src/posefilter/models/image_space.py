@@ -1,4 +1,6 @@
-"""What the four image-space methods share: a particle is a pixel, and reads the image where it stands."""
+"""What the four image-space methods share: a particle is a pixel, and reads the image where it
+stands.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,20 +15,25 @@ from posefilter.geometry.lookup import nearest_pixel, pick
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
-from posefilter.models.box import Box
-from posefilter.models.checks import check_fragments, check_poses, check_training_clouds, check_votes
-from posefilter.models.stages import Auxiliary, Stage, check_stages, factors_at
+from posefilter.models.box_heads import BoxHead
+from posefilter.models.checks import (
+    check_fragments,
+    check_poses,
+    check_training_clouds,
+    check_votes,
+)
+from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
 from posefilter.nets.heads import fill_depth
-from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
 @dataclass(frozen=True)
 class ImageScene:
     """What an image-space method keeps of B images."""
 
-    image: Tensor  # (B, 4, H, W): colour in [-1, 1], depth [m]
+    image: Tensor  # (B, 4, H, W): color in [-1, 1], depth [m]
     depth: Tensor  # (B, 2, H, W): depth with its holes filled [m], and 1 where it was measured
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: ContextMap
@@ -40,33 +47,36 @@ class RelevantScene(ImageScene):
 
 
 class ImageSpace(PoseEstimator):
-    """Observe images and read particles off them; the networks, and what their outputs mean, are injected.
+    """Observe images and read particles off them; the networks, and what their outputs mean, are
+    injected.
 
-    net: given the patch's size, how many extra numbers a particle is told and how many make a pose; bounds: how particles
-    bound the object in the image; lessons: losses beside the chosen one, by name; stages: factors on all of them as training
-    proceeds (null: 1 throughout); relevance: weight of the loss on the context's map, if it tells one; place_gradient:
-    whether what is read at a place also teaches the motion that led there; truncate: cut the gradient through places that
-    are looked at, and through the memory, every so many steps (null: never), which changes no value. A place still hands its
-    own gradient on to the next, so that over a long roll-out this damps the growth; only 1, a cut at every step, ends it.
+    net: given the patch's size, how many extra numbers a particle is told and how many make a pose;
+    bounds: how particles bound the object in the image; lessons: losses beside the chosen one, by
+    name; stages: factors on all of them as training proceeds (null: 1 throughout); relevance:
+    weight of the loss on the context's map, if it tells one; place_gradient: whether what is read
+    at a place also teaches the displacement that led there; truncate: cut the gradient through
+    places that are looked at, and through the latent, every so many steps (null: never), which
+    changes no value. A place still hands its own gradient on to the next, so that over a long
+    roll-out this damps the growth; only 1, a cut at every step, ends it.
     """
 
-    place_width: ClassVar[int] = 0  # numbers that tell a particle its own location
+    position_width: ClassVar[int] = 0  # numbers that tell a particle its own location
     net: Any
     glimpse: Any
-    context: Any
-    pose_code: Any
-    motion: Any
+    encoder: Any
+    pose_head: Any
+    displacement: Any
 
     def __init__(
         self,
         net: Callable[..., nn.Module],
         glimpse: IntegerCut | SmoothGlimpse,
-        context: nn.Module,
-        pose_code: nn.Module,
-        motion: nn.Module,
-        bounds: Box,
-        lessons: Mapping[str, Auxiliary | None] | None = None,
-        stages: Sequence[Stage] | None = None,
+        encoder: nn.Module,
+        pose_head: nn.Module,
+        displacement: nn.Module,
+        box_head: BoxHead,
+        aux_losses: Mapping[str, Auxiliary | None] | None = None,
+        loss_schedule: Sequence[Stage] | None = None,
         relevance: float = 1.0,
         place_gradient: bool = True,
         truncate: int | None = None,
@@ -74,18 +84,31 @@ class ImageSpace(PoseEstimator):
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.glimpse, self.context, self.pose_code, self.motion = glimpse, context, pose_code, motion
-        self.net = net(extra=self.context.width + self.place_width, size=glimpse.size, pose_width=self.pose_code.width)
-        self.bounds = bounds
-        self.lessons = {name: lesson for name, lesson in (lessons or {}).items() if lesson is not None}
-        self.stages = tuple(stages or ())
-        check_stages(self.stages, ["loss", "relevance", *(lessons or {})])
+        self.glimpse, self.encoder, self.pose_head, self.displacement = (
+            glimpse,
+            encoder,
+            pose_head,
+            displacement,
+        )
+        self.net = net(
+            extra=self.encoder.width + self.position_width,
+            size=glimpse.size,
+            pose_width=self.pose_head.width,
+        )
+        self.box_head = box_head
+        self.aux_losses = {name: aux for name, aux in (aux_losses or {}).items() if aux is not None}
+        self.loss_schedule = tuple(loss_schedule or ())
+        check_loss_schedule(self.loss_schedule, ["loss", "relevance", *(aux_losses or {})])
         check_poses(self)
         check_votes(self)
         check_fragments(self)
-        self.relevance_weight, self.place_gradient, self.truncate = relevance, place_gradient, truncate
+        self.relevance_weight, self.place_gradient, self.truncate = (
+            relevance,
+            place_gradient,
+            truncate,
+        )
         if object_model is not None:  # not in the base, where the pose code is not there yet
-            self.adopt(object_model)
+            self.set_object(object_model)
 
     @property
     def space(self) -> PixelSpace:
@@ -93,78 +116,94 @@ class ImageSpace(PoseEstimator):
         return PixelSpace()
 
     @property
-    def memory_width(self) -> int:
+    def latent_width(self) -> int:
         """Return L."""
-        return int(self.net.memory_width)
+        return int(self.net.latent_width)
 
-    def observe(self, batch: Batch) -> ImageScene:
+    def encode(self, batch: Batch) -> ImageScene:
         """Encode the images once."""
-        seen = self.context(batch.rgb, batch.depth, batch.intrinsics)
+        seen = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
         if seen.relevance is None:
             return ImageScene(image, depth, batch.intrinsics, seen)
-        return RelevantScene(image, depth, batch.intrinsics, seen, torch.sigmoid(seen.relevance)[:, None])
+        return RelevantScene(
+            image, depth, batch.intrinsics, seen, torch.sigmoid(seen.relevance)[:, None]
+        )
 
-    def read(self, scene: ImageScene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
-        """Look at each particle's patch and place, and tell likelihood, motion, pose and memory."""
-        state, memory = cloud.state, cloud.memory
+    def measure(
+        self, scene: ImageScene, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        """Look at each particle's patch and place, and tell likelihood, displacement, pose and
+        latent.
+        """
+        state, latent = particles.state, particles.latent
         if self.truncate and step.number % self.truncate == 0:
-            state, memory = state.detach(), memory.detach()
+            state, latent = state.detach(), latent.detach()
         if not self.place_gradient:
             state = state.detach()
         patch = self.glimpse(scene.image, state)
-        extra = torch.cat([self.context.look(scene.context, state), self.place(scene, state)], dim=-1)
-        said = self.net(patch, extra, memory)
+        extra = torch.cat(
+            [self.encoder.look(scene.context, state), self.place(scene, state)], dim=-1
+        )
+        said = self.net(patch, extra, latent)
         height, width = scene.image.shape[-2:]
-        motion = self.motion(said.motion, said.logit, state, width, height)
-        pose, fragments = self.pose_code(said.pose, self.own_points(scene, state)[0])
-        return Reading(F.logsigmoid(said.logit), motion, pose, said.memory, fragments)
+        displacement = self.displacement(said.displacement, said.logit, state, width, height)
+        pose, fragments = self.pose_head(said.pose, self.surface_points(scene, state)[0])
+        return ParticleOutput(F.logsigmoid(said.logit), displacement, pose, said.latent, fragments)
 
-    def own_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B, N) bool.
+    def surface_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
+        N) bool.
 
-        Depth is read at the particle's whole pixel: between pixels of two surfaces there is nothing. Off the frame it is the
-        nearest pixel's, and not measured.
+        Depth is read at the particle's whole pixel: between pixels of two surfaces there is
+        nothing. Off the frame it is the nearest pixel's, and not measured.
         """
         H, W = scene.depth.shape[-2:]
         corner = torch.tensor([W - 1, H - 1], device=state.device)
         pixel = nearest_pixel(state)
         inside = torch.minimum(pixel.clamp_min(0), corner)
         z, known = pick(scene.depth, inside).unbind(-1)
-        return back_project(state.detach(), z, scene.intrinsics), (known > 0) & (inside == pixel).all(-1)
+        return back_project(state.detach(), z, scene.intrinsics), (known > 0) & (
+            inside == pixel
+        ).all(-1)
 
     def place(self, scene: ImageScene, state: Tensor) -> Tensor:
-        """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its location in [-1, 1]."""
-        if not self.place_width:
-            return state.detach()[..., :0]  # nothing to learn: else all that decided the place would be asked for zeros
+        """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its
+        location in [-1, 1].
+        """
+        if not self.position_width:
+            # nothing to learn: else all that decided the place would be asked for zeros
+            return state.detach()[..., :0]
         height, width = scene.image.shape[-2:]
         half = state.new_tensor([(width - 1) / 2, (height - 1) / 2])
-        return (state / half - 1)[..., : self.place_width]
+        return (state / half - 1)[..., : self.position_width]
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an image each, weighted."""
+        """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an
+        image each, weighted.
+        """
         check_training_clouds(self)
-        scene = self.observe(batch)
+        scene = self.encode(batch)
         trace: Trace = self.train_filter(batch, _Observed(self, scene), generator)
         losses = {"loss": self.loss(trace, batch, self.model)}
-        for name, lesson in self.lessons.items():
-            losses[name] = lesson.weight * lesson.loss(trace, batch, self.model)
+        for name, aux in self.aux_losses.items():
+            losses[name] = aux.weight * aux.loss(trace, batch, self.model)
         if isinstance(scene, RelevantScene) and self.relevance_weight:
             losses["relevance"] = self.relevance_weight * relevance_loss(scene.context, batch.mask)
-        factors = factors_at(self.stages, self.progress())
+        factors = factors_at(self.loss_schedule, self.progress())
         return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
 
     def progress(self) -> float:
         """Return the share of the training's steps that are done; 0 where no trainer counts them."""
-        if self._trainer is None or not self.stages:
+        if self._trainer is None or not self.loss_schedule:
             return 0.0
         return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
 
-    def adopt(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
-        super().adopt(model)
-        self.pose_code.about(model)
+        super().set_object(model)
+        self.pose_head.about(model)
         self.scores["signs"] = SignsOfFailure()
 
     def score(self, trace: Trace, batch: Batch) -> None:
@@ -178,24 +217,32 @@ class ImageSpace(PoseEstimator):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return how the particles bound the object, (B, 4) [px]."""
-        return self.bounds(trace, batch, self.model)
+        return self.box_head(trace, batch, self.model)
 
 
 class _Observed:
-    """A method that has looked at its images already, so that a roll-out and a loss on the scene share one look."""
+    """A method that has looked at its images already, so that a roll-out and a loss on the scene
+    share one look.
+    """
 
     def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
         self.method, self.scene = method, scene
-        self.space, self.memory_width, self.read = method.space, method.memory_width, method.read
-        self.own_points, self.model = method.own_points, method.model
+        self.space, self.latent_width, self.measure = (
+            method.space,
+            method.latent_width,
+            method.measure,
+        )
+        self.surface_points, self.model = method.surface_points, method.model
 
-    def observe(self, batch: Batch) -> ImageScene:
+    def encode(self, batch: Batch) -> ImageScene:
         """Return what was seen."""
         return self.scene
 
 
 def relevance_loss(context: ContextMap, mask: Tensor) -> Tensor:
-    """Cross-entropy of the map against whether its cells show the object, half of the weight on those that do.  -> (B,)."""
+    """Cross-entropy of the map against whether its cells show the object, half of the weight on
+    those that do.  -> (B,).
+    """
     logit = context.relevance
     assert logit is not None
     shows = F.adaptive_max_pool2d(mask.float(), logit.shape[-2:])[:, 0]

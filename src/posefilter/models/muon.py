@@ -1,4 +1,6 @@
-"""Muon: momentum whose matrices are made orthogonal before each step (Jordan et al. 2024), AdamW for the rest."""
+"""Muon: momentum whose matrices are made orthogonal before each step (Jordan et al. 2024), AdamW
+for the rest.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -11,13 +13,16 @@ from posefilter.nets.layers import fast_bfloat16
 
 
 class Muon(Optimizer):
-    """Orthogonalised momentum for the matrices and kernels within networks; AdamW for vectors and the layers at either end.
+    """Orthogonalized momentum for the matrices and kernels within networks; AdamW for vectors and
+    the layers at either end.
 
-    Every direction of a layer is then learned at the same pace, also those that few samples speak for. Kernels count as
-    matrices (outputs, rest). Steps have the size that AdamW's would (0.2 x sqrt of the larger side; Liu et al. 2025).
+    Every direction of a layer is then learned at the same pace, also those that few samples speak
+    for. Kernels count as matrices (outputs, rest). Steps have the size that AdamW's would (0.2 x
+    sqrt of the larger side; Liu et al. 2025).
 
-    parameters: (name, parameter) pairs; lr, momentum: of the matrices; adam_lr, betas, eps: of the rest; weight_decay: of
-    both; spared: names of layers that AdamW trains, such as the first and the last of each network.
+    parameters: (name, parameter) pairs; lr, momentum: of the matrices; adam_lr, betas, eps: of the
+    rest; weight_decay: of both; spared: names of layers that AdamW trains, such as the first and
+    the last of each network.
     """
 
     def __init__(
@@ -36,7 +41,12 @@ class Muon(Optimizer):
         for name, parameter in parameters:
             plain = parameter.dim() < 2 or bool(set(name.split(".")) & set(spared))
             (rest if plain else matrices).append(parameter)
-        common = {"weight_decay": weight_decay, "momentum": momentum, "betas": tuple(betas), "eps": eps}
+        common = {
+            "weight_decay": weight_decay,
+            "momentum": momentum,
+            "betas": tuple(betas),
+            "eps": eps,
+        }
         groups: list[dict[str, Any]] = [
             {"params": matrices, "lr": lr, "orthogonal": True},
             {"params": rest, "lr": adam_lr, "orthogonal": False},
@@ -65,8 +75,12 @@ class Muon(Optimizer):
             alike.setdefault(ahead.shape, []).append((p, ahead))
         for shape, pairs in alike.items():
             size = group["lr"] * 0.2 * max(shape) ** 0.5
-            for (p, _), update in zip(pairs, orthogonal(torch.stack([u for _, u in pairs])), strict=True):
-                p.mul_(1 - group["lr"] * group["weight_decay"]).sub_(update.reshape(p.shape), alpha=size)
+            for (p, _), update in zip(
+                pairs, orthogonal(torch.stack([u for _, u in pairs])), strict=True
+            ):
+                p.mul_(1 - group["lr"] * group["weight_decay"]).sub_(
+                    update.reshape(p.shape), alpha=size
+                )
 
     def _adam_step(self, parameters: list[Tensor], group: dict[str, Any]) -> None:
         first, second = group["betas"]
@@ -74,7 +88,9 @@ class Muon(Optimizer):
             assert p.grad is not None
             state = self.state[p]
             if not state:
-                state.update(step=torch.zeros(()), mean=torch.zeros_like(p), square=torch.zeros_like(p))
+                state.update(
+                    step=torch.zeros(()), mean=torch.zeros_like(p), square=torch.zeros_like(p)
+                )
             state["step"] += 1
             t = float(state["step"])
             state["mean"].lerp_(p.grad, 1 - first)
@@ -85,9 +101,11 @@ class Muon(Optimizer):
 
 
 def orthogonal(matrices: Tensor, steps: int = 5) -> Tensor:
-    """Return matrices of the same singular vectors whose singular values are about 1 (0.7 to 1.2).  (M, a, b) -> (M, a, b).
+    """Return matrices of the same singular vectors whose singular values are about 1 (0.7 to 1.2).
+    (M, a, b) -> (M, a, b).
 
-    Newton-Schulz iterations of a quintic whose slope at zero is steep (Jordan et al. 2024): in bfloat16 where that is fast.
+    Newton-Schulz iterations of a quintic whose slope at zero is steep (Jordan et al. 2024): in
+    bfloat16 where that is fast.
     """
     x = matrices / matrices.norm(dim=(1, 2), keepdim=True).clamp_min(1e-12)
     tall = x.shape[1] > x.shape[2]

@@ -4,7 +4,18 @@ from posefilter.models.image_space import ImageSpace
 
 
 class PatchPF(ImageSpace):
-    """Each particle sees the flattened patch about it and its own location, and remembers in its latent."""
+    """Each particle sees the flattened patch about it and its own location, and remembers in its
+    latent.
+    """
 
-    legal_losses = ("bce", "balanced_bce", "focal", "add", "add_s", "confidence", "offset", "chamfer")
-    place_width = 2
+    legal_losses = (
+        "bce",
+        "balanced_bce",
+        "focal",
+        "add",
+        "add_s",
+        "confidence",
+        "offset",
+        "chamfer",
+    )
+    position_width = 2

@@ -4,10 +4,20 @@ from posefilter.models.image_space import ImageSpace
 
 
 class PixelPF(ImageSpace):
-    """Each particle sees the one RGB-D pixel it stands on, and remembers what it saw before in its latent.
+    """Each particle sees the one RGB-D pixel it stands on, and remembers what it saw before in its
+    latent.
 
     It is not told where it stands: the paper concatenates pixel and latent, no more.
     """
 
-    legal_losses = ("add", "add_s", "confidence", "bce", "balanced_bce", "focal", "offset", "chamfer")
-    place_width = 0
+    legal_losses = (
+        "add",
+        "add_s",
+        "confidence",
+        "bce",
+        "balanced_bce",
+        "focal",
+        "offset",
+        "chamfer",
+    )
+    position_width = 0

@@ -1,4 +1,6 @@
-"""The paper's fifth method: particles are poses, and a learned likelihood judges each by the image points it explains."""
+"""The paper's fifth method: particles are poses, and a learned likelihood judges each by the image
+points it explains.
+"""
 
 from typing import Any, NamedTuple
 
@@ -10,17 +12,19 @@ from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.models.lessons import Lesson
+from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, lay_out
+from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.nets.votes import draw_poses, measure_cells
-from posefilter.types import Batch, Cloud, ObjectModel, Reading, Step, Trace
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
 class PoseScene(NamedTuple):
-    """What is kept of an image: its pixels, and what the proposal network makes of it (None without one)."""
+    """What is kept of an image: its pixels, and what the proposal network makes of it (None without
+    one).
+    """
 
     image: Pixels
     said: Coordinates | None
@@ -30,7 +34,9 @@ class PoseScene(NamedTuple):
     def relevance(self) -> Tensor:
         """Return where the object is likely to be, (B, 1, h, w)."""
         if self.said is None:
-            raise UserError("initialise=from_relevance needs the proposal network; choose proposals=dense")
+            raise UserError(
+                "initialize=from_relevance needs the proposal network; choose proposals=dense"
+            )
         return torch.sigmoid(self.said.logit)[:, None]
 
     def first(self, count: int) -> "PoseScene":
@@ -41,43 +47,53 @@ class PoseScene(NamedTuple):
 class PosePF(PoseEstimator):
     """A particle filter over SE(3) with a learned likelihood.
 
-    likelihood: scores poses (nets/likelihood.py, or the paper's); proposals: the dense network that the filter starts from,
-    or None; lesson: what the likelihood is trained on; pixels: image points a pose reads at each filter step; lesson_pixels:
-    the same in training; lesson_images: of a batch that the likelihood learns from (the proposal network, which needs more
-    of them, learns from all; None: all); proposal_weight: of the proposal network's loss.
+    likelihood: scores poses (nets/likelihood.py, or the paper's); proposals: the dense network that
+    the filter starts from, or None; lesson: what the likelihood is trained on; pixels: image points
+    a pose reads at each filter step; train_pixels: the same in training; likelihood_batch_size: of
+    a batch that the likelihood learns from (the proposal network, which needs more of them, learns
+    from all; None: all); proposal_weight: of the proposal network's loss.
     """
 
     legal_losses = ("contrast", "regression")
-    judged_pixels, judged_at = 4096, 0.004  # for comparing the estimate with the truth: image points, noise level [m]
+    # for comparing the estimate with the truth: image points, noise level [m]
+    judged_pixels, judged_at = 4096, 0.004
 
     def __init__(
         self,
         likelihood: nn.Module,
-        lesson: Lesson,
+        candidate_sampler: CandidateSampler,
         proposals: ObjectCoordinateNet | None = None,
         pixels: int = 64,
-        lesson_pixels: int = 48,
-        lesson_images: int | None = None,
+        train_pixels: int = 48,
+        likelihood_batch_size: int | None = None,
         proposal_weight: float = 1.0,
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.likelihood, self.proposals, self.lesson = likelihood, proposals, lesson
-        self.pixels, self.lesson_pixels, self.lesson_images = pixels, lesson_pixels, lesson_images
+        self.likelihood, self.proposals, self.candidate_sampler = (
+            likelihood,
+            proposals,
+            candidate_sampler,
+        )
+        self.pixels, self.train_pixels, self.likelihood_batch_size = (
+            pixels,
+            train_pixels,
+            likelihood_batch_size,
+        )
         self.proposal_weight = proposal_weight
 
     @property
     def space(self) -> PoseSpace:
-        """Return SE(3) about the object's centre."""
+        """Return SE(3) about the object's center."""
         x, y, z = self.model.center.tolist()
         return PoseSpace((x, y, z), self.model.radius)
 
     @property
-    def memory_width(self) -> int:
+    def latent_width(self) -> int:
         """Return 0: these particles remember nothing."""
         return 0
 
-    def observe(self, batch: Batch) -> PoseScene:
+    def encode(self, batch: Batch) -> PoseScene:
         """Lay the image out, and run the proposal network once."""
         if self.proposals is None:
             return PoseScene(lay_out(batch.rgb, batch.depth, batch.intrinsics), None, None)
@@ -86,62 +102,90 @@ class PosePF(PoseEstimator):
         image = lay_out(batch.rgb, batch.depth, batch.intrinsics, context)
         return PoseScene(image, said, measure_cells(batch.depth, batch.intrinsics))
 
-    def read(self, scene: PoseScene, cloud: Cloud, step: Step, generator: Generator) -> Reading:
+    def measure(
+        self, scene: PoseScene, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
-        count = self.lesson_pixels if self.training else self.pixels
-        # bfloat16 halves the time of a step, and its error is far below what drawing so few pixels makes
+        count = self.train_pixels if self.training else self.pixels
+        # bfloat16 halves the time of a step, and its error is far below what drawing so few pixels
+        # makes
         with torch.autocast(self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)):
-            score = self._score(scene, cloud.state, step.sigma, generator, count).float()
-        still = cloud.state.new_zeros(*cloud.state.shape[:2], self.space.dimensions)
-        return Reading(score, still, cloud.state, cloud.memory)
+            score = self._score(scene, particles.state, step.sigma, generator, count).float()
+        still = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
+        return ParticleOutput(score, still, particles.state, particles.latent)
 
-    def score_poses(self, scene: PoseScene, poses: Tensor, sigma: float, generator: Generator, pixels: int) -> Tensor:
+    def score_poses(
+        self, scene: PoseScene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
         """Score any poses (B, N, 4, 4) at a noise level [m].  -> (B, N)."""
         return self._score(scene, poses, poses.new_tensor(sigma), generator, pixels)
 
-    def propose(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
         if scene.said is None or scene.cells is None:
-            raise UserError("initialise=from_proposals needs the proposal network; choose proposals=dense")
+            raise UserError(
+                "initialize=from_proposals needs the proposal network; choose proposals=dense"
+            )
         if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
-            raise UserError("depth: not one pixel of an image has a known depth, so no pose can be proposed")
-        return draw_poses(scene.said.detach(), scene.cells, self._center(), self.model.radius, particles, generator)
+            raise UserError(
+                "depth: not one pixel of an image has a known depth, so no pose can be proposed"
+            )
+        return draw_poses(
+            scene.said.detach(),
+            scene.cells,
+            self._center(),
+            self.model.radius,
+            particles,
+            generator,
+        )
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the likelihood's loss and the proposal network's, one value an image each, from one look at the images."""
-        scene = self.observe(batch)
-        count = self.lesson_images or len(batch.rgb)
+        """Return the likelihood's loss and the proposal network's, one value an image each, from
+        one look at the images.
+        """
+        scene = self.encode(batch)
+        count = self.likelihood_batch_size or len(batch.rgb)
         part, seen = Batch(*(x[:count] for x in batch)), scene.first(count)
-        losses = {"likelihood": self.loss(self.lesson(self, seen, part, generator), part, self.model)}
+        losses = {
+            "likelihood": self.loss(
+                self.candidate_sampler(self, seen, part, generator), part, self.model
+            )
+        }
         if scene.said is not None and scene.cells is not None:
             assert self.proposals is not None
             size = (self._center(), self.model.radius, float(self.proposals.reach))
-            fit, error = coordinate_loss(scene.said, scene.cells, batch.mask, batch.camera_from_object, *size)
+            fit, error = coordinate_loss(
+                scene.said, scene.cells, batch.mask, batch.camera_from_object, *size
+            )
             losses["proposals"] = self.proposal_weight * fit
             self.watch("coordinate_error_mm", 1000 * error.mean())
         return losses
 
-    def adopt(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Learn which object it is about; count, too, how often the truth is outscored."""
-        super().adopt(model)
+        super().set_object(model)
         if self.proposals is not None:
-            self.proposals.adopt(model.points, model.center, model.radius)
+            self.proposals.set_object(model.points, model.center, model.radius)
         self.scores["truth_outscored"] = MeanMetric()
         self.scores["truth_outscored_by_wrong"] = MeanMetric()
 
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
 
-        An estimate that climbed the score outscores the truth by a little even where it is right; what tells of a bad
-        likelihood is an estimate that does so and is wrong (ADD of 0.1 diameters or more).
+        An estimate that climbed the score outscores the truth by a little even where it is right;
+        what tells of a bad likelihood is an estimate that does so and is wrong (ADD of 0.1
+        diameters or more).
         """
         super().score(trace, batch)
-        scene = self.observe(batch)
+        scene = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
         scores = self.score_poses(scene, pair, self.judged_at, generator, self.judged_pixels)
         outscored = scores[:, 0] > scores[:, 1]
-        wrong = add(trace.belief.best, batch.camera_from_object, self.model.points) > 0.1 * self.model.diameter
+        wrong = (
+            add(trace.belief.best, batch.camera_from_object, self.model.points)
+            > 0.1 * self.model.diameter
+        )
         self.scores["truth_outscored"].update(outscored.float())
         self.scores["truth_outscored_by_wrong"].update((outscored & wrong).float())
 
@@ -153,18 +197,24 @@ class PosePF(PoseEstimator):
         return out
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Carry along what the lesson remembers, so that a resumed run ends as one that was not cut."""
+        """Carry along what the lesson remembers, so that a resumed run ends as one that was not
+        cut.
+        """
         super().on_save_checkpoint(checkpoint)
-        checkpoint["lesson"] = self.lesson.state()
+        checkpoint["lesson"] = self.candidate_sampler.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Give the lesson its memory back."""
+        """Give the candidate sampler its state back."""
         super().on_load_checkpoint(checkpoint)
-        self.lesson.restore(checkpoint.get("lesson", {}))
+        self.candidate_sampler.restore(checkpoint.get("lesson", {}))
 
     def _center(self) -> Tensor:
         return self.model.center.to(self.device)
 
-    def _score(self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int) -> Tensor:
-        score: Tensor = self.likelihood(scene.image, poses, sigma, self._center(), self.model.radius, pixels, generator)
+    def _score(
+        self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int
+    ) -> Tensor:
+        score: Tensor = self.likelihood(
+            scene.image, poses, sigma, self._center(), self.model.radius, pixels, generator
+        )
         return score

@@ -6,8 +6,12 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 
-def warm_cosine(optimizer: Optimizer, steps: int, warm_up: int = 200, floor: float = 0.01) -> LambdaLR:
-    """Rise linearly over `warm_up` steps (at most a tenth of all), then fall as a cosine to `floor` of the peak."""
+def warm_cosine(
+    optimizer: Optimizer, steps: int, warm_up: int = 200, floor: float = 0.01
+) -> LambdaLR:
+    """Rise linearly over `warm_up` steps (at most a tenth of all), then fall as a cosine to `floor`
+    of the peak.
+    """
     rise = max(1, min(warm_up, steps // 10))
 
     def factor(step: int) -> float:

@@ -1,7 +1,9 @@
-"""Global context: what a particle may know of the image beyond its own glimpse, sampled where the particle stands.
+"""Global context: what a particle may know of the image beyond its own glimpse, sampled where the
+particle stands.
 
-Every context maps images, (B, 3, H, W) in [0, 1], (B, 1, H, W) [m] and (B, 3, 3) [px], once to feature maps (a
-`ContextMap`), and is then looked up at each particle at each step, for `width` features.
+Every context maps images, (B, 3, H, W) in [0, 1], (B, 1, H, W) [m] and (B, 3, 3) [px], once to
+feature maps (a `ContextMap`), and is then looked up at each particle at each step, for `width`
+features.
 """
 
 import math
@@ -23,7 +25,8 @@ class ContextMap(NamedTuple):
 
     levels: tuple[Tensor, ...]  # each (B, F, h, w)
     strides: tuple[int, ...]  # pixels a cell of each
-    relevance: Tensor | None  # (B, h, w) logit of `this cell shows the object`, at strides[0]; None where not told
+    # (B, h, w) logit of `this cell shows the object`, at strides[0]; None where not told
+    relevance: Tensor | None
 
 
 class NoContext(nn.Module):
@@ -36,26 +39,33 @@ class NoContext(nn.Module):
         return ContextMap((), (), None)
 
     def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """(B, N, 2) -> (B, N, 0), without gradient: else all that decided the place would be asked for zeros."""
+        """(B, N, 2) -> (B, N, 0), without gradient: else all that decided the place would be asked
+        for zeros.
+        """
         return pixels.detach()[..., :0]
 
 
 class Pyramid(nn.Module):
-    """Colour and depth at halving resolutions, a 3 x 3 glimpse of each: a fovea without a single learned weight."""
+    """Color and depth at halving resolutions, a 3 x 3 glimpse of each: a fovea without a single
+    learned weight.
+    """
 
     def __init__(self, levels: int = 5) -> None:
         super().__init__()
         if levels < 1:
-            raise UserError(f"context.levels={levels}: must be 1 or more; choose context=none for none")
+            raise UserError(
+                f"context.levels={levels}: must be 1 or more; choose encoder=none for none"
+            )
         self.strides = tuple(2 ** (i + 1) for i in range(levels))
         self.width = levels * 9 * 5
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
-        """Return one map a level, of 5 channels: colour, depth, share of known depth."""
+        """Return one map a level, of 5 channels: color, depth, share of known depth."""
         side = min(rgb.shape[-2:])
         if self.strides[-1] > side:
             raise UserError(
-                f"context.levels={len(self.strides)}: a cell of the last would be larger than the image; "
+                f"context.levels={len(self.strides)}: a cell of the last would be larger than the "
+                f"image; "
                 f"choose {side.bit_length() - 1} or fewer"
             )
         levels = []
@@ -69,7 +79,11 @@ class Pyramid(nn.Module):
         found = []
         for level, stride in zip(seen.levels, seen.strides, strict=True):
             places = pixels[:, :, None] + window(3, pixels.device) * stride
-            found.append(sample(level, places.flatten(1, 2), stride).unflatten(1, places.shape[1:3]).flatten(2))
+            found.append(
+                sample(level, places.flatten(1, 2), stride)
+                .unflatten(1, places.shape[1:3])
+                .flatten(2)
+            )
         return torch.cat(found, dim=-1)
 
 
@@ -91,24 +105,31 @@ class _Encoder(nn.Module):
 
 
 def averaged(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return images, depths and cameras at 1 / factor of the size; rows and columns that do not fill a cell are left out.
+    """Return images, depths and cameras at 1 / factor of the size; rows and columns that do not
+    fill a cell are left out.
 
-    (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) [px] -> the same three. Depth is the mean of what is known, 0 where nothing is.
+    (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) [px] -> the same three. Depth is the mean of what is
+    known, 0 where nothing is.
     """
     z, _ = masked_mean_pool(depth, factor)
     return F.avg_pool2d(rgb, factor), z, resize_intrinsics(K, 1 / factor, 1 / factor)
 
 
 class ConvEncoder(_Encoder, UNet):
-    """A small U-Net from nothing: strides 4 to 32 and back to 4, about a million and a half parameters.
+    """A small U-Net from nothing: strides 4 to 32 and back to 4, about a million and a half
+    parameters.
 
-    widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets; most_px: images that are
-    wider are averaged down to that, by a whole number, since context is about the whole (null: never). Runs in bfloat16
-    where the machine has it (float32 in, float32 out), which halves its time on processors.
+    widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets;
+    most_px: images that are wider are averaged down to that, by a whole number, since context is
+    about the whole (null: never). Runs in bfloat16 where the machine has it (float32 in, float32
+    out), which halves its time on processors.
     """
 
     def __init__(
-        self, widths: tuple[int, int, int, int] = (32, 64, 96, 128), width: int = 64, most_px: int | None = None
+        self,
+        widths: tuple[int, int, int, int] = (32, 64, 96, 128),
+        width: int = 64,
+        most_px: int | None = None,
     ) -> None:
         super().__init__(width)
         if most_px is not None and most_px < 32:
@@ -117,7 +138,11 @@ class ConvEncoder(_Encoder, UNet):
         self.lay_trunk(widths)
         a, b = widths[:2]
         self.up8 = ResBlock(b)
-        self.to4, self.skip4, self.up4 = nn.Conv2d(b, width, 1), nn.Conv2d(a, width, 1), ResBlock(width)
+        self.to4, self.skip4, self.up4 = (
+            nn.Conv2d(b, width, 1),
+            nn.Conv2d(a, width, 1),
+            ResBlock(width),
+        )
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map, of 4 pixels a cell in an image as small as it is looked at."""
@@ -132,9 +157,11 @@ class ConvEncoder(_Encoder, UNet):
 
 
 class ResNetContext(_Encoder):
-    """A ResNet trunk (its weights from a file, an address, or chance) with a light top-down path to stride 4.
+    """A ResNet trunk (its weights from a file, an address, or chance) with a light top-down path to
+    stride 4.
 
-    trunk: gives maps of strides 4, 8, 16 and 32 for colour in [0, 1] and 7 geometry channels at half resolution.
+    trunk: gives maps of strides 4, 8, 16 and 32 for color in [0, 1] and 7 geometry channels at half
+    resolution.
     """
 
     def __init__(self, trunk: nn.Module, width: int = 64) -> None:

@@ -1,8 +1,10 @@
-"""Dense object coordinates: for each cell of an image, is it the object, and which point of the object?
+"""Dense object coordinates: for each cell of an image, is it the object, and which point of the
+object?
 
-Which point is answered in two parts, a fragment of the surface (a classification) and the place within it (a regression),
-after EPOS (Hodan et al. 2020). Regression alone answers doubt by the mean of what is possible, which lies inside the
-object and is nobody's point; shares of fragments can hold several possibilities, so that votes drawn from them do too.
+Which point is answered in two parts, a fragment of the surface (a classification) and the place
+within it (a regression), after EPOS (Hodan et al. 2020). Regression alone answers doubt by the mean
+of what is possible, which lies inside the object and is nobody's point; shares of fragments can
+hold several possibilities, so that votes drawn from them do too.
 """
 
 from typing import NamedTuple
@@ -11,7 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from posefilter.geometry.fragments import fragment_errors, may_be_object, nearest_fragment, pick_fragment
+from posefilter.geometry.fragments import (
+    fragment_errors,
+    may_be_object,
+    nearest_fragment,
+    pick_fragment,
+)
 
 STRIDE = 8  # pixels a cell
 
@@ -21,13 +28,17 @@ class Coordinates(NamedTuple):
 
     logit: Tensor  # (B, h, w) is it the object
     log_share: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
-    place: Tensor  # (B, h, w, K, 3) the object's point if it is that fragment, over the radius, from the object's centre
-    centers: Tensor  # (B, K, 3) the fragments' middles, over the radius, from the object's centre
+    # (B, h, w, K, 3) the object's point if it is that fragment, over the radius, from the object's
+    # center
+    place: Tensor
+    centers: Tensor  # (B, K, 3) the fragments' middles, over the radius, from the object's center
     features: Tensor  # (B, h, w, C) told to a likelihood that reads context; C = 0 where none does
 
     @property
     def coordinate(self) -> Tensor:
-        """Return the likeliest object point of each cell, over the radius, from the object's centre, (B, h, w, 3)."""
+        """Return the likeliest object point of each cell, over the radius, from the object's
+        center, (B, h, w, 3).
+        """
         return pick_fragment(self.place, self.log_share.argmax(-1))
 
     def first(self, count: int) -> "Coordinates":
@@ -51,7 +62,10 @@ class Cells(NamedTuple):
 
 
 def whole_cells(image: Tensor) -> Tensor:
-    """Pad images with zeros to whole cells, as many as the network makes.  (B, C, H, W) -> the same, sides of `STRIDE`."""
+    """Pad images with zeros to whole cells, as many as the network makes.
+
+    (B, C, H, W) -> the same, sides of `STRIDE`.
+    """
     H, W = image.shape[-2:]
     return F.pad(image, (0, -W % STRIDE, 0, -H % STRIDE))
 
@@ -61,9 +75,10 @@ def true_coordinates(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return what a perfect network would say.
 
-    mask: (B, 1, H, W) bool; camera_from_object: (B, 4, 4) [m]. -> the object point that each cell's measured point is, over
-    the radius, from the centre, (B, h, w, 3); whether the cell's middle pixel shows the object, (B, h, w) bool; and whether
-    it also has a depth that can be of the object, so that the point is true.
+    mask: (B, 1, H, W) bool; camera_from_object: (B, 4, 4) [m]. -> the object point that each cell's
+    measured point is, over the radius, from the center, (B, h, w, 3); whether the cell's middle
+    pixel shows the object, (B, h, w) bool; and whether it also has a depth that can be of the
+    object, so that the point is true.
     """
     on = whole_cells(mask)[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
@@ -72,12 +87,20 @@ def true_coordinates(
 
 
 def coordinate_loss(
-    said: Coordinates, cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float, reach: float
+    said: Coordinates,
+    cells: Cells,
+    mask: Tensor,
+    camera_from_object: Tensor,
+    center: Tensor,
+    radius: float,
+    reach: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss an image (B,) and the mean error of the likeliest coordinates on the object (B,) [m].
+    """Return the loss an image (B,) and the mean error of the likeliest coordinates on the object
+    (B,) [m].
 
-    5 x binary cross-entropy for `is it the object`, and where it is and depth is known, cross-entropy of the fragments and
-    0.3 x the true one's L1 error in units of their reach [radii]. mask: (B, 1, H, W) bool.
+    5 x binary cross-entropy for `is it the object`, and where it is and depth is known,
+    cross-entropy of the fragments and 0.3 x the true one's L1 error in units of their reach
+    [radii]. mask: (B, 1, H, W) bool.
     """
     truth, on, usable = true_coordinates(cells, mask, camera_from_object, center, radius)
     inside = usable.float()
@@ -106,20 +129,26 @@ class Context(NamedTuple):
 
 
 def lay_out_context(said: Coordinates, height: int, width: int) -> Context:
-    """Lay out what is said of H x W images. Gradients reach the features alone: the rest has a lesson of its own."""
+    """Lay out what is said of H x W images.
+
+    Gradients reach the features alone: the rest has a lesson of its own.
+    """
     rows, columns = -(-height // 2), -(-width // 2)
     grid = torch.cat([said.logit.detach()[..., None], said.features], dim=-1).permute(0, 3, 1, 2)
-    grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[..., :rows, :columns]
+    grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[
+        ..., :rows, :columns
+    ]
     share, place = said.log_share.detach().exp().flatten(1), said.place.detach().flatten(1, 3)
-    return Context(grid.flatten(2).transpose(1, 2), share, place, said.centers, said.logit.shape[1:], columns)  # type: ignore[arg-type]
+    shape = (said.logit.shape[1], said.logit.shape[2])
+    return Context(grid.flatten(2).transpose(1, 2), share, place, said.centers, shape, columns)
 
 
 def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
     """Ask what is said at pixels of the object's points that a hypothesis sees there.
 
-    u, v: (B, *) [px]; position: (B, *, 3) over the radius, from the object's centre. -> (B, *, 5 + C): log of the share of
-    the fragment that the point lies in, where in it the network sees the point, logit, features. Between cells the shares
-    are interpolated, and places by their shares.
+    u, v: (B, *) [px]; position: (B, *, 3) over the radius, from the object's center. -> (B, *, 5 +
+    C): log of the share of the fragment that the point lies in, where in it the network sees the
+    point, logit, features. Between cells the shares are interpolated, and places by their shares.
     """
     h, w = context.grid
     K = context.centers.shape[1]
@@ -135,8 +164,12 @@ def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
         index = (row * w + column) * K + fragment
         part = near * context.share.gather(1, index) + 1e-12
         total = total + part
-        place = place + part[..., None] * context.place.gather(1, index[..., None].expand(-1, -1, 3))
+        place = place + part[..., None] * context.place.gather(
+            1, index[..., None].expand(-1, -1, 3)
+        )
     at = (v.flatten(1).long() // 2) * context.columns + u.flatten(1).long() // 2
     smooth = context.smooth.gather(1, at[..., None].expand(-1, -1, context.smooth.shape[-1]))
-    out = torch.cat([total.clamp_min(1e-6).log()[..., None], place / total[..., None], smooth], dim=-1)
+    out = torch.cat(
+        [total.clamp_min(1e-6).log()[..., None], place / total[..., None], smooth], dim=-1
+    )
     return out.unflatten(1, u.shape[1:])

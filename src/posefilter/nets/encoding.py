@@ -1,4 +1,6 @@
-"""What every encoder of an image starts from: depth as geometry; and the trunk that those learned from nothing share."""
+"""What every encoder of an image starts from: depth as geometry; and the trunk that those learned
+from nothing share.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -9,7 +11,10 @@ from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
 
 
 def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Average known depth over size x size blocks.  (B, 1, H, W) [m] -> means (0 where none), share of known pixels."""
+    """Average known depth over size x size blocks.
+
+    (B, 1, H, W) [m] -> means (0 where none), share of known pixels.
+    """
     known = (depth > 0).to(depth.dtype)
     share = F.avg_pool2d(known, size)
     return F.avg_pool2d(depth, size) / share.clamp_min(1e-6), share
@@ -18,7 +23,8 @@ def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
 def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
     """Return surface normals towards the camera at half resolution, zeros where depth is missing.
 
-    (B, 1, H, W) [m], (B, 3, 3) -> (B, 3, H // 2, W // 2). Central differences of the points of a 3 x 3 masked mean.
+    (B, 1, H, W) [m], (B, 3, 3) -> (B, 3, H // 2, W // 2). Central differences of the points of a 3
+    x 3 masked mean.
     """
     B, _, H, W = depth.shape
     z, share = masked_mean_pool(depth, 2)
@@ -31,17 +37,20 @@ def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
     along_u = P[..., 1:-1, 2:] - P[..., 1:-1, :-2]
     along_v = P[..., 2:, 1:-1] - P[..., :-2, 1:-1]
     normal = torch.linalg.cross(along_v, along_u, dim=1)
-    normal = normal * normal.square().sum(1, keepdim=True).clamp_min(1e-24).rsqrt()  # F.normalize is slow across channels
+    # F.normalize is slow across channels
+    normal = normal * normal.square().sum(1, keepdim=True).clamp_min(1e-24).rsqrt()
     ok = F.pad(known, (1, 1, 1, 1))
     ok = ok[..., 1:-1, 2:] * ok[..., 1:-1, :-2] * ok[..., 2:, 1:-1] * ok[..., :-2, 1:-1] * known
     return normal * ok
 
 
 def geometry(depth: Tensor, K: Tensor) -> Tensor:
-    """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H, W) -> (B, 7, ...).
+    """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H,
+    W) -> (B, 7, ...).
 
-    Sides are halved upwards, as by a convolution of stride 2: beyond an odd side lies a row of which nothing is known.
-    Channels last: joined with colour that is not, it would have every convolution after it reorder its input.
+    Sides are halved upwards, as by a convolution of stride 2: beyond an odd side lies a row of
+    which nothing is known. Channels last: joined with color that is not, it would have every
+    convolution after it reorder its input.
     """
     depth = F.pad(depth, (0, depth.shape[-1] % 2, 0, depth.shape[-2] % 2))
     B, _, H, W = depth.shape
@@ -59,22 +68,32 @@ def grow(x: Tensor, like: Tensor) -> Tensor:
 
 
 def in_bfloat16(rgb: Tensor) -> torch.autocast:
-    """Return the context to encode images in: bfloat16 where the machine has it, unless they come in double precision."""
-    return torch.autocast(rgb.device.type, torch.bfloat16, enabled=rgb.dtype == torch.float32 and fast_bfloat16(rgb.device))
+    """Return the context to encode images in: bfloat16 where the machine has it, unless they come
+    in double precision.
+    """
+    return torch.autocast(
+        rgb.device.type,
+        torch.bfloat16,
+        enabled=rgb.dtype == torch.float32 and fast_bfloat16(rgb.device),
+    )
 
 
 class UNet(nn.Module):
-    """The trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8: colour at full resolution, geometry at half.
+    """The trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8: color at full
+    resolution, geometry at half.
 
-    A base class, laid by a method: checkpoints go by its parameters' names, and resumed optimizers by their order too.
+    A base class, laid by a method: checkpoints go by its parameters' names, and resumed optimizers
+    by their order too.
     """
 
     up8: nn.Module  # of each subclass, laid next: what follows on the way up at stride 8
 
     def lay_trunk(self, widths: tuple[int, int, int, int]) -> None:
-        """Make the layers all but `up8`.  widths: channels at strides 4, 8, 16 and 32, multiples of 8."""
+        """Make the layers all but `up8`.  widths: channels at strides 4, 8, 16 and 32, multiples of
+        8.
+        """
         a, b, c, d = widths
-        self.colour = conv_norm(3, 24, stride=2)
+        self.color = conv_norm(3, 24, stride=2)
         self.enter = conv_norm(24 + 7, a, stride=2)
         self.down4 = ResBlock(a)
         self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
@@ -84,8 +103,10 @@ class UNet(nn.Module):
         self.to8 = nn.Conv2d(c, b, 1)
 
     def encode(self, rgb: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, 3, H, W) in [0, 1], its geometry -> maps of stride 4, on the way down, and 8, on the way up."""
-        x = self.colour((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
+        """(B, 3, H, W) in [0, 1], its geometry -> maps of stride 4, on the way down, and 8, on the
+        way up.
+        """
+        x = self.color((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
         x4 = self.down4(self.enter(torch.cat([x, shape], dim=1)))
         x8 = self.down8(x4)
         x16 = self.down16(x8)

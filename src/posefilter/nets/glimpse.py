@@ -1,7 +1,8 @@
 """Glimpses: what a particle sees of the image where it stands.  Outside the frame is zero.
 
-A glimpse of size k covers the offsets of `geometry.lookup.window`, so that odd and even sizes have the particle's own pixel
-among theirs, and both kinds agree wherever the particle stands on whole pixels.
+A glimpse of size k covers the offsets of `geometry.lookup.window`, so that odd and even sizes have
+the particle's own pixel among theirs, and both kinds agree wherever the particle stands on whole
+pixels.
 """
 
 from torch import Tensor, nn
@@ -11,7 +12,9 @@ from posefilter.geometry.lookup import nearest_pixel, pick, sample, window
 
 
 class IntegerCut(nn.Module):
-    """Cut whole pixels, as one slices an array: nothing of what is seen has a gradient towards where the particle stands."""
+    """Cut whole pixels, as one slices an array: nothing of what is seen has a gradient towards
+    where the particle stands.
+    """
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -23,11 +26,14 @@ class IntegerCut(nn.Module):
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
         index = nearest_pixel(pixels)[:, :, None] + window(self.size, pixels.device)
         seen = pick(image, index.flatten(1, 2))
-        return seen.unflatten(1, index.shape[1:3]).transpose(2, 3).unflatten(3, (self.size, self.size))
+        return (
+            seen.unflatten(1, index.shape[1:3]).transpose(2, 3).unflatten(3, (self.size, self.size))
+        )
 
 
 class SmoothGlimpse(nn.Module):
-    """Interpolate bilinearly, so that what is seen has a gradient towards where the particle stands.
+    """Interpolate bilinearly, so that what is seen has a gradient towards where the particle
+    stands.
 
     spacing: pixels between the glimpse's samples; above 1 the glimpse sees further, more coarsely.
     """
@@ -45,4 +51,8 @@ class SmoothGlimpse(nn.Module):
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
         places = pixels[:, :, None] + window(self.size, pixels.device) * self.spacing
         seen = sample(image, places.flatten(1, 2))
-        return seen.unflatten(1, places.shape[1:3]).transpose(2, 3).unflatten(3, (self.size, self.size))
+        return (
+            seen.unflatten(1, places.shape[1:3])
+            .transpose(2, 3)
+            .unflatten(3, (self.size, self.size))
+        )

@@ -13,23 +13,30 @@ from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
 from posefilter.types import Fragments, ObjectModel
 
 
-class Motion(Protocol):
+class Displacement(Protocol):
     """Turns two plain outputs into a displacement."""
 
-    def __call__(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
-        """(B, N, 2), likelihood's logit (B, N), (B, N, 2) [px] in a frame of width x height -> (B, N, 2) [px]."""
+    def __call__(
+        self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int
+    ) -> Tensor:
+        """(B, N, 2), likelihood's logit (B, N), (B, N, 2) [px] in a frame of width x height -> (B,
+        N, 2) [px].
+        """
         ...
 
 
-class ToldPose(NamedTuple):
+class PosePrediction(NamedTuple):
     """A pose a particle, and where it comes from."""
 
     pose: Tensor  # (B, N, 4, 4) camera_from_object
-    fragments: Fragments | None = None  # that the particle's own point may lie in; None where the code tells one point
+    # that the particle's own point may lie in; None where the code tells one point
+    fragments: Fragments | None = None
 
 
 class Unbounded(nn.Module):
-    """The outputs are the displacement, in half frame widths; a particle may leave the frame, and go on."""
+    """The outputs are the displacement, in half frame widths; a particle may leave the frame, and
+    go on.
+    """
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2) -> (B, N, 2) [px]."""
@@ -39,7 +46,8 @@ class Unbounded(nn.Module):
 class Bounded(nn.Module):
     """At most `reach` frame widths along each axis (tanh), and never out of the frame.
 
-    The gradient passes an edge as if it were not there: else a particle that was pushed onto one could not be taught back.
+    The gradient passes an edge as if it were not there: else a particle that was pushed onto one
+    could not be taught back.
     """
 
     def __init__(self, reach: float = 0.25) -> None:
@@ -54,20 +62,24 @@ class Bounded(nn.Module):
         return goal + (inside - goal).detach() - state
 
 
-class Held(nn.Module):
-    """Another motion, less the surer the particle is of being on the object: who is there stays there.
+class Gated(nn.Module):
+    """Another displacement, less the surer the particle is of being on the object: who is there
+    stays there.
 
-    A displacement that is wrong in one place in twenty throws a cloud off again, all copies of a particle at once. The
-    likelihood learns nothing through this: it has a lesson of its own.
+    A displacement that is wrong in one place in twenty throws a cloud off again, all copies of a
+    particle at once. The likelihood learns nothing through this: it has a lesson of its own.
     """
 
-    def __init__(self, motion: Motion) -> None:
+    def __init__(self, displacement: Displacement) -> None:
         super().__init__()
-        self.motion = motion
+        self.displacement = displacement
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
-        return self.motion(raw, logit, state, width, height) * torch.sigmoid(-logit.detach())[..., None]
+        return (
+            self.displacement(raw, logit, state, width, height)
+            * torch.sigmoid(-logit.detach())[..., None]
+        )
 
 
 class _AnyObject(nn.Module):
@@ -82,13 +94,15 @@ class AbsoluteQuaternion(_AnyObject):
 
     width = 7
 
-    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
-        """(B, N, 7), (B, N, 3) -> ToldPose."""
-        return ToldPose(make_pose(matrix_from_quat_xyzw(raw[..., :4]), raw[..., 4:]))
+    def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
+        """(B, N, 7), (B, N, 3) -> PosePrediction."""
+        return PosePrediction(make_pose(matrix_from_quat_xyzw(raw[..., :4]), raw[..., 4:]))
 
 
-class _OwnPoint(nn.Module):
-    """A code that tells a rotation by two of its columns, and which object point the particle's own 3-D point is."""
+class _SurfacePointHead(nn.Module):
+    """A code that tells a rotation by two of its columns, and which object point the particle's own
+    3-D point is.
+    """
 
     center: Tensor
 
@@ -98,76 +112,96 @@ class _OwnPoint(nn.Module):
         self.radius = 1.0
 
     def about(self, model: ObjectModel) -> None:
-        """Take the object's centre and radius as origin and unit of the object point."""
+        """Take the object's center and radius as origin and unit of the object point."""
         self.center, self.radius = model.center.to(self.center), model.radius
 
     def _pose(self, columns: Tensor, thing: Tensor, point: Tensor) -> Tensor:
-        """(B, N, 6), object points (B, N, 3) over the radius, measured ones (B, N, 3) [m] -> (B, N, 4, 4)."""
-        start = columns.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])  # so that zeros are a rotation, not a singularity
+        """(B, N, 6), object points (B, N, 3) over the radius, measured ones (B, N, 3) [m] -> (B, N,
+        4, 4).
+        """
+        # so that zeros are a rotation, not a singularity
+        start = columns.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
         R = matrix_from_6d(columns + start)
         x = self.center + self.radius * thing
         return make_pose(R, point - (R @ x[..., None])[..., 0])
 
 
-class OwnPointSixD(_OwnPoint):
-    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and which object point the particle's own 3-D point is.
+class SurfacePointSixD(_SurfacePointHead):
+    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and which object point the
+    particle's own 3-D point is.
 
-    The translation follows: t = p - R x, p being the measured point in the camera and x the told one in the object. So what
-    is regressed is bounded by the object's size, and independent of where in the room it stands.
+    The translation follows: t = p - R x, p being the measured point in the camera and x the told
+    one in the object. So what is regressed is bounded by the object's size, and independent of
+    where in the room it stands.
     """
 
     width = 9
 
-    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
-        """(B, N, 9), (B, N, 3) [m] -> ToldPose."""
-        return ToldPose(self._pose(raw[..., :6], raw[..., 6:], point))
+    def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
+        """(B, N, 9), (B, N, 3) [m] -> PosePrediction."""
+        return PosePrediction(self._pose(raw[..., :6], raw[..., 6:], point))
 
 
-class OwnPointFragments(_OwnPoint):
-    """The same, but the object point is told as a fragment of the surface and a place in it (EPOS, Hodan 2020).
+class SurfacePointFragments(_SurfacePointHead):
+    """The same, but the object point is told as a fragment of the surface and a place in it (EPOS,
+    Hodan 2020).
 
-    6 + 4 K outputs. One told point answers doubt by the mean of what is possible, which lies inside the object and is
-    nobody's point; shares of fragments can hold several possibilities. The pose is that of the likeliest.
+    6 + 4 K outputs. One told point answers doubt by the mean of what is possible, which lies inside
+    the object and is nobody's point; shares of fragments can hold several possibilities. The pose
+    is that of the likeliest.
     """
 
-    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's centre
+    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
     reach: Tensor  # () their mean reach, over the radius
 
     def __init__(self, fragments: int = 64) -> None:
         super().__init__()
         if fragments < 1:
-            raise UserError(f"pose_code.fragments={fragments}: must be 1 or more")
+            raise UserError(f"pose_head.fragments={fragments}: must be 1 or more")
         self.width = 6 + 4 * fragments
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
 
     def about(self, model: ObjectModel) -> None:
-        """Cut the object into fragments, once: what was learned is about these, whatever points it is judged by later."""
+        """Cut the object into fragments, once: what was learned is about these, whatever points it
+        is judged by later.
+        """
         super().about(model)
         cut_once(self.centers, self.reach, model.points, model.center, model.radius)
 
-    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
-        """(B, N, 6 + 4 K), (B, N, 3) [m] -> ToldPose."""
+    def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
+        """(B, N, 6 + 4 K), (B, N, 3) [m] -> PosePrediction."""
         columns, share, offset = raw.split([6, self.fragments, 3 * self.fragments], dim=-1)
         place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
         likeliest = pick_fragment(place, share.argmax(-1))
-        said = Fragments(torch.log_softmax(share, dim=-1), place, self.centers.expand(len(raw), -1, -1), self.reach)
-        return ToldPose(self._pose(columns, likeliest, point), said)
+        said = Fragments(
+            torch.log_softmax(share, dim=-1),
+            place,
+            self.centers.expand(len(raw), -1, -1),
+            self.reach,
+        )
+        return PosePrediction(self._pose(columns, likeliest, point), said)
 
 
 class NoPose(_AnyObject):
-    """No outputs: a detector's particle tells where, not how. Its `pose` is unturned, at its own point, for drawing only."""
+    """No outputs: a detector's particle tells where, not how.
+
+    Its `pose` is unturned, at its own point, for drawing only.
+    """
 
     width = 0
 
-    def forward(self, raw: Tensor, point: Tensor) -> ToldPose:
-        """(B, N, 0), (B, N, 3) [m] -> ToldPose."""
-        return ToldPose(make_pose(torch.eye(3, dtype=point.dtype, device=point.device), point))
+    def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
+        """(B, N, 0), (B, N, 3) [m] -> PosePrediction."""
+        return PosePrediction(
+            make_pose(torch.eye(3, dtype=point.dtype, device=point.device), point)
+        )
 
 
 def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
-    """Fill unknown depth with the mean of what is known near by, else the image's median (1 m where nothing is known).
+    """Fill unknown depth with the mean of what is known near by, else the image's median (1 m where
+    nothing is known).
 
     (B, 1, H, W) [m], 0 where unknown -> (B, 1, H, W) [m].
     """
@@ -180,6 +214,9 @@ def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
 
 
 def _window_mean(x: Tensor, size: int) -> Tensor:
-    """Average over a square about each pixel, zeros beyond the frame, an axis at a time.  (B, C, H, W) -> the same."""
+    """Average over a square about each pixel, zeros beyond the frame, an axis at a time.
+
+    (B, C, H, W) -> the same.
+    """
     rows = F.avg_pool2d(x, (size, 1), 1, (size // 2, 0))
     return F.avg_pool2d(rows, (1, size), 1, (0, size // 2))

@@ -9,20 +9,27 @@ from posefilter.nets.linear import Linear
 
 
 def fast_bfloat16(device: torch.device) -> bool:
-    """Tell whether bfloat16 is worth while on a device: where the processor only emulates it, it is several times slower."""
+    """Tell whether bfloat16 is worth while on a device: where the processor only emulates it, it is
+    several times slower.
+    """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def fourier(x: Tensor, octaves: int) -> Tensor:
-    """Append sines and cosines of doubling frequencies, the first of period 2.  (*, D) -> (*, D (1 + 2 octaves))."""
+    """Append sines and cosines of doubling frequencies, the first of period 2.
+
+    (*, D) -> (*, D (1 + 2 octaves)).
+    """
     angles = x[..., None] * (math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype))
     return torch.cat([x, angles.sin().flatten(-2), angles.cos().flatten(-2)], dim=-1)
 
 
 class ResnetFC(nn.Module):
-    """x + fc(relu(fc(relu(x)))), the last layer starting at zero (Occupancy Networks, Mescheder et al. 2019)."""
+    """x + fc(relu(fc(relu(x)))), the last layer starting at zero (Occupancy Networks, Mescheder et
+    al. 2019).
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -38,10 +45,13 @@ class ResnetFC(nn.Module):
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     """Return a 3 x 3 convolution, batch norm and ReLU.
 
-    Batch norm, since its statistics do not hang on an image's extent: it trains on windows and reads whole images.
+    Batch norm, since its statistics do not hang on an image's extent: it trains on windows and
+    reads whole images.
     """
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
     )
 
 
@@ -51,7 +61,9 @@ class ResBlock(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.first = conv_norm(width, width)
-        self.second = nn.Sequential(nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width))
+        self.second = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width)
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, width, H, W) -> (B, width, H, W)."""

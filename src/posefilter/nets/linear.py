@@ -1,4 +1,6 @@
-"""A linear layer that multiplies with oneDNN: MKL, PyTorch's choice for float32, takes twice as long on AMD's processors."""
+"""A linear layer that multiplies with oneDNN: MKL, PyTorch's choice for float32, takes twice as
+long on AMD's processors.
+"""
 
 from typing import Any
 
@@ -17,7 +19,9 @@ _ONEDNN = has_onednn()
 
 
 class Linear(nn.Linear):
-    """A linear layer: the same parameters, the same function up to rounding, in less time where oneDNN is there."""
+    """A linear layer: the same parameters, the same function up to rounding, in less time where
+    oneDNN is there.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """(*, inputs) -> (*, outputs)."""
@@ -28,7 +32,9 @@ class Linear(nn.Linear):
 
 
 def takes_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Tell whether oneDNN is there for these: float32 on the processor, not empty, no autocast to another type."""
+    """Tell whether oneDNN is there for these: float32 on the processor, not empty, no autocast to
+    another type.
+    """
     plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32 and x.numel() > 0
     return _ONEDNN and plain and not torch.is_autocast_enabled("cpu")
 

@@ -1,4 +1,6 @@
-"""The networks that read one particle: multi-layer perceptrons over a latent, or a small convolution net over a patch."""
+"""The networks that read one particle: multi-layer perceptrons over a latent, or a small
+convolution net over a patch.
+"""
 
 from typing import NamedTuple
 
@@ -10,25 +12,27 @@ from posefilter.errors import UserError
 from posefilter.nets.linear import Linear
 
 
-class Said(NamedTuple):
+class NetOutput(NamedTuple):
     """What a particle's network says, before any of it is bounded or given a unit."""
 
-    memory: Tensor  # (B, N, L)
+    latent: Tensor  # (B, N, L)
     logit: Tensor  # (B, N) of the likelihood
-    motion: Tensor  # (B, N, 2)
+    displacement: Tensor  # (B, N, 2)
     pose: Tensor  # (B, N, D), D = 0 where the network tells no pose
 
 
 class ParticleNorm(nn.Module):
-    """Normalise features over every particle of every image of the batch ("batch"), or each particle by itself ("layer").
+    """Normalize features over every particle of every image of the batch ("batch"), or each
+    particle by itself ("layer").
 
-    Batch statistics mix images, particles and steps, whose distributions differ; layer statistics do not.
+    Batch statistics mix images, particles and steps, whose distributions differ; layer statistics
+    do not.
     """
 
     def __init__(self, kind: str, width: int) -> None:
         super().__init__()
         if kind not in ("batch", "layer"):
-            raise UserError(f"normalisation={kind!r} is unknown: choose batch or layer")
+            raise UserError(f"normalization={kind!r} is unknown: choose batch or layer")
         self.inner: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -37,7 +41,9 @@ class ParticleNorm(nn.Module):
 
 
 class Mlp(nn.Sequential):
-    """Layers over rows: leading axes are folded into one, once: a ReLU in place on a view costs copies of its gradient."""
+    """Layers over rows: leading axes are folded into one, once: a ReLU in place on a view costs
+    copies of its gradient.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """(*, inputs) -> (*, outputs)."""
@@ -45,50 +51,59 @@ class Mlp(nn.Sequential):
         return out.unflatten(0, x.shape[:-1])
 
 
-def mlp(inputs: int, outputs: int, width: int, layers: int, normalisation: str) -> Mlp:
-    """Return `layers` linear layers, each but the last followed by a normalisation and a ReLU."""
+def mlp(inputs: int, outputs: int, width: int, layers: int, normalization: str) -> Mlp:
+    """Return `layers` linear layers, each but the last followed by a normalization and a ReLU."""
     parts: list[nn.Module] = []
     for _ in range(layers - 1):
-        parts += [Linear(inputs, width), ParticleNorm(normalisation, width), nn.ReLU(inplace=True)]
+        parts += [Linear(inputs, width), ParticleNorm(normalization, width), nn.ReLU(inplace=True)]
         inputs = width
     return Mlp(*parts, Linear(inputs, outputs))
 
 
 class LatentNet(nn.Module):
-    """The paper's figure 3: sight and latent give the next latent; it gives pose and likelihood; all three the motion."""
+    """The paper's figure 3: sight and latent give the next latent; it gives pose and likelihood;
+    all three the displacement.
+    """
 
     def __init__(
         self,
         extra: int,
         size: int,
         pose_width: int = 7,
-        memory_width: int = 256,
+        latent_width: int = 256,
         width: int = 512,
         layers: int = 4,
-        normalisation: str = "batch",
+        normalization: str = "batch",
     ) -> None:
         super().__init__()
-        if min(memory_width, width, layers) < 1:
-            raise UserError(f"net: memory_width={memory_width}, width={width} and layers={layers} must be 1 or more")
-        self.memory_width = memory_width
-        self.latent = mlp(4 * size * size + extra + memory_width, memory_width, width, layers, normalisation)
-        self.pose = mlp(memory_width, pose_width, width, layers, normalisation)
-        self.likelihood = mlp(memory_width, 1, width, layers, normalisation)
-        self.motion = mlp(pose_width + 1 + memory_width, 2, width, layers, normalisation)
+        if min(latent_width, width, layers) < 1:
+            raise UserError(
+                f"net: latent_width={latent_width}, width={width} and layers={layers} "
+                f"must be 1 or more"
+            )
+        self.latent_width = latent_width
+        self.latent = mlp(
+            4 * size * size + extra + latent_width, latent_width, width, layers, normalization
+        )
+        self.pose = mlp(latent_width, pose_width, width, layers, normalization)
+        self.likelihood = mlp(latent_width, 1, width, layers, normalization)
+        self.displacement = mlp(pose_width + 1 + latent_width, 2, width, layers, normalization)
 
-    def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
-        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; C = 4, k = `size`, E = `extra`."""
-        latent = self.latent(torch.cat([patch.flatten(2), extra, memory], dim=-1))
+    def forward(self, patch: Tensor, extra: Tensor, latent: Tensor) -> NetOutput:
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; C = 4, k = `size`, E = `extra`."""
+        latent = self.latent(torch.cat([patch.flatten(2), extra, latent], dim=-1))
         pose, logit = self.pose(latent), self.likelihood(latent)
-        motion = self.motion(torch.cat([pose, logit, latent], dim=-1))
-        return Said(latent, logit[..., 0], motion, pose)
+        displacement = self.displacement(torch.cat([pose, logit, latent], dim=-1))
+        return NetOutput(latent, logit[..., 0], displacement, pose)
 
 
 class PatchNet(nn.Module):
-    """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, shared by all particles, then offset and likelihood.
+    """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, shared by all particles, then
+    offset and likelihood.
 
-    With `memory_width` 4 the particle also tells, as its memory, how far the box's four sides lie from it. `hidden` > 0
-    puts two layers of that width before the outputs, for the context that then joins the patch's features.
+    With `latent_width` 4 the particle also tells, as its latent, how far the box's four sides lie
+    from it. `hidden` > 0 puts two layers of that width before the outputs, for the context that
+    then joins the patch's features.
     """
 
     def __init__(
@@ -98,26 +113,33 @@ class PatchNet(nn.Module):
         pose_width: int = 0,
         width: int = 32,
         hidden: int = 0,
-        memory_width: int = 0,
-        normalisation: str = "batch",
+        latent_width: int = 0,
+        normalization: str = "batch",
     ) -> None:
         super().__init__()
         if pose_width:
-            raise UserError("net=patch tells no pose: choose pose_code=none, or net=latent")
-        if width < 1 or min(hidden, memory_width) < 0:
-            raise UserError(f"net: width={width} must be 1 or more; hidden={hidden}, memory_width={memory_width} 0 or more")
-        self.memory_width = memory_width
+            raise UserError("net=patch tells no pose: choose pose_head=none, or net=latent")
+        if width < 1 or min(hidden, latent_width) < 0:
+            raise UserError(
+                f"net: width={width} must be 1 or more; hidden={hidden}, "
+                f"latent_width={latent_width} 0 or more"
+            )
+        self.latent_width = latent_width
         blocks: list[nn.Module] = []
         for inputs in (4, width, width):
-            norm = nn.BatchNorm2d(width) if normalisation == "batch" else nn.GroupNorm(1, width)
+            norm = nn.BatchNorm2d(width) if normalization == "batch" else nn.GroupNorm(1, width)
             blocks += [nn.Conv2d(inputs, width, 3, padding=1), norm, nn.ReLU(inplace=True)]
         self.convolve = nn.Sequential(*blocks)
         features = width * size * size + extra
-        outputs = 3 + memory_width
-        self.tell = mlp(features, outputs, hidden, 3, normalisation) if hidden else Linear(features, outputs)
+        outputs = 3 + latent_width
+        self.tell = (
+            mlp(features, outputs, hidden, 3, normalization)
+            if hidden
+            else Linear(features, outputs)
+        )
 
-    def forward(self, patch: Tensor, extra: Tensor, memory: Tensor) -> Said:
-        """(B, N, C, k, k), (B, N, E), (B, N, L) -> Said; the memory is written anew, not read."""
+    def forward(self, patch: Tensor, extra: Tensor, latent: Tensor) -> NetOutput:
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; the latent is written anew, not read."""
         seen = self.convolve(patch.flatten(0, 1)).flatten(1).unflatten(0, patch.shape[:2])
         out = self.tell(torch.cat([seen, extra], dim=-1))
-        return Said(F.softplus(out[..., 3:] - 2), out[..., 0], out[..., 1:3], out[..., :0])
+        return NetOutput(F.softplus(out[..., 3:] - 2), out[..., 0], out[..., 1:3], out[..., :0])

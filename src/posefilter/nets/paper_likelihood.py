@@ -1,4 +1,6 @@
-"""The paper's likelihood network M (table 1): a scalar for each coloured point in the hypothesis's object frame."""
+"""The paper's likelihood network M (table 1): a scalar for each colored point in the hypothesis's
+object frame.
+"""
 
 import torch
 from torch import Generator, Tensor, nn
@@ -9,23 +11,36 @@ from posefilter.nets.linear import Linear
 
 
 class PaperLikelihood(nn.Module):
-    """The sum of M over a pose's pixels.  M: Linear 6 -> 128, five ResnetFC of 128, Linear 128 -> 1.
+    """The sum of M over a pose's pixels.  M: Linear 6 -> 128, five ResnetFC of 128, Linear 128 ->
+    1.
 
-    Knows neither the viewing ray nor a noise level. spread: width of the pixels' Gaussian over the projected radius (not
-    stated in the paper). Pixels outside the frame or without depth add nothing (not stated either).
+    Knows neither the viewing ray nor a noise level. spread: width of the pixels' Gaussian over the
+    projected radius (not stated in the paper). Pixels outside the frame or without depth add
+    nothing (not stated either).
     """
 
     def __init__(self, width: int = 128, blocks: int = 5, spread: float = 0.6) -> None:
         super().__init__()
         self.spread = spread
-        self.net = nn.Sequential(Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1))
+        self.net = nn.Sequential(
+            Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1)
+        )
 
     def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
-        """Judge points (*, 3) in the object frame [m], from the mesh's origin, with colours (*, 3) in [0, 1].  -> (*)."""
+        """Judge points (*, 3) in the object frame [m], from the mesh's origin, with colors (*, 3)
+        in [0, 1].  -> (*).
+        """
         return self.net(torch.cat([position, color], dim=-1))[..., 0]
 
     def forward(
-        self, image: Pixels, poses: Tensor, sigma: Tensor, center: Tensor, radius: float, pixels: int, generator: Generator
+        self,
+        image: Pixels,
+        poses: Tensor,
+        sigma: Tensor,
+        center: Tensor,
+        radius: float,
+        pixels: int,
+        generator: Generator,
     ) -> Tensor:
         """Score poses.  poses (B, N, 4, 4) -> (B, N); `sigma` is not used."""
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)

@@ -1,4 +1,6 @@
-"""The proposal network: it tells for each cell of the image whether it shows the object, and which point of it."""
+"""The proposal network: it tells for each cell of the image whether it shows the object, and which
+point of it.
+"""
 
 import torch
 from torch import Tensor, nn
@@ -10,17 +12,21 @@ from posefilter.nets.layers import ResBlock
 
 
 class ObjectCoordinateNet(UNet):
-    """A U-Net with residual blocks: colour at full resolution, geometry (normals, depth, rays) at half of it.
+    """A U-Net with residual blocks: color at full resolution, geometry (normals, depth, rays) at
+    half of it.
 
-    widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told apart by; features: of
-    each cell, for the likelihood's use.
+    widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told
+    apart by; features: of each cell, for the likelihood's use.
     """
 
-    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's centre
+    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
     reach: Tensor  # () their mean reach, over the radius
 
     def __init__(
-        self, widths: tuple[int, int, int, int] = (32, 80, 128, 160), fragments: int = 64, features: int = 0
+        self,
+        widths: tuple[int, int, int, int] = (32, 80, 128, 160),
+        fragments: int = 64,
+        features: int = 0,
     ) -> None:
         super().__init__()
         self.fragments = fragments
@@ -31,20 +37,26 @@ class ObjectCoordinateNet(UNet):
         self.up8 = nn.Sequential(ResBlock(b), ResBlock(b))
         self.parts = [1, fragments, 3 * fragments, features]
         self.out = nn.Conv2d(b, 1 + 4 * fragments + features, 1)
-        nn.init.normal_(self.out.weight, std=0.01)  # at first, every fragment is as likely, and its middle is the place
+        # at first, every fragment is as likely, and its middle is the place
+        nn.init.normal_(self.out.weight, std=0.01)
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
-        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8, rounded up."""
+        """(B, 3, H, W) in [0, 1], (B, 1, H, W) [m], (B, 3, 3) [px] -> Coordinates at H / 8 x W / 8,
+        rounded up.
+        """
         shape = geometry(depth, K)
         with in_bfloat16(rgb):
             y = self.out(self.encode(rgb, shape)[1]).float()
         logit, share, offset, features = y.permute(0, 2, 3, 1).split(self.parts, dim=-1)
         place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
         centers = self.centers.expand(len(y), -1, -1)
-        return Coordinates(logit[..., 0], torch.log_softmax(share, dim=-1), place, centers, features)
+        return Coordinates(
+            logit[..., 0], torch.log_softmax(share, dim=-1), place, centers, features
+        )
 
-    def adopt(self, points: Tensor, center: Tensor, radius: float) -> None:
-        """Cut an object into fragments, once: what was learned is about these, whatever points it is judged by later.
+    def set_object(self, points: Tensor, center: Tensor, radius: float) -> None:
+        """Cut an object into fragments, once: what was learned is about these, whatever points it
+        is judged by later.
 
         (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m].
         """

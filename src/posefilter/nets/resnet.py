@@ -1,4 +1,6 @@
-"""ResNet-18 and -34 (He et al. 2016) with torchvision's parameter names, so that its weight files load as they are."""
+"""ResNet-18 and -34 (He et al. 2016) with torchvision's parameter names, so that its weight files
+load as they are.
+"""
 
 from pathlib import Path
 
@@ -8,7 +10,8 @@ from torch import Tensor, nn
 from posefilter.errors import UserError
 
 DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's colours, that published weights expect
+# of ImageNet's colors, that published weights expect
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class BasicBlock(nn.Module):
@@ -22,7 +25,9 @@ class BasicBlock(nn.Module):
         self.bn2 = nn.BatchNorm2d(outputs)
         self.downsample: nn.Module | None = None
         if stride != 1 or inputs != outputs:
-            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs)
+            )
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, inputs, H, W) -> (B, outputs, H / stride, W / stride)."""
@@ -33,15 +38,18 @@ class BasicBlock(nn.Module):
 class ResNet(nn.Module):
     """The trunk of a ResNet, with a second, new stem through which geometry joins at stride 2.
 
-    kind: resnet18 or resnet34; weights: None (chance), a file, or an address that torch.hub can fetch. frozen: the trunk's
-    own weights and statistics stay as loaded, only the geometry stem learns. The classifier (`fc`) of a file is not used.
+    kind: resnet18 or resnet34; weights: None (chance), a file, or an address that torch.hub can
+    fetch. frozen: the trunk's own weights and statistics stay as loaded, only the geometry stem
+    learns. The classifier (`fc`) of a file is not used.
     """
 
     channels = (64, 128, 256, 512)
     mean: Tensor
     std: Tensor
 
-    def __init__(self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False) -> None:
+    def __init__(
+        self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False
+    ) -> None:
         super().__init__()
         if kind not in DEPTHS:
             raise UserError(f"context.trunk.kind={kind!r} is unknown: choose {' or '.join(DEPTHS)}")
@@ -51,7 +59,9 @@ class ResNet(nn.Module):
         nn.init.zeros_(self.geometry.weight)  # a loaded trunk starts as it was trained
         nn.init.zeros_(self.geometry.bias)  # type: ignore[arg-type]
         inputs = 64
-        for i, (outputs, depth) in enumerate(zip(self.channels, DEPTHS[kind], strict=True), start=1):
+        for i, (outputs, depth) in enumerate(
+            zip(self.channels, DEPTHS[kind], strict=True), start=1
+        ):
             blocks = [BasicBlock(inputs, outputs, 1 if i == 1 else 2)]
             blocks += [BasicBlock(outputs, outputs, 1) for _ in range(depth - 1)]
             setattr(self, f"layer{i}", nn.Sequential(*blocks))
@@ -87,15 +97,24 @@ class ResNet(nn.Module):
 
 
 def load_trunk(trunk: ResNet, weights: str) -> None:
-    """Load a torchvision ResNet's state dict, from a file or an address; every trunk weight must be there and fit."""
+    """Load a torchvision ResNet's state dict, from a file or an address; every trunk weight must be
+    there and fit.
+    """
     if weights.startswith(("http://", "https://")):
         try:
-            state = torch.hub.load_state_dict_from_url(weights, map_location="cpu", weights_only=True)
+            state = torch.hub.load_state_dict_from_url(
+                weights, map_location="cpu", weights_only=True
+            )
         except OSError as error:
-            raise UserError(f"context.trunk.weights={weights}: cannot be fetched ({error})") from error
+            raise UserError(
+                f"context.trunk.weights={weights}: cannot be fetched ({error})"
+            ) from error
     else:
         if not Path(weights).is_file():
-            raise UserError(f"context.trunk.weights={weights}: no such file (a path, an http address, or null for none)")
+            raise UserError(
+                f"context.trunk.weights={weights}: no such file (a path, an http "
+                f"address, or null for none)"
+            )
         state = torch.load(weights, map_location="cpu", weights_only=True)
     own = {name for name in trunk.state_dict() if not name.startswith("geometry.")}
     missing = sorted(own - state.keys())
@@ -103,5 +122,8 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
     if missing or strange:
         name = (missing or strange)[0]
         what = "lacks" if missing else "has the unexpected"
-        raise UserError(f"context.trunk.weights={weights}: {what} {name}; is it another network than trunk.kind says?")
+        raise UserError(
+            f"context.trunk.weights={weights}: {what} {name}; is it another network "
+            f"than trunk.kind says?"
+        )
     trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})

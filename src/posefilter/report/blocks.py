@@ -131,13 +131,17 @@ class Section(NamedTuple):
 
 
 def draw_charts(panels: Sequence[Panel]) -> list[Charts]:
-    """Return charts side by side, each drawn for light and for dark pages; nothing where there is none."""
+    """Return charts side by side, each drawn for light and for dark pages; nothing where there is
+    none.
+    """
     charts = []
     for panel in panels:
         light, dark = draw_chart(panel, LIGHT), draw_chart(panel, DARK)
         file = f"{make_slug(panel.title)}-{make_slug(panel.xlabel)}.png"
         uris = encode_png(light), encode_png(dark)
-        charts.append(Chart(*uris, WIDTH_PX, measure_height(panel), describe_panel(panel), file, light))
+        charts.append(
+            Chart(*uris, WIDTH_PX, measure_height(panel), describe_panel(panel), file, light)
+        )
     return [Charts(charts)] if charts else []
 
 

@@ -29,8 +29,20 @@ class Theme(NamedTuple):
     lines: tuple[str, ...]
 
 
-LIGHT = Theme("light", "#ffffff", "#1c2430", "#8a93a3", ("#2563c9", "#d9650d", "#0f8a5f", "#a03bb0", "#b58900", "#5b6675"))
-DARK = Theme("dark", "#171b23", "#e4e8ef", "#7d8797", ("#7aa8ff", "#ffa657", "#4fcf9d", "#d79be6", "#e6cf6a", "#a5afbf"))
+LIGHT = Theme(
+    "light",
+    "#ffffff",
+    "#1c2430",
+    "#8a93a3",
+    ("#2563c9", "#d9650d", "#0f8a5f", "#a03bb0", "#b58900", "#5b6675"),
+)
+DARK = Theme(
+    "dark",
+    "#171b23",
+    "#e4e8ef",
+    "#7d8797",
+    ("#7aa8ff", "#ffa657", "#4fcf9d", "#d79be6", "#e6cf6a", "#a5afbf"),
+)
 
 
 @dataclass(frozen=True)
@@ -47,7 +59,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart.  `categories`: names of 0, 1, ... along the side, instead of a horizontal axis of numbers."""
+    """One chart.
+
+    `categories`: names of 0, 1, ... along the side, instead of a horizontal axis of numbers.
+    """
 
     title: str
     xlabel: str
@@ -78,16 +93,27 @@ def draw_chart(panel: Panel, theme: Theme) -> bytes:
     style_axes(axes, panel, theme)
     if len(panel.lines) > 1:
         place = (
-            {"loc": "outside lower center", "ncols": count_columns(panel)} if needs_legend_below(panel) else {"loc": "best"}
+            {"loc": "outside lower center", "ncols": count_columns(panel)}
+            if needs_legend_below(panel)
+            else {"loc": "best"}
         )
         legend = figure.legend if needs_legend_below(panel) else axes.legend
-        legend(fontsize=8, frameon=False, labelcolor=theme.ink, handlelength=1.4, borderaxespad=0.2, **place)
+        legend(
+            fontsize=8,
+            frameon=False,
+            labelcolor=theme.ink,
+            handlelength=1.4,
+            borderaxespad=0.2,
+            **place,
+        )
     return to_small_png(figure)
 
 
 def needs_legend_below(panel: Panel) -> bool:
     """Tell whether a chart's legend stands below it, since it would hide what is drawn."""
-    return len(panel.lines) > 1 and (bool(panel.categories) or len(panel.lines) > 4 or not panel.joined)
+    return len(panel.lines) > 1 and (
+        bool(panel.categories) or len(panel.lines) > 4 or not panel.joined
+    )
 
 
 def count_columns(panel: Panel) -> int:
@@ -113,7 +139,9 @@ def draw_line(axes: Axes, line: Line, color: str, joined: bool) -> None:
     style = ("o-" if few else "-") if joined else "o"
     axes.plot(line.x, line.y, style, color=color, linewidth=1.7, markersize=4.5, label=line.label)
     if line.dots:
-        axes.plot(*zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0)
+        axes.plot(
+            *zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0
+        )
 
 
 def is_step(line: Line) -> bool:
@@ -157,7 +185,9 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
             axes.xaxis.set_minor_locator(NullLocator())
         elif not panel.log_x:
             axes.xaxis.set_major_locator(
-                MaxNLocator(6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x))
+                MaxNLocator(
+                    6, integer=all(float(x).is_integer() for line in panel.lines for x in line.x)
+                )
             )
         if panel.limits:
             axes.set_ylim(*panel.limits)
@@ -168,8 +198,8 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
 def smooth(values: Sequence[float]) -> np.ndarray:
     """Return a running mean over about a twelfth of a line; what is not finite does not count.
 
-    Narrower at the start, where losses fall steeply; at the end one-sided, since a narrow mean would show a last jump as a
-    trend.
+    Narrower at the start, where losses fall steeply; at the end one-sided, since a narrow mean
+    would show a last jump as a trend.
     """
     y = np.asarray(values, float)
     reach = max(1, len(y) // 24)
@@ -191,5 +221,7 @@ def shorten(name: str, most: int = 22) -> str:
 def to_small_png(figure: Figure) -> bytes:
     """Return a figure as a PNG of 128 colors, a third of the plain one."""
     stream = BytesIO()
-    Image.fromarray(rasterize(figure)).quantize(128, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    Image.fromarray(rasterize(figure)).quantize(128, dither=Image.Dither.NONE).save(
+        stream, "PNG", optimize=True
+    )
     return stream.getvalue()

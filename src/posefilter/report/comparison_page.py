@@ -11,7 +11,17 @@ from posefilter.errors import UserError
 from posefilter.figures.layout import format_length
 from posefilter.metrics.image_errors import FILE, ImageError, summarize_errors
 from posefilter.metrics.registry import find_metric
-from posefilter.report.blocks import Block, Cell, Heading, Paragraph, Section, Table, Text, Tile, draw_charts
+from posefilter.report.blocks import (
+    Block,
+    Cell,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    Text,
+    Tile,
+    draw_charts,
+)
 from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run, read_run
 from posefilter.report.image_errors import chart_errors
@@ -41,7 +51,8 @@ class Verdict(NamedTuple):
     a: int  # images in which the first is
     b: int
     equal: int
-    chance: float  # that runs which are equally good would differ as much in either direction (sign test)
+    # that runs which are equally good would differ as much in either direction (sign test)
+    chance: float
 
 
 def read_two_runs(text: str) -> tuple[Run, Run]:
@@ -51,14 +62,18 @@ def read_two_runs(text: str) -> tuple[Run, Run]:
         UserError: Where these are not two runs' folders, or one has no errors.csv.
     """
     parts = text.split(",")
-    splits = [(",".join(parts[:i]).strip(), ",".join(parts[i:]).strip()) for i in range(1, len(parts))]
+    splits = [
+        (",".join(parts[:i]).strip(), ",".join(parts[i:]).strip()) for i in range(1, len(parts))
+    ]
     found = [(Path(a), Path(b)) for a, b in splits if Path(a).is_dir() and Path(b).is_dir()]
     if len(found) != 1:
         raise UserError(f"runs={text}: should be the folders of two runs, separated by a comma")
     a, b = (read_run(folder) for folder in found[0])
     for run in (a, b):
         if not run.errors:
-            raise UserError(f"runs: {run.folder} has no {FILE}; test its checkpoint again with evaluate.py")
+            raise UserError(
+                f"runs: {run.folder} has no {FILE}; test its checkpoint again with evaluate.py"
+            )
     return a, b
 
 
@@ -93,7 +108,10 @@ def make_comparison_page(a: Run, b: Run, command: str) -> Page:
     if not pairs:
         raise UserError(f"runs: {a.folder} and {b.folder} were tested on no common image")
     if any(math.isnan(row.add_mm) for pair in pairs for row in pair):
-        raise UserError("runs: one of the two only detects; errors of poses can be compared of two that tell poses")
+        raise UserError(
+            "runs: one of the two only detects; errors of poses can be compared of "
+            "two that tell poses"
+        )
     names = name_runs(a, b)
     rows = dict(zip(names, ([pair.a for pair in pairs], [pair.b for pair in pairs]), strict=True))
     charts = [*chart_errors(rows), *chart_pairs(pairs, names)]
@@ -101,15 +119,24 @@ def make_comparison_page(a: Run, b: Run, command: str) -> Page:
         Section("Verdict", list_verdict(pairs, names)),
         Section("On the common images", [tabulate_common(rows), *draw_charts(charts)]),
         Section("Greatest changes", list_changes_of_images(pairs, names)),
-        Section("Whole tests", [compare_numbers(dict(zip(names, (a.metrics, b.metrics), strict=True)))]),
+        Section(
+            "Whole tests", [compare_numbers(dict(zip(names, (a.metrics, b.metrics), strict=True)))]
+        ),
         Section("Settings that differ", list_settings(a, b, names)),
     ]
     lines = [
-        Paragraph([Text(name, "badge"), Text(str(run.folder), "code"), f"{run.named('model')}, {run.named('variant')}"])
+        Paragraph(
+            [
+                Text(name, "badge"),
+                Text(str(run.folder), "code"),
+                f"{run.named('model')}, {run.named('variant')}",
+            ]
+        )
         for name, run in zip(names, (a, b), strict=True)
     ]
     notes = [
-        f"{len(run.errors) - len(pairs)} images of {name} are not in the other test; they are left out."
+        f"{len(run.errors) - len(pairs)} images of {name} are not in the other test; they are "
+        f"left out."
         for name, run in zip(names, (a, b), strict=True)
         if len(run.errors) > len(pairs)
     ]
@@ -133,7 +160,10 @@ def make_tiles(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Tile]:
     verdict = judge(pairs)
     return [
         Tile(str(len(pairs)), "", "common images"),
-        *(Tile(str(count), "", f"{name} is nearer") for count, name in zip(verdict[:2], names, strict=True)),
+        *(
+            Tile(str(count), "", f"{name} is nearer")
+            for count, name in zip(verdict[:2], names, strict=True)
+        ),
         Tile(str(verdict.equal), "", "alike"),
     ]
 
@@ -151,7 +181,11 @@ def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
     else:
         words = [Text("No difference that chance would not explain", "soft"), f"(p = {chance})."]
     finite = [pair.change for pair in pairs if math.isfinite(pair.change)]
-    middle = f"The median change of the error from the first to the second is {median(finite):+.2g} mm." if finite else ""
+    middle = (
+        f"The median change of the error from the first to the second is {median(finite):+.2g} mm."
+        if finite
+        else ""
+    )
     how = "Sign test over images: those whose errors differ by less than 0.05 mm do not count."
     return [Paragraph([*words, middle]), Paragraph([Text(how, "soft")])]
 
@@ -166,7 +200,10 @@ def tabulate_common(rows: dict[str, list[ImageError]]) -> Table:
         change = second - first if math.isfinite(first) and math.isfinite(second) else 0.0
         difference: Cell = "alike"
         if f"{abs(change):.1f}" != "0.0":
-            difference = Text(f"{change:+.1f} {info.unit}".strip(), "good" if change * info.direction > 0 else "bad")
+            difference = Text(
+                f"{change:+.1f} {info.unit}".strip(),
+                "good" if change * info.direction > 0 else "bad",
+            )
         cells.append([info.label, info.describe(first), info.describe(second), difference])
     return Table(("", *rows, "change"), cells, numeric=(1, 2, 3), form="narrow")
 
@@ -180,14 +217,28 @@ def chart_pairs(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Panel]:
     dots = Line("an image", [pair.a.add_mm for pair in both], [pair.b.add_mm for pair in both])
     xlabel = f"ADD of {names[0]} [mm]"
     diagonal = (ends[0], ends[1])
-    return [Panel(f"ADD of {names[1]}", xlabel, "mm", [dots], joined=False, log_x=True, log_y=True, diagonal=diagonal)]
+    return [
+        Panel(
+            f"ADD of {names[1]}",
+            xlabel,
+            "mm",
+            [dots],
+            joined=False,
+            log_x=True,
+            log_y=True,
+            diagonal=diagonal,
+        )
+    ]
 
 
 def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
     """Return the images in which one run is most ahead of the other, by name."""
     out: list[Block] = []
     for sign, name in ((1, names[0]), (-1, names[1])):
-        ahead = sorted((pair for pair in pairs if sign * pair.change > EQUAL_MM), key=lambda pair: -sign * pair.change)
+        ahead = sorted(
+            (pair for pair in pairs if sign * pair.change > EQUAL_MM),
+            key=lambda pair: -sign * pair.change,
+        )
         rows: list[list[Cell]] = [
             [
                 Text(pair.a.image, "code"),
@@ -196,7 +247,9 @@ def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> lis
             ]
             for pair in ahead[:LISTED]
         ]
-        table = Table(("image", "visible share", *(f"ADD of {own}" for own in names)), rows, numeric=(1, 2, 3))
+        table = Table(
+            ("image", "visible share", *(f"ADD of {own}" for own in names)), rows, numeric=(1, 2, 3)
+        )
         out += [Heading(f"Where {name} is most ahead"), table] if rows else []
     return out
 
@@ -204,4 +257,8 @@ def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> lis
 def list_settings(a: Run, b: Run, names: tuple[str, str]) -> list[Block]:
     """Return the settings in which two runs differ."""
     changed = compare_settings(a.config, b.config)
-    return [list_changes(changed, names)] if changed else [Paragraph([Text("None that is known.", "soft")])]
+    return (
+        [list_changes(changed, names)]
+        if changed
+        else [Paragraph([Text("None that is known.", "soft")])]
+    )

@@ -37,7 +37,9 @@ class Finding(NamedTuple):
 DIAGNOSTICS = (
     Diagnostic("missed_share", 0.0, "The filter gave no finite pose."),
     Diagnostic(
-        "belief/truth_outscored_by_wrong", 0.02, "The likelihood prefers a wrong pose: no amount of searching would help."
+        "belief/truth_outscored_by_wrong",
+        0.02,
+        "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
     Diagnostic("belief/coverage_90", 75.0, "The belief is too sure of itself."),
     Diagnostic("signs/pairwise_cosine", 0.8, "All particles move in one direction."),
@@ -56,12 +58,18 @@ DIAGNOSTICS = (
 def diagnose(run: Run) -> list[Finding]:
     """Return the diagnostics that a run has numbers for, the bad ones first."""
     known = collect_numbers(run)
-    found = [Finding(one, known[one.key], one.is_bad(known[one.key])) for one in DIAGNOSTICS if one.key in known]
+    found = [
+        Finding(one, known[one.key], one.is_bad(known[one.key]))
+        for one in DIAGNOSTICS
+        if one.key in known
+    ]
     return sorted(found, key=lambda finding: not finding.bad)
 
 
 def collect_numbers(run: Run) -> dict[str, float]:
-    """Return a run's numbers by joined names: of its test, or of its last validation where there is none."""
+    """Return a run's numbers by joined names: of its test, or of its last validation where there is
+    none.
+    """
     out = flatten(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
     for name, values in (run.metrics.get("signs") or {}).items():
         if isinstance(values, list) and values:
@@ -73,16 +81,24 @@ def collect_numbers(run: Run) -> dict[str, float]:
         out["fallen"] = max(score.values) - score.values[-1]
     training = [curve for tag, curve in run.curves.items() if tag.startswith("train/")]
     if training:
-        out["not_finite"] = float(sum(not math.isfinite(x) for curve in training for x in curve.values))
+        out["not_finite"] = float(
+            sum(not math.isfinite(x) for curve in training for x in curve.values)
+        )
     return {name: value for name, value in out.items() if math.isfinite(value)}
 
 
 def read_last_validation(curves: Mapping[str, Curve]) -> tuple[int | None, dict[str, float]]:
     """Return the step and the numbers of the last validation; None and nothing before the first."""
-    own = {tag.removeprefix("val/"): curve for tag, curve in curves.items() if tag.startswith(("val/", "signs/"))}
+    own = {
+        tag.removeprefix("val/"): curve
+        for tag, curve in curves.items()
+        if tag.startswith(("val/", "signs/"))
+    }
     if not own:
         return None, {}
-    return max(curve.steps[-1] for curve in own.values()), {name: curve.values[-1] for name, curve in own.items()}
+    return max(curve.steps[-1] for curve in own.values()), {
+        name: curve.values[-1] for name, curve in own.items()
+    }
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
@@ -103,12 +119,16 @@ def collect_timings(run: Run) -> list[tuple[str, str]]:
     if train and len(train.steps) > 1:
         pace = sorted(
             (b - a) / (t - s)
-            for a, b, s, t in zip(train.steps, train.steps[1:], train.times, train.times[1:], strict=False)
+            for a, b, s, t in zip(
+                train.steps, train.steps[1:], train.times, train.times[1:], strict=False
+            )
             if t > s and b > a
         )
         if pace:
             out.append(("training steps a second (median)", f"{pace[len(pace) // 2]:.2f}"))
-        out.append(("training, validations included", format_duration(train.times[-1] - train.times[0])))
+        out.append(
+            ("training, validations included", format_duration(train.times[-1] - train.times[0]))
+        )
     if seconds := collect_numbers(run).get("seconds_per_image"):
         out.append(("filter, an image", f"{seconds:.3f} s"))
     return out

@@ -19,13 +19,16 @@ class Curve(NamedTuple):
 
 
 def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
-    """Return the scalars by tag and the latest picture of each tag; both empty where nothing was logged.
+    """Return the scalars by tag and the latest picture of each tag; both empty where nothing was
+    logged.
 
-    A file that is still being written is read as far as it goes; steps that a resumed run took again count once.
+    A file that is still being written is read as far as it goes; steps that a resumed run took
+    again count once.
     """
     if not any(find_event_files(folder)):
         return {}, []
-    logging.getLogger("tensorboard").setLevel(logging.ERROR)  # it warns of every step that was taken again
+    # it warns of every step that was taken again
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
     log = EventAccumulator(str(folder), size_guidance={SCALARS: 0, IMAGES: 1})
     log.Reload()
     tags = log.Tags()
@@ -40,9 +43,11 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
 
 
 def drop_repeats(events: list[tuple[int, float, float]]) -> Curve:
-    """Return a curve of (step, value, time) in which steps only grow: what was logged last of a step is what counts.
+    """Return a curve of (step, value, time) in which steps only grow: what was logged last of a
+    step is what counts.
 
-    A run that goes on from a checkpoint goes back to its step; what it had logged beyond that is void.
+    A run that goes on from a checkpoint goes back to its step; what it had logged beyond that is
+    void.
     """
     kept: list[tuple[int, float, float]] = []
     for event in sorted(events, key=lambda event: event[2]):
@@ -59,13 +64,17 @@ def find_event_files(folder: Path) -> Iterator[Path]:
 
 
 def select_unsaved(pictures: list[StoredImage], files: list[StoredImage]) -> list[StoredImage]:
-    """Return the logged pictures that no file shows: `3_belief/belief` is what `validation_belief.jpg` is."""
+    """Return the logged pictures that no file shows: `3_belief/belief` is what
+    `validation_belief.jpg` is.
+    """
     known = {name_figure(picture.name) for picture in files}
     return [picture for picture in pictures if name_figure(picture.name) not in known]
 
 
 def name_figure(name: str) -> str:
-    """Return what a file or tag shows: `belief` of `3_belief/belief`, `test_worst` of `6_test/worst`."""
+    """Return what a file or tag shows: `belief` of `3_belief/belief`, `test_worst` of
+    `6_test/worst`.
+    """
     if "/" in name:
         group, _, name = name.rpartition("/")
         return f"test_{name}" if group.endswith("_test") else name

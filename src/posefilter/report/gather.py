@@ -23,7 +23,8 @@ class Run:
 
     folder: Path
     metrics: dict[str, Any]  # metrics.json; empty before the test
-    metrics_train: dict[str, Any]  # of its training, where an evaluation has since written its own; else empty
+    # of its training, where an evaluation has since written its own; else empty
+    metrics_train: dict[str, Any]
     config: dict[str, Any]  # as composed, interpolations unresolved
     choices: dict[str, str]  # which file of each group
     overrides: list[str]  # as typed
@@ -39,10 +40,16 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """Read a run's folder.  Raises UserError where it is none, or holds a file that cannot be read."""
+    """Read a run's folder.
+
+    Raises UserError where it is none, or holds a file that cannot be read.
+    """
     check_run(folder)
     metrics = read_json(folder / "metrics.json")
-    config, hydra = read_yaml(folder / ".hydra" / "config.yaml"), read_yaml(folder / ".hydra" / "hydra.yaml")
+    config, hydra = (
+        read_yaml(folder / ".hydra" / "config.yaml"),
+        read_yaml(folder / ".hydra" / "hydra.yaml"),
+    )
     runtime = (hydra.get("hydra") or {}).get("runtime") or {}
     choices = {str(k): str(v) for k, v in (runtime.get("choices") or {}).items() if v is not None}
     said = (hydra.get("hydra") or {}).get("overrides") or {}
@@ -71,7 +78,10 @@ def check_run(folder: Path) -> None:
         return
     if is_sweep(folder):
         raise UserError(f"run={folder}: is a sweep's folder; give it as sweep={folder}")
-    raise UserError(f"run={folder}: is no run's folder (it has no metrics.json, no .hydra/config.yaml and no events)")
+    raise UserError(
+        f"run={folder}: is no run's folder (it has no metrics.json, no "
+        f".hydra/config.yaml and no events)"
+    )
 
 
 def is_sweep(folder: Path) -> bool:
@@ -87,16 +97,28 @@ def list_missing(folder: Path, pictures: bool) -> list[str]:
             "No errors.csv: what the test found in single images is not known.",
             (folder / "metrics.json").is_file() and not (folder / FILE).is_file(),
         ),
-        ("No TensorBoard events, so no curves and no timings of the training.", not any(find_event_files(folder))),
+        (
+            "No TensorBoard events, so no curves and no timings of the training.",
+            not any(find_event_files(folder)),
+        ),
         ("No pictures in figures/ or in the events, so no gallery.", not pictures),
-        ("No .hydra folder: what was configured is not known.", not (folder / ".hydra" / "config.yaml").is_file()),
-        ("No data.json: how its data were split is not known.", not (folder / "data.json").is_file()),
+        (
+            "No .hydra folder: what was configured is not known.",
+            not (folder / ".hydra" / "config.yaml").is_file(),
+        ),
+        (
+            "No data.json: how its data were split is not known.",
+            not (folder / "data.json").is_file(),
+        ),
     )
     return [sentence for sentence, true in lacks if true]
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON file's object, empty where there is no file.  Raises UserError where it is malformed."""
+    """Return a JSON file's object, empty where there is no file.
+
+    Raises UserError where it is malformed.
+    """
     if not path.is_file():
         return {}
     try:
@@ -109,7 +131,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return a YAML file's mapping, empty where there is no file.  Raises UserError where it is malformed."""
+    """Return a YAML file's mapping, empty where there is no file.
+
+    Raises UserError where it is malformed.
+    """
     if not path.is_file():
         return {}
     try:

@@ -1,4 +1,6 @@
-"""Charts and tables of the errors of single images: how many are below a threshold, and how they grow with occlusion."""
+"""Charts and tables of the errors of single images: how many are below a threshold, and how they
+grow with occlusion.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -36,7 +38,9 @@ def read_image_errors(folder: Path) -> list[ImageError]:
         raise UserError(f"{path}: is no table of errors ({error})") from error
 
 
-def compute_cdf(errors_mm: Sequence[float], limit_mm: float = LIMIT_MM) -> tuple[list[float], list[float]]:
+def compute_cdf(
+    errors_mm: Sequence[float], limit_mm: float = LIMIT_MM
+) -> tuple[list[float], list[float]]:
     """Return the share of the images whose error is at most a threshold.
 
     Args:
@@ -55,8 +59,12 @@ def compute_cdf(errors_mm: Sequence[float], limit_mm: float = LIMIT_MM) -> tuple
 
 
 def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
-    """Return the images in ranges of their visible share, about as many in each; unknown shares are left out."""
-    known = sorted((row for row in rows if math.isfinite(row.visibility)), key=lambda row: row.visibility)
+    """Return the images in ranges of their visible share, about as many in each; unknown shares are
+    left out.
+    """
+    known = sorted(
+        (row for row in rows if math.isfinite(row.visibility)), key=lambda row: row.visibility
+    )
     count = min(MOST, len(known) // FEWEST)
     if count < 2:
         return []
@@ -64,21 +72,43 @@ def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
 
 
 def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
-    """Return the charts of one run's errors, or of several, a line each; the name of a single one is not shown."""
-    runs = {name: rows for name, rows in runs.items() if any(math.isfinite(row.diameter_mm) for row in rows)}
+    """Return the charts of one run's errors, or of several, a line each; the name of a single one
+    is not shown.
+    """
+    runs = {
+        name: rows
+        for name, rows in runs.items()
+        if any(math.isfinite(row.diameter_mm) for row in rows)
+    }
     cdf, by_share, by_auc = [], [], []
     for name, rows in runs.items():
-        for label, key in (("ADD", "add_mm"), ("ADD-S", "add_s_mm")) if len(runs) == 1 else ((name, "add_mm"),):
+        for label, key in (
+            (("ADD", "add_mm"), ("ADD-S", "add_s_mm")) if len(runs) == 1 else ((name, "add_mm"),)
+        ):
             cdf.append(Line(label, *compute_cdf([getattr(row, key) for row in rows])))
         parts = group_by_visibility(rows)
         seen = [float(np.mean([row.visibility for row in part])) for part in parts]
         if parts:
-            by_share.append(Line(name, seen, [100 * float(np.mean([is_found(row) for row in part])) for part in parts]))
+            by_share.append(
+                Line(
+                    name,
+                    seen,
+                    [100 * float(np.mean([is_found(row) for row in part])) for part in parts],
+                )
+            )
             by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
-    out = [Panel("Images with an ADD below a threshold", "threshold [mm]", "%", cdf, PERCENT)] if cdf else []
+    out = (
+        [Panel("Images with an ADD below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
+        if cdf
+        else []
+    )
     for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
         info = find_metric(key)
-        out += [Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT)] if lines else []
+        out += (
+            [Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT)]
+            if lines
+            else []
+        )
     return out
 
 
@@ -93,7 +123,9 @@ def measure_auc(rows: Sequence[ImageError]) -> float:
 
 
 def show_errors(rows: Sequence[ImageError]) -> list[Block]:
-    """Return the charts of one run's errors, and its worst images by name; nothing where there are none."""
+    """Return the charts of one run's errors, and its worst images by name; nothing where there are
+    none.
+    """
     if not rows:
         return []
     return [*draw_charts(chart_errors({"": rows})), *list_worst(rows)]
@@ -119,4 +151,8 @@ def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     head = ("image", "visible share", "ADD", "ADD-S", "particles on the object")
     where = Paragraph(["Every image is in", Text(FILE, "code"), "in the run's folder."])
     table = Table(head, cells, numeric=range(1, len(head)))
-    return [Heading("Images"), Fold(f"The {len(worst)} worst of {len(rows)} images", [table]), where]
+    return [
+        Heading("Images"),
+        Fold(f"The {len(worst)} worst of {len(rows)} images", [table]),
+        where,
+    ]

@@ -56,8 +56,13 @@ def read_images(folder: Path) -> list[StoredImage]:
     """Return the pictures of a folder, sorted by name as people count; empty where there is none."""
     if not folder.is_dir():
         return []
-    files = sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=lambda p: sort_by_number(p.name))
-    return [StoredImage(path.stem, path.stem.replace("_", " "), path.read_bytes()) for path in files]
+    files = sorted(
+        (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES),
+        key=lambda p: sort_by_number(p.name),
+    )
+    return [
+        StoredImage(path.stem, path.stem.replace("_", " "), path.read_bytes()) for path in files
+    ]
 
 
 def sort_by_number(name: str) -> list[tuple[int, str]]:
@@ -81,7 +86,8 @@ def group_by_section(pictures: list[StoredImage]) -> dict[str, list[StoredImage]
 
 
 def encode_image(data: bytes) -> tuple[str, int, int]:
-    """Return a picture as a data URI with its width and height [px]: large ones smaller, animations as they are.
+    """Return a picture as a data URI with its width and height [px]: large ones smaller, animations
+    as they are.
 
     Raises ValueError where the bytes are no picture.
     """

@@ -34,13 +34,23 @@ class Page:
 
     def render(self) -> str:
         """Return the page as HTML.  Whatever its content holds is escaped."""
-        sections = [Section(title, kept) for title, blocks in self.sections if (kept := drop_empty(blocks))]
+        sections = [
+            Section(title, kept) for title, blocks in self.sections if (kept := drop_empty(blocks))
+        ]
         style = resources.files("posefilter.report").joinpath("templates", "page.css").read_text()
-        return open_templates().get_template("page.html").render(page=self, sections=sections, style=style)
+        return (
+            open_templates()
+            .get_template("page.html")
+            .render(page=self, sections=sections, style=style)
+        )
 
     def files(self) -> dict[str, bytes]:
         """Return the charts of the page as PNGs by file name."""
-        return {name: png for section in self.sections for name, png in find_charts(section.blocks).items()}
+        return {
+            name: png
+            for section in self.sections
+            for name, png in find_charts(section.blocks).items()
+        }
 
 
 def drop_empty(blocks: Sequence[Block]) -> list[Block]:

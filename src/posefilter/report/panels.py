@@ -51,10 +51,18 @@ def choose_panels(curves: Mapping[str, Curve], charts: Mapping[str, Sequence[str
 
 
 def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
-    """Return the charts of the training: losses together, what has a unit and the learning rate alone."""
+    """Return the charts of the training: losses together, what has a unit and the learning rate
+    alone.
+    """
     rate = [tag for tag in curves if tag.startswith("lr-") or tag == "train/learning_rate"]
-    own = {tag[6:]: curve for tag, curve in curves.items() if tag.startswith("train/") and tag not in rate}
-    units = {name: name.rpartition("_")[2] for name in own if name.endswith(("_mm", "_px", "_m", "_rad"))}
+    own = {
+        tag[6:]: curve
+        for tag, curve in curves.items()
+        if tag.startswith("train/") and tag not in rate
+    }
+    units = {
+        name: name.rpartition("_")[2] for name in own if name.endswith(("_mm", "_px", "_m", "_rad"))
+    }
     names = [name for name in sorted(own, key=lambda name: name != "total") if name not in units]
     if len(names) == 2:  # the total of one loss is that loss
         names = names[:1]
@@ -62,7 +70,14 @@ def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     out = [Panel("Training loss", "training step", "", losses)] if losses else []
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)
-        out.append(Panel(name.removesuffix(f"_{unit}").replace("_", " ").capitalize(), "training step", unit, [line]))
+        out.append(
+            Panel(
+                name.removesuffix(f"_{unit}").replace("_", " ").capitalize(),
+                "training step",
+                unit,
+                [line],
+            )
+        )
     if rate:
         newest = max((curves[tag] for tag in rate), key=lambda curve: curve.times[-1])
         line = Line("learning rate", newest.steps, newest.values)
@@ -71,7 +86,9 @@ def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
 
 
 def make_health_panels(curves: Mapping[str, Curve]) -> list[Panel]:
-    """Return the charts of the filter's iterations at the last validation, from `filter/<quantity>/step_<iteration>`."""
+    """Return the charts of the filter's iterations at the last validation, from
+    `filter/<quantity>/step_<iteration>`.
+    """
     found: dict[str, dict[int, float]] = {}
     for tag, curve in curves.items():
         match = re.fullmatch(r"filter/(\w+)/step_(\d+)", tag)

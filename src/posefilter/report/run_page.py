@@ -100,10 +100,18 @@ def head_lines(run: Run) -> list[Paragraph]:
         badge, state = Text("tested", "done"), f"on {int(run.metrics.get('instances') or 0)} images"
     else:
         badge = Text("not tested yet", "badge")
-        state = f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "") if train else "nothing logged yet"
+        state = (
+            f"at step {train.steps[-1] + 1}" + (f" of {most}" if most else "")
+            if train
+            else "nothing logged yet"
+        )
         state += f"; numbers of the validation at step {step + 1}" if step is not None else ""
-    objects = ", ".join(run.data.get("objects") or []) or str((run.config.get("data") or {}).get("object") or "")
-    line = " · ".join(part for part in (run.named("variant"), f"loss {run.named('loss')}", objects) if part)
+    objects = ", ".join(run.data.get("objects") or []) or str(
+        (run.config.get("data") or {}).get("object") or ""
+    )
+    line = " · ".join(
+        part for part in (run.named("variant"), f"loss {run.named('loss')}", objects) if part
+    )
     return [
         Paragraph([badge, state]),
         Paragraph([line]),
@@ -124,7 +132,11 @@ def list_diagnostics(run: Run) -> list[Block]:
     bad = sum(finding.bad for finding in found)
     if not found:
         return []
-    say = f"{bad} of {len(found)} signs of failure are there." if bad else f"None of {len(found)} signs of failure is there."
+    say = (
+        f"{bad} of {len(found)} signs of failure are there."
+        if bad
+        else f"None of {len(found)} signs of failure is there."
+    )
     rows: list[list[Cell]] = []
     for one, value, is_bad in found:
         side = "above" if one.info.direction < 0 else "below"
@@ -167,15 +179,26 @@ def compare_numbers(columns: Mapping[str, Mapping[str, Any]]) -> Table:
     for info in map(find_metric, ROWS):
         values = [read_number(metrics, info.key) for metrics in columns.values()]
         if any(value is not None for value in values):
-            rows.append([info.label, *("–" if value is None else info.describe(value) for value in values)])
+            rows.append(
+                [info.label, *("–" if value is None else info.describe(value) for value in values)]
+            )
     return Table(("", *columns), rows, numeric=range(1, len(columns) + 1), form="narrow")
 
 
 def list_visibility(metrics: Mapping[str, Any]) -> list[Block]:
-    """Return errors by visibility: ranges that share no image, and apart from them those from a share upwards."""
-    found = {tuple(float(end) for end in name.split("-")): own for name, own in (metrics.get("by_visibility") or {}).items()}
-    apart = {f"{low:g} to {high:g}": found[low, high] for low, high in APART if (low, high) in found}
-    above = {f"at least {ends[0]:g}": own for ends, own in sorted(found.items()) if ends not in APART}
+    """Return errors by visibility: ranges that share no image, and apart from them those from a
+    share upwards.
+    """
+    found = {
+        tuple(float(end) for end in name.split("-")): own
+        for name, own in (metrics.get("by_visibility") or {}).items()
+    }
+    apart = {
+        f"{low:g} to {high:g}": found[low, high] for low, high in APART if (low, high) in found
+    }
+    above = {
+        f"at least {ends[0]:g}": own for ends, own in sorted(found.items()) if ends not in APART
+    }
     out: list[Block] = []
     for heading, ranges in (
         ("By visibility", apart),
@@ -200,7 +223,9 @@ def list_belief(run: Run) -> list[Block]:
     """Return what the belief's numbers are, and mean."""
     known = collect_numbers(run)
     infos = [find_metric(key) for key in BELIEF if key in known]
-    rows: list[list[Cell]] = [[info.label, info.describe(known[info.key]), Text(info.meaning, "soft")] for info in infos]
+    rows: list[list[Cell]] = [
+        [info.label, info.describe(known[info.key]), Text(info.meaning, "soft")] for info in infos
+    ]
     return [Table(("mean over the images", "", ""), rows, numeric=(1,), form="meanings")]
 
 
@@ -209,21 +234,39 @@ def list_settings(run: Run, changed: Sequence[Change] | None) -> list[Block]:
     typed = " ".join(run.overrides)
     out: list[Block] = []
     if run.config or run.overrides:
-        out.append(Paragraph(["Typed:", Text(typed, "code") if typed else "nothing: all is default"]))
+        out.append(
+            Paragraph(["Typed:", Text(typed, "code") if typed else "nothing: all is default"])
+        )
     if changed is None:
-        out += [Paragraph([Text("These settings cannot be compared with today's defaults.", "soft")])] if run.config else []
+        out += (
+            [Paragraph([Text("These settings cannot be compared with today's defaults.", "soft")])]
+            if run.config
+            else []
+        )
     else:
         name = Text(f"model={run.named('model')} variant={run.named('variant')}", "code")
         which = "Settings that" if changed else "No settings"
-        out.append(Paragraph([f"{which} differ from the defaults of", name, "in this version of the code."]))
+        out.append(
+            Paragraph(
+                [f"{which} differ from the defaults of", name, "in this version of the code."]
+            )
+        )
         out.append(list_changes(changed, ("this run", "default")))
-    choices = [(k, v) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"]
+    choices = [
+        (k, v) for k, v in sorted(run.choices.items()) if not k.startswith("hydra/") and v != "null"
+    ]
     rows = [[Text(group, "code"), Text(choice, "code")] for group, choice in choices]
-    return [*out, Fold(f"All {len(rows)} choices", [Table(("group", "choice"), rows)])] if rows else out
+    return (
+        [*out, Fold(f"All {len(rows)} choices", [Table(("group", "choice"), rows)])]
+        if rows
+        else out
+    )
 
 
 def list_changes(changed: Sequence[Change], names: tuple[str, str]) -> Table:
-    """Return the settings in which two configurations differ; names: of the own and of the other one."""
+    """Return the settings in which two configurations differ; names: of the own and of the other
+    one.
+    """
 
     def cell(value: str | None) -> Cell:
         return "–" if value is None else Text(shorten(value), "code")
@@ -249,7 +292,9 @@ def list_machine(run: Run) -> Table:
     if data.get("root"):
         rows.append([f"data, from {data.get('source')}", Text(str(data["root"]), "code")])
     for name, split in (data.get("splits") or {}).items():
-        rows.append([f"data, {name}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"])
+        rows.append(
+            [f"data, {name}", f"{split.get('frames')} frames of {split.get('scenes')} scenes"]
+        )
     return Table(("", ""), rows, form="pairs")
 
 

@@ -26,12 +26,20 @@ class Change(NamedTuple):
 def compare_settings(config: Mapping[str, Any], default: Mapping[str, Any]) -> list[Change]:
     """Return the settings that differ, in the run's order, those that it lacks last."""
     own, usual = flatten_settings(config), flatten_settings(default)
-    keys = [key for key in (*own, *(k for k in usual if k not in own)) if key.split(".")[0] not in PASSING]
-    return [Change(key, usual.get(key), own.get(key)) for key in keys if own.get(key) != usual.get(key)]
+    keys = [
+        key
+        for key in (*own, *(k for k in usual if k not in own))
+        if key.split(".")[0] not in PASSING
+    ]
+    return [
+        Change(key, usual.get(key), own.get(key)) for key in keys if own.get(key) != usual.get(key)
+    ]
 
 
 def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Return a configuration's settings by dotted key; a list is one setting, unless it holds sections."""
+    """Return a configuration's settings by dotted key; a list is one setting, unless it holds
+    sections.
+    """
     out: dict[str, str] = {}
     for key, value in config.items():
         name = f"{prefix}{key}"

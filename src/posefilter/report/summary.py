@@ -35,16 +35,26 @@ def draw_summary(rows: Sequence[Row], axes: Sequence[str]) -> Figure:
     words = {key for key in swept if any(isinstance(value, str) for value in values[key])}
     once = len({tuple(row[key] for key in swept) for row in rows}) == len(rows)
     heights = [max(3.2, 1.2 + 0.26 * len(values[key])) if key in words else 3.2 for key in swept]
-    figure = Figure(figsize=(max(4.2 * len(columns), 6.0), sum(heights) + 0.9), layout="constrained")
+    figure = Figure(
+        figsize=(max(4.2 * len(columns), 6.0), sum(heights) + 0.9), layout="constrained"
+    )
     FigureCanvasAgg(figure)
     count = f"{len(rows)} run{'s' * (len(rows) != 1)}"
-    notes = "one seed each: differences may be chance" if once else "line or bar: mean over seeds; dots: runs"
-    figure.suptitle(f"Sweep over {', '.join(swept)}: {count}\n{notes}", fontsize=12, fontweight="bold")
+    notes = (
+        "one seed each: differences may be chance"
+        if once
+        else "line or bar: mean over seeds; dots: runs"
+    )
+    figure.suptitle(
+        f"Sweep over {', '.join(swept)}: {count}\n{notes}", fontsize=12, fontweight="bold"
+    )
     panels = figure.subplots(len(swept), len(columns), squeeze=False, height_ratios=heights)
     for line, key in zip(panels, swept, strict=True):
         for panel, name in zip(line, columns, strict=True):
             info = find_metric(COLUMNS[name])
-            dots = [(row[key], info.convert(row[name])) for row in rows if row.get(name) is not None]
+            dots = [
+                (row[key], info.convert(row[name])) for row in rows if row.get(name) is not None
+            ]
             panel.grid(alpha=0.3)
             panel.set_title(info.title, fontsize=11, loc="left")
             if key in words:
@@ -88,7 +98,9 @@ def draw_over_words(
     places = {value: place for place, value in enumerate(values)}
     if joined:
         means = {x: mean(y for own, y in dots if own == x) for x, _ in dots}
-        panel.barh([places[x] for x in means], list(means.values()), height=0.7, color=_COLOR, alpha=0.25)
+        panel.barh(
+            [places[x] for x in means], list(means.values()), height=0.7, color=_COLOR, alpha=0.25
+        )
     panel.plot([y for _, y in dots], [places[x] for x, _ in dots], "o", color=_COLOR, alpha=0.6)
     panel.set_yticks(list(places.values()), [shorten(str(value), 32) for value in places])
     panel.set_ylim(len(places) - 0.5, -0.5)

@@ -36,7 +36,9 @@ from posefilter.report.sweeps import (
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
 
 
-def make_sweep_page(sweep: Sweep, best: Run | None, changed: Sequence[Change] | None, command: str) -> Page:
+def make_sweep_page(
+    sweep: Sweep, best: Run | None, changed: Sequence[Change] | None, command: str
+) -> Page:
     """Return what a sweep's page says.
 
     Args:
@@ -76,23 +78,41 @@ def make_sweep_page(sweep: Sweep, best: Run | None, changed: Sequence[Change] | 
 
 def list_metrics(sweep: Sweep) -> list[MetricInfo]:
     """Return what the runs have numbers of."""
-    return [find_metric(key) for key in COLUMNS.values() if any(key in job.numbers for job in sweep.jobs)]
+    return [
+        find_metric(key)
+        for key in COLUMNS.values()
+        if any(key in job.numbers for job in sweep.jobs)
+    ]
 
 
 def head_lines(sweep: Sweep, winner: Job) -> list[Paragraph]:
     """Return what stands below the heading: how many runs, which is the best, where they are."""
-    count = f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}" if sweep.unfinished else str(len(sweep.jobs))
+    count = (
+        f"{len(sweep.jobs)} of {len(sweep.jobs) + len(sweep.unfinished)}"
+        if sweep.unfinished
+        else str(len(sweep.jobs))
+    )
     badge = Text(f"{count} runs", "badge" if sweep.unfinished else "done")
     tied = find_ties(sweep)
-    why = [Text(f"({tied} runs have its score to one decimal; it has the least median ADD)", "soft")] if tied > 1 else []
+    why = (
+        [Text(f"({tied} runs have its score to one decimal; it has the least median ADD)", "soft")]
+        if tied > 1
+        else []
+    )
     name = Text(spell(winner.place) or winner.folder, "code")
     return [Paragraph([badge, "best:", name, *why]), Paragraph([Text(str(sweep.folder), "code")])]
 
 
 def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
-    """Return what a reader should know first: which runs have no result, and whether the runs themselves are there."""
+    """Return what a reader should know first: which runs have no result, and whether the runs
+    themselves are there.
+    """
     notes = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
-    return notes if best else [*notes, "The runs themselves are not there: numbers are those of summary.csv."]
+    return (
+        notes
+        if best
+        else [*notes, "The runs themselves are not there: numbers are those of summary.csv."]
+    )
 
 
 def spell(place: Mapping[str, Value]) -> str:
@@ -100,7 +120,9 @@ def spell(place: Mapping[str, Value]) -> str:
     return " ".join(f"{axis}={value}" for axis, value in place.items())
 
 
-def tabulate_groups(sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Block]:
+def tabulate_groups(
+    sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]
+) -> list[Block]:
     """Return a row a setting: means, with half the range over seeds."""
     rows: list[list[Cell]] = [
         [
@@ -143,14 +165,20 @@ def note_seeds(found: Sequence[Group]) -> list[Block]:
     ]
 
 
-def chart_over(axis: str, sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Panel]:
+def chart_over(
+    axis: str, sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]
+) -> list[Panel]:
     """Return a chart for each metric over one axis; another axis of few values becomes lines."""
     values = sweep.values(axis)
     if len(values) < 2:
         return []
     numeric = not any(isinstance(value, str) for value in values)
     spots = {value: float(value) if numeric else float(i) for i, value in enumerate(values)}
-    others = [other for other in sweep.shown if other != axis and 1 < len(sweep.values(other)) <= MOST_LINES]
+    others = [
+        other
+        for other in sweep.shown
+        if other != axis and 1 < len(sweep.values(other)) <= MOST_LINES
+    ]
     kinds = [(others[0], value) for value in sweep.values(others[0])] if others else [None]
     low = min(spots.values())
     log_x = numeric and low > 0 and max(spots.values()) / low >= 8
@@ -213,11 +241,17 @@ def chart_against_time(found: Sequence[Group]) -> list[Panel]:
     if len(found) < 2:
         return []
     cost = find_metric("seconds_per_image")
-    for info in map(find_metric, ("add/auc", "particles_on_object")):  # what sweeps maximize: the one, or else the other
-        pairs = [(group, group.of(cost.key), [info.convert(y) for y in group.of(info.key)]) for group in found]
+    # what sweeps maximize: the one, or else the other
+    for info in map(find_metric, ("add/auc", "particles_on_object")):
+        pairs = [
+            (group, group.of(cost.key), [info.convert(y) for y in group.of(info.key)])
+            for group in found
+        ]
         lines = [Line(spell(g.place), [mean(x)], [mean(y)]) for g, x, y in pairs if x and y]
         if len(lines) > MOST_LINES:  # too many for a legend: the table tells them apart
-            lines = [Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])]
+            lines = [
+                Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])
+            ]
         if lines:
             return [Panel(info.label, cost.title, info.unit, lines, info.limits, joined=False)]
     return []
@@ -265,7 +299,10 @@ def list_jobs(sweep: Sweep, infos: Sequence[MetricInfo]) -> list[Block]:
     rows: list[list[Cell]] = [
         [
             *(Text(str(job.place[axis]), "code") for axis in sweep.axes),
-            *(info.format(job.numbers[info.key]) if info.key in job.numbers else "–" for info in infos),
+            *(
+                info.format(job.numbers[info.key]) if info.key in job.numbers else "–"
+                for info in infos
+            ),
         ]
         for job in sweep.jobs
     ]

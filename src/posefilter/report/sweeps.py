@@ -1,4 +1,6 @@
-"""Gather a sweep: its runs, the settings in which they differ, and runs that differ in nothing but the seed as one."""
+"""Gather a sweep: its runs, the settings in which they differ, and runs that differ in nothing but
+the seed as one.
+"""
 
 import csv
 import math
@@ -70,10 +72,19 @@ def read_sweep(folder: Path) -> Sweep:
         raise UserError(f"sweep={folder}: no such folder")
     found = sorted(path.parent for path in folder.rglob("metrics.json") if path.parent != folder)
     if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
-        kind = "is a run's folder; give it as run=" + str(folder) if (folder / ".hydra").is_dir() else "is no sweep's folder"
-        raise UserError(f"sweep={folder}: {kind} (no run with a metrics.json below it, no multirun.yaml, no summary.csv)")
+        kind = (
+            "is a run's folder; give it as run=" + str(folder)
+            if (folder / ".hydra").is_dir()
+            else "is no sweep's folder"
+        )
+        raise UserError(
+            f"sweep={folder}: {kind} (no run with a metrics.json below it, no "
+            f"multirun.yaml, no summary.csv)"
+        )
     started = sorted(path.parent.parent for path in folder.rglob(".hydra/overrides.yaml"))
-    unfinished = [str(path.relative_to(folder)) for path in started if path not in found and path != folder]
+    unfinished = [
+        str(path.relative_to(folder)) for path in started if path not in found and path != folder
+    ]
     if found:
         axes, jobs = read_jobs(folder, found)
     elif (folder / "summary.csv").is_file():
@@ -88,11 +99,20 @@ def read_sweep(folder: Path) -> Sweep:
 def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
     metrics = [read_json(path / "metrics.json") for path in found]
-    said = [dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o) for own in metrics]
+    said = [
+        dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o)
+        for own in metrics
+    ]
     keys = dict.fromkeys(key for pairs in said for key in pairs)
-    axes = [key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in said}) > 1]
+    axes = [
+        key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in said}) > 1
+    ]
     jobs = [
-        Job({axis: parse_number(pairs.get(axis, "default")) for axis in axes}, flatten(own), str(path.relative_to(folder)))
+        Job(
+            {axis: parse_number(pairs.get(axis, "default")) for axis in axes},
+            flatten(own),
+            str(path.relative_to(folder)),
+        )
         for path, own, pairs in zip(found, metrics, said, strict=True)
     ]
     return axes, jobs
@@ -107,20 +127,31 @@ def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
         raise UserError(f"{path}: has no row")
     jobs = []
     for row in rows:
-        figures = {name: parse_number(row[column]) for column, name in COLUMNS.items() if row.get(column)}
-        numbers = {name: float(value) for name, value in figures.items() if not isinstance(value, str)}
-        jobs.append(Job({axis: parse_number(row[axis]) for axis in axes}, numbers, row.get("folder") or ""))
+        figures = {
+            name: parse_number(row[column]) for column, name in COLUMNS.items() if row.get(column)
+        }
+        numbers = {
+            name: float(value) for name, value in figures.items() if not isinstance(value, str)
+        }
+        jobs.append(
+            Job({axis: parse_number(row[axis]) for axis in axes}, numbers, row.get("folder") or "")
+        )
     return axes, jobs
 
 
 def read_declared(folder: Path) -> dict[str, list[Value]]:
-    """Return the values of each axis in the order in which they were asked for, as far as that is told."""
+    """Return the values of each axis in the order in which they were asked for, as far as that is
+    told.
+    """
     hydra: dict[str, Any] = read_yaml(folder / "multirun.yaml").get("hydra") or {}
     asked = dict((hydra.get("sweeper") or {}).get("params") or {})
     for typed in (hydra.get("overrides") or {}).get("task") or []:
         key, _, values = str(typed).lstrip("+~").partition("=")
         asked[key] = values
-    return {str(key): [parse_number(value.strip()) for value in str(values).split(",")] for key, values in asked.items()}
+    return {
+        str(key): [parse_number(value.strip()) for value in str(values).split(",")]
+        for key, values in asked.items()
+    }
 
 
 def make_sort_key(order: Sequence[Value]) -> Callable[[Value], tuple[int, float, str]]:
@@ -157,11 +188,15 @@ def group_jobs(sweep: Sweep) -> list[Group]:
 def score(numbers: Mapping[str, float]) -> float:
     """Return what sweeps maximize (see `overall`)."""
     least = float("-inf")
-    return overall(numbers.get("add/auc"), numbers.get("particles_on_object", least), numbers.get("iou", least))
+    return overall(
+        numbers.get("add/auc"), numbers.get("particles_on_object", least), numbers.get("iou", least)
+    )
 
 
 def rank(jobs: Sequence[Job]) -> tuple[float, float]:
-    """Return what the best of all has most of: the mean score to one decimal, then (where it ties) the least median ADD."""
+    """Return what the best of all has most of: the mean score to one decimal, then (where it ties)
+    the least median ADD.
+    """
     medians = [job.numbers.get("add/median_mm", math.inf) for job in jobs]
     return round(mean(score(job.numbers) for job in jobs), 1), -mean(medians)
 
@@ -178,6 +213,8 @@ def find_ties(sweep: Sweep) -> int:
 
 
 def find_best_group(found: Sequence[Group]) -> int:
-    """Return which group has the highest mean score; of those that tie, the one with the least median ADD."""
+    """Return which group has the highest mean score; of those that tie, the one with the least
+    median ADD.
+    """
     ranks = [rank(group.jobs) for group in found]
     return ranks.index(max(ranks))

@@ -1,0 +1,206 @@
+"""A checkpoint's file is data that others may have written: check its archive before it is read,
+and its tensors after.
+"""
+
+import re
+import stat
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+
+from posefilter.errors import UserError
+from posefilter.paths import is_plain_name
+
+_LARGEST = 8 << 30  # bytes of a file
+_MOST_FILES = 50_000  # in an archive
+# of what is in it: optimizers and loops hold a few values a parameter
+_MOST_NODES, _DEEPEST = 500_000, 64
+_PART = re.compile(r"[\w.\-]{1,100}(/[\w.\-]{1,100}){0,4}")
+_POINTS = 1_000_000  # of an object's surface
+
+
+def check_archive(file: Path, said: str) -> None:
+    """Raise UserError unless a file is an archive as torch.save writes it: parts stored as they
+    are, no larger than it.
+
+    Args:
+        file: The file.
+        said: How the user named it, for messages.
+    """
+    size = file.stat().st_size
+    if size > _LARGEST:
+        raise UserError(f"{said}: {size / 1e9:.0f} GB is more than a checkpoint has")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            parts = archive.infolist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError) as error:
+        raise UserError(
+            f"{said}: not readable as a checkpoint (no archive as torch writes it)"
+        ) from error
+    if len(parts) > _MOST_FILES:
+        raise UserError(f"{said}: {len(parts)} parts are more than a checkpoint has")
+    for part in parts:
+        if part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size:
+            raise UserError(
+                f"{said}: its part {part.filename[:60]!r} is compressed, which torch does not do"
+            )
+        if (
+            not _PART.fullmatch(part.filename)
+            or ".." in part.filename.split("/")
+            or stat.S_ISLNK(part.external_attr >> 16)
+        ):
+            raise UserError(
+                f"{said}: its part {part.filename[:60]!r} is not named as torch names them"
+            )
+    if sum(part.file_size for part in parts) > size:
+        raise UserError(f"{said}: its parts claim to be larger than the file")
+    if len({part.filename for part in parts}) < len(parts):
+        raise UserError(f"{said}: two of its parts have one name")
+
+
+def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
+    """Return what a checkpoint holds.
+
+    Raises UserError where it is none of ours, or a tensor is not what it seems.
+    """
+    if not isinstance(checkpoint, dict) or not {"state_dict", "recipe", "object_model"} <= set(
+        checkpoint
+    ):
+        raise UserError(f"{said}: not made by this project's train.py (no recipe or object in it)")
+    size = file.stat().st_size
+    for value in _leaves(checkpoint, said):
+        if isinstance(value, Tensor):
+            check_tensor(value, size, said)
+    state = checkpoint["state_dict"]
+    if not isinstance(state, dict) or not all(
+        isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()
+    ):
+        raise UserError(f"{said}: its state_dict should hold tensors by name")
+    _check_object(checkpoint["object_model"], said)
+    return checkpoint
+
+
+def check_tensor(value: Tensor, size: int, said: str) -> None:
+    """Raise UserError unless a tensor is a plain one whose elements all lie in a file of this size
+    [bytes].
+    """
+    shape = list(value.shape)
+    plain = (
+        type(value) in (Tensor, nn.Parameter)
+        and value.layout is torch.strided
+        and value.device.type == "cpu"
+    )
+    if not plain or value.is_quantized:
+        raise UserError(
+            f"{said}: holds a tensor of an unusual kind ({value.layout}, {value.device.type})"
+        )
+    held = value.untyped_storage().nbytes()
+    if value.numel() * value.element_size() > held or held > size:
+        raise UserError(
+            f"{said}: a tensor of shape {shape[:8]} claims more elements than the file holds"
+        )
+
+
+def _check_object(model: Any, said: str) -> None:
+    shapes = {"points": (-1, 3), "center": (3,), "symmetries": (-1, 4, 4), "hull": (-1, 3)}
+    if not isinstance(model, dict) or set(model) != {"name", "radius", "diameter", *shapes}:
+        raise UserError(
+            f"{said}: its object should have name, points, center, radius, diameter, "
+            f"symmetries and hull"
+        )
+    name = model["name"]
+    if not (isinstance(name, str) and is_plain_name(name)):
+        raise UserError(f"{said}: its object's name {str(name)[:40]!r} is not a plain one")
+    for key, shape in shapes.items():
+        value = model[key]
+        fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.is_floating_point()
+        if not fits or any(
+            want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
+        ):
+            raise UserError(f"{said}: its object's {key} should be numbers of shape {shape}")
+        if len(value) > _POINTS or not bool(value.isfinite().all()):
+            raise UserError(
+                f"{said}: its object's {key} has more than {_POINTS} rows, or rows "
+                f"that are not finite"
+            )
+    for key in ("radius", "diameter"):
+        if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
+            raise UserError(f"{said}: its object's {key} should be a length [m]")
+
+
+def _leaves(node: Any, said: str) -> Iterator[Any]:
+    """Yield every value, lazily and without recursion."""
+    stack, count = [(0, node)], 0
+    while stack:
+        depth, value = stack.pop()
+        count += 1
+        if count > _MOST_NODES or depth > _DEEPEST:
+            raise UserError(
+                f"{said}: holds more than a checkpoint does ({_MOST_NODES} values, {_DEEPEST} deep)"
+            )
+        if isinstance(value, dict):
+            stack += [(depth + 1, inner) for inner in value.values()]
+        elif isinstance(value, list | tuple | set):
+            stack += [(depth + 1, inner) for inner in value]
+        else:
+            yield value
+
+
+class Bounded(TorchFunctionMode):
+    """While it is entered, tensors that are made anew stay within bounds: a recipe must not fill
+    the memory.
+
+    Args:
+        elements: How many there may be, all tensors together.
+        tensors: How many tensors.
+        said: How the user named the checkpoint, for messages.
+    """
+
+    def __init__(self, elements: int, tensors: int, said: str) -> None:
+        super().__init__()
+        self.elements, self.tensors, self.said = elements, tensors, said
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Count what a factory is to make, before it does."""
+        kwargs = kwargs or {}
+        if func in _FACTORIES:
+            count = 1
+            for size in _sizes((*args, kwargs.get("size"))):
+                count *= max(size, 1)
+            self.elements -= count
+            self.tensors -= 1
+            if self.elements < 0 or self.tensors < 0:
+                raise UserError(
+                    f"{self.said}: its recipe describes a method larger than the weights it brings"
+                )
+        return func(*args, **kwargs)
+
+
+_FACTORIES = frozenset(
+    getattr(torch, name)
+    for name in (
+        "arange",
+        "empty",
+        "eye",
+        "full",
+        "linspace",
+        "logspace",
+        "ones",
+        "rand",
+        "randn",
+        "zeros",
+    )
+)
+
+
+def _sizes(node: Any) -> Iterator[int]:
+    if isinstance(node, int) and not isinstance(node, bool):
+        yield node
+    elif isinstance(node, list | tuple):
+        for inner in node:
+            yield from _sizes(inner)

@@ -1,0 +1,132 @@
+"""Build a method, from a configuration or from a checkpoint that carries its own."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.cli.archive import Bounded, check_archive, check_content
+from posefilter.cli.components import changed
+from posefilter.cli.instantiate import hint, instantiate_recipe, locate
+from posefilter.cli.job import Job
+from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
+from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
+from posefilter.models.quantization import unpack
+from posefilter.types import ObjectModel
+
+_SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
+
+
+def check_loss(job: Job) -> None:
+    """Raise UserError unless the chosen loss fits the chosen method, naming those that do."""
+    method, loss = locate(str(job.cfg.model._target_), "model"), job.choices["loss"]
+    legal = getattr(method, "legal_losses", ())
+    if loss not in legal:
+        model = job.choices["model"]
+        raise UserError(
+            f"loss={loss} does not fit model={model}: choose {', '.join(legal)}{hint(loss, legal)}"
+        )
+
+
+def recipe(job: Job) -> dict[str, Any]:
+    """Return what a checkpoint carries, to build the method again: choices, and settings that refer
+    to each other.
+
+    Any other interpolation is resolved here and now, since no reader of the checkpoint would.
+    """
+    settings = OmegaConf.to_container(job.cfg, resolve=False)
+    assert isinstance(settings, dict)
+    kept = {str(key): value for key, value in settings.items() if key not in NOT_KEPT}
+    return {
+        "choices": {
+            group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")
+        },
+        "settings": resolve_foreign(kept),
+    }
+
+
+def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> PoseEstimator:
+    """Build the method of a recipe, for an object if it is known."""
+    settings = OmegaConf.create(recipe["settings"])
+    try:
+        method = instantiate_recipe(settings.get("model"), "model")
+    except UserError as error:
+        where, found, rest = str(error).partition(":")
+        key, equals, value = where.partition("=")
+        raise UserError(typed_key(settings, key) + equals + value + found + rest) from error
+    if not isinstance(method, PoseEstimator):
+        raise UserError(f"model: is a {type(method).__name__}, not a method")
+    method.recipe = recipe
+    if model is not None:
+        method.set_object(model)
+    return method
+
+
+def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
+    """Read a checkpoint of ours, as data that others may have written.
+
+    Raises UserError where the path holds none, and where what it holds could do harm (see `archive`
+    and `recipe`).
+    """
+    if not path:
+        raise UserError(
+            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
+        )
+    file = Path(path)
+    if file.is_dir():
+        file = file / "checkpoints" / "best.ckpt"
+    if not file.is_file():
+        raise UserError(f"checkpoint={path}: no such file")
+    said = f"checkpoint={path}"
+    check_archive(file, said)
+    try:
+        loaded = torch.load(file, map_location="cpu", weights_only=True)
+    # a damaged archive fails in many ways, and pickle raises what it likes
+    except Exception as error:
+        raise UserError(f"{said}: not readable as a checkpoint ({type(error).__name__})") from error
+    checkpoint = check_content(loaded, file, said)
+    return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
+
+
+def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> PoseEstimator:
+    """Build the method that a checkpoint holds, with some of its pieces changed, and load its
+    weights.
+    """
+    recipe = checkpoint["recipe"]
+    recipe = {**recipe, "settings": without_pretrained(changed(recipe["settings"], wanted or {}))}
+    state = unpack(checkpoint["state_dict"])
+    elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
+    with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
+        method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
+    try:
+        missing, foreign = method.load_state_dict(state, strict=False)
+    except RuntimeError as error:  # tensors of other shapes
+        raise UserError(
+            "checkpoint: its weights do not fit the method; they were trained by another version "
+            "of this code"
+        ) from error
+    lost = [key for key in missing if not key.startswith("scores.")]
+    if lost or foreign:
+        raise UserError(
+            f"checkpoint: its weights do not fit the method ({len(lost)} missing, "
+            f"{len(foreign)} unknown)"
+        )
+    return method.eval()
+
+
+def typed_key(settings: DictConfig, where: str) -> str:
+    """Return a place in the model's tree as one types it: `model.filter.initialize.behind` is
+    `initialize.behind`.
+    """
+    path: list[str] = []
+    for part in where.split("."):
+        path.append(part)
+        node: Any = OmegaConf.to_container(settings, resolve=False)
+        for key in path:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and (link := re.fullmatch(r"\$\{([\w.]+)\}", node)):
+            path = link[1].split(".")
+    return ".".join(path)

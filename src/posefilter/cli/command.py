@@ -1,0 +1,247 @@
+"""From a command line to a job, and from a mistake to one readable line."""
+
+import importlib
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from posefilter.cli.components import loosen
+from posefilter.cli.console import JSON, logging_for, settle_logging
+from posefilter.cli.instantiate import hint
+from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
+from posefilter.cli.resume import with_resumed
+from posefilter.cli.trust import trust
+from posefilter.errors import UserError
+
+Work = Callable[[Job], Any]
+EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
+MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
+_MULTIRUN = ("-m", "--multirun")
+
+
+def run_command(name: str, home: Path, arguments: list[str] | None = None) -> int:
+    """Compose `conf/<name>.yaml` with the command line, do the work (or a sweep of it), and return
+    the exit status.
+
+    The work is the function `name` of the module `posefilter.cli.<name>`, imported only when the
+    settings have stood up. A mistake ends in one line on stderr and status 2; `debug=trace` shows
+    where it came from.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    # Hydra's parser wants it before or after all the rest
+    arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)
+    trace = "debug=trace" in arguments
+    conf = home / "conf"
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
+    register_resolvers()
+    before = sys.argv
+    try:
+        check_choices(arguments, conf)
+        arguments = loosen(with_resumed(bracketed(arguments)), name) + logging_for(arguments)
+        sys.argv = [sys.argv[0], *arguments]
+        hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
+            _task(name)
+        )()
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (_Stop, *EXPECTED) as caught:
+        error = caught.args[0] if isinstance(caught, _Stop) else caught
+        if trace:
+            traceback.print_exception(error)
+        print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
+        return FAILURE if isinstance(error, FloatingPointError) else MISTAKE
+    finally:
+        sys.argv = before
+    return 0
+
+
+def bracketed(arguments: list[str]) -> list[str]:
+    """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
+    numbers, not a sweep.
+    """
+    return [
+        re.sub(
+            r"^((?:\w+\.)*(?:intrinsics|camera|size))=([^\[\],]+(?:,[^\[\],]+)+)$", r"\1=[\2]", a
+        )
+        for a in arguments
+    ]
+
+
+def check_choices(arguments: list[str], conf: Path) -> None:
+    """Raise UserError where a group is given a value instead of the name of one of its files: Hydra
+    stumbles over it.
+    """
+    for argument in arguments:
+        group, _, value = argument.partition("=")
+        if value.startswith(("[", "{")) and re.fullmatch(r"\w+", group) and (conf / group).is_dir():
+            options = sorted(file.stem for file in (conf / group).glob("*.yaml"))
+            there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
+            raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
+
+
+def _task(name: str) -> Callable[[DictConfig], Any]:
+    """Return the function that Hydra calls for each job."""
+
+    def task(cfg: DictConfig) -> Any:
+        job = job_of(cfg)
+        settle_logging(job.cfg.get("console", JSON))
+        work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
+        try:
+            check_settings(cfg)
+            use_plugins(cfg)
+            return work(job)
+        except EXPECTED as error:
+            if job.swept:  # the other jobs go on; Hydra raises it again at the end
+                print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
+                raise
+            raise _Stop(error) from error
+
+    return task
+
+
+def use_plugins(cfg: DictConfig) -> None:
+    """Trust the packages that the user names in `plugins`, and import them.
+
+    Raises UserError where one is not there.
+    """
+    named = cfg.get("plugins")
+    if named is None:
+        return
+    if not isinstance(named, ListConfig):
+        raise UserError(
+            f"plugins={named}: must be a list of packages, such as plugins=[my_package]"
+        )
+    for package in named:
+        trust(package)
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"plugins={package}: there is no package '{error.name}' (is it installed?)"
+            ) from error
+
+
+class _Stop(BaseException):
+    """Carries a mistake past Hydra's own reporting."""
+
+
+def job_of(cfg: DictConfig) -> Job:
+    """Return the job that Hydra has prepared."""
+    own = HydraConfig.get()
+    choices = {str(k): str(v) for k, v in own.runtime.choices.items()}
+    swept = own.mode is RunMode.MULTIRUN
+    return Job(
+        cfg,
+        choices,
+        list(own.overrides.task),
+        Path(own.runtime.output_dir),
+        own.job.config_name or "",
+        swept,
+    )
+
+
+def register_resolvers() -> None:
+    """Teach configurations `${first:a,b}` (not null), `${plain:text}` (fit for a folder),
+    `${run_of:checkpoint}`.
+    """
+    OmegaConf.register_new_resolver("first", first, replace=True)
+    OmegaConf.register_new_resolver("run_of", run_of, replace=True)
+    OmegaConf.register_new_resolver("plain", plain_name, replace=True)
+
+
+def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Job:
+    """Compose a job as the command line would, for tests and tools."""
+    register_resolvers()
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        cfg = compose(name, [*overrides], return_hydra_config=True)
+    choices = {str(k): str(v) for k, v in cfg.hydra.runtime.choices.items()}
+    OmegaConf.set_struct(cfg, False)
+    cfg.pop("hydra")
+    OmegaConf.set_struct(cfg, True)
+    return Job(cfg, choices, list(overrides), folder, name, False)
+
+
+def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:
+    """Return a mistake as one line that names the key and the nearest valid one."""
+    text = str(error)
+    if (
+        isinstance(error, MissingConfigException)
+        and error.options is not None
+        and error.missing_cfg_file
+    ):
+        group, _, choice = error.missing_cfg_file.rpartition("/")
+        options = sorted(error.options)
+        if not options:  # the choices of some groups lie in a folder each
+            inner, group = group, group.partition("/")[0]
+            choice = f"{inner.partition('/')[2]}/{choice}".lstrip("/")
+            options = sorted(
+                str(f.relative_to(conf / group).with_suffix(""))
+                for f in (conf / group).rglob("*.yaml")
+            )
+        return (
+            f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
+            f"are {', '.join(options)}"
+        )
+    if isinstance(error, ConfigCompositionException):
+        found = re.search(r"Could not override '([^']+)'", text)
+        if found:
+            key = found[1]
+            return f"{key}: there is no such setting{near(key, known_keys(name, conf, arguments, key))}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: is missing; give {error.full_key}=..."
+    if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
+        return f"{error.full_key}: {first_line(error)}"
+    return first_line(error)
+
+
+def first_line(error: BaseException) -> str:
+    """Return an error's first line, or its kind where it says nothing."""
+    lines = str(error).splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def near(wrong: str, known: list[str]) -> str:
+    """Return the nearest key of the same depth; else what the wrong key's section has."""
+    told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
+    section = wrong.rpartition(".")[0]
+    if told or section not in known:
+        return told or hint(wrong, known)
+    own = [key for key in known if key.rpartition(".")[0] == section]
+    return f"; {section} has {', '.join(own)}" if own else f"; {section} has no settings"
+
+
+def known_keys(name: str, conf: Path, arguments: list[str], wrong: str) -> list[str]:
+    """Return every key and group that would have been valid, nearest depth first."""
+    good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        try:
+            cfg = compose(name, good, return_hydra_config=True)
+        except HydraException:
+            cfg = compose(name, return_hydra_config=True)
+    groups = [str(k) for k in cfg.hydra.runtime.choices if "/" not in str(k)]
+    keys: list[str] = []
+
+    def walk(node: Any, prefix: str) -> None:
+        for key, value in node.items():
+            keys.append(f"{prefix}{key}")
+            if isinstance(value, dict):
+                walk(value, f"{prefix}{key}.")
+
+    tree = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(tree, dict)
+    walk({k: v for k, v in tree.items() if k != "hydra"}, "")
+    depth = wrong.count(".")
+    return sorted({*groups, *keys}, key=lambda k: (abs(k.count(".") - depth), k))

@@ -1,0 +1,94 @@
+"""What a run is told apart by from others: its choices, and every plain setting."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from posefilter.cli.job import Job
+
+# by whose change nothing else comes out
+HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")
+_PLACES = ("data.root", "data.cache_dir")
+_PASSING = (
+    "callbacks",
+    "console",
+    "debug",
+    "folder",
+    "logger",
+    "out",
+    "plugins",
+    "resume",
+    "threads",
+)  # where and how, not what
+
+
+def comparable(job: Job) -> dict[str, bool | int | float | str]:
+    """Return a job's choices by group, and its settings by dotted key; a setting that repeats
+    another is left out.
+    """
+    chosen: dict[str, bool | int | float | str] = {
+        group: choice
+        for group, choice in job.choices.items()
+        if "/" not in group and group not in _PASSING and choice not in ("None", "null")
+    }
+    settings = OmegaConf.to_container(job.cfg, resolve=False)
+    assert isinstance(settings, dict)
+    return chosen | dict(
+        leaves({key: value for key, value in settings.items() if key not in _PASSING})
+    )
+
+
+def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return the choices and settings in which two recipes differ, such as a default that has
+    changed since.
+    """
+    groups = {
+        group
+        for group in {*then["choices"]} & {*now["choices"]}
+        if then["choices"][group] != now["choices"][group]
+    }
+    before, after = (dict(flat(recipe["settings"])) for recipe in (then, now))
+    settings = {key for key in {*before, *after} if before.get(key) != after.get(key)}
+    return sorted(
+        k
+        for k in groups | settings
+        if k not in (*HANDS, *_PLACES) and k.split(".")[0] not in _PASSING
+    )
+
+
+def flat(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value of nested settings, those in lists too, by its dotted key."""
+    inner = (
+        node.items()
+        if isinstance(node, Mapping)
+        else enumerate(node)
+        if isinstance(node, list)
+        else None
+    )
+    if inner is None:
+        yield name, node
+        return
+    for key, value in inner:
+        yield from flat(value, f"{name}.{key}" if name else str(key))
+
+
+def leaves(
+    node: Mapping[Any, Any], prefix: str = ""
+) -> Iterator[tuple[str, bool | int | float | str]]:
+    """Yield the settings of a section: neither nulls, nor interpolations (they repeat another), nor
+    classes' names.
+    """
+    for key, value in node.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from leaves(value, f"{name}.")
+        elif isinstance(value, list):
+            if not any(isinstance(item, Mapping) for item in value):
+                yield name, str(value)
+        elif (
+            value is not None
+            and not str(key).startswith("_")
+            and not (isinstance(value, str) and "${" in value)
+        ):
+            yield name, value

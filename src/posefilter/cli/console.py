@@ -1,0 +1,109 @@
+"""What a command says: sentences and tables for people, or with console=json one JSON object a line
+on stdout.
+"""
+
+import json
+import logging
+import math
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+JSON = "json"
+Files = Mapping[str, Path | str]
+
+
+def say(console: str, event: str, sentence: str, **content: Any) -> None:
+    """Print a sentence, or for machines its content."""
+    print(
+        json.dumps({"event": event, **finite(content)}) if console == JSON else sentence, flush=True
+    )
+
+
+def ended(
+    console: str, event: str, files: Files, following: Sequence[str] = (), **content: Any
+) -> None:
+    """Say where everything was written, and what may be typed next.
+
+    For machines: the last line, with all content.
+    """
+    if console == JSON:
+        told = {
+            **content,
+            "files": {name: str(path) for name, path in files.items()},
+            "next": list(following),
+        }
+        say(console, event, "", **told)
+        return
+    out = Console(soft_wrap=True, highlight=False)  # paths and commands must survive being copied
+    width = max((len(name) for name in files), default=0)
+    out.print(Text("written", "bold"))
+    for name, path in files.items():
+        out.print(Text.assemble(f"  {name:{width}}  ", (str(path), "cyan")))
+    if following:
+        out.print(Text("next", "bold"))
+    for command in following:
+        out.print(Text.assemble("  ", (command, "green")))
+
+
+def show_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print a table of names and values."""
+    table = Table("", "", title=title, show_header=False, title_justify="left", title_style="bold")
+    table.columns[1].justify = "right"
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def typed(command: str, **settings: Any) -> str:
+    """Return a command line that survives the shell and Hydra: `python train.py data.root=DIR`;
+    `__` stands for a dot.
+    """
+    return " ".join(
+        [f"python {command}.py", *(setting(k.replace("__", "."), v) for k, v in settings.items())]
+    )
+
+
+def setting(key: str, value: Any) -> str:
+    """Return one setting as it is typed; what Hydra would take apart is quoted for it."""
+    text = str(value)
+    if not re.fullmatch(r"[\w./:\-~ ]*", text):
+        text = "'" + text.replace("'", "\\'") + "'"
+    return shlex.quote(f"{key}={text}") if re.search(r"[^\w./:\-=~]", text) else f"{key}={text}"
+
+
+def finite(content: Any) -> Any:
+    """Return plain content with NaN and infinity as null, and paths as text."""
+    if isinstance(content, Mapping):
+        return {str(key): finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return str(content) if isinstance(content, Path) else content
+
+
+def settle_logging(console: str) -> None:
+    """Have the log's lines on the console be sentences; for machines, on stderr, and only warnings.
+
+    Files keep all.
+    """
+    for handler in logging.getLogger().handlers:
+        if type(handler) is logging.StreamHandler:
+            if console == JSON:
+                handler.setStream(sys.stderr)
+                handler.setLevel(logging.WARNING)
+            handler.setFormatter(logging.Formatter("%(message)s"))
+
+
+def logging_for(arguments: Sequence[str]) -> list[str]:
+    """Return what keeps Hydra's own log, of sweeps, off stdout where that is for machines."""
+    stream = "hydra.hydra_logging.handlers.console.stream=ext://sys.stderr"
+    return [stream] if f"console={JSON}" in arguments else []

@@ -1,0 +1,240 @@
+"""Test a checkpoint, or poses from anywhere, on a dataset."""
+
+import shutil
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.callbacks.errors import ErrorTable, make_rows
+from posefilter.callbacks.records import (
+    Records,
+    read_poses_csv,
+    to_mesh,
+    to_rows,
+    write_beliefs,
+    write_poses_csv,
+)
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.components import changed, changes, chosen
+from posefilter.cli.console import typed
+from posefilter.cli.job import Job
+from posefilter.cli.machine import settle
+from posefilter.cli.progress_bar import progress
+from posefilter.cli.recipe import check_data
+from posefilter.cli.results import record, show, write_json
+from posefilter.cli.train import build_data, make_trainer, quiet
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+from posefilter.geometry.boxes import box_of_pose
+from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.metrics.image_errors import FILE as ERRORS
+from posefilter.metrics.image_errors import ImageError, write_errors
+from posefilter.models.base import score_of
+from posefilter.paths import check_links
+from posefilter.types import ObjectModel
+
+OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
+_SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
+
+
+def evaluate(job: Job) -> float:
+    """Write metrics.json, and for a checkpoint poses.csv and beliefs.npz.
+
+    Returns the score that sweeps compare.
+    """
+    quiet()
+    settle(job.cfg.threads, job.cfg.seed)
+    if bool(job.cfg.checkpoint) == bool(job.cfg.estimates):
+        raise UserError("give either checkpoint=RUN/checkpoints/best.ckpt or estimates=poses.csv")
+    metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
+    keep_training_metrics(job.folder)
+    write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
+    files = {"metrics": job.folder / "metrics.json", **files}
+    following = (
+        [typed("report", run=job.folder)]
+        if (job.folder / ".hydra").is_dir() and not job.swept
+        else []
+    )
+    show(
+        metrics,
+        str(job.cfg.estimates or job.cfg.checkpoint),
+        job.cfg.console,
+        "evaluated",
+        files,
+        following,
+    )
+    return score_of(metrics)
+
+
+def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
+    checkpoint = read_checkpoint(job.cfg.checkpoint)
+    method = method_of(checkpoint, changes(job.cfg))
+    if job.cfg.seed is not None:
+        method.seed = job.cfg.seed
+    check_links(job.folder)
+    data = build_data(
+        data_settings(job, checkpoint["recipe"]["settings"], method.model.name), job.cfg.console
+    )
+    data.setup("test")
+    method.set_object(object_to_judge(data, method.model))
+    records = Records(beliefs=True)
+    callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
+    make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
+    files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
+    native = data.reader.native_from_mesh
+    if method.tells_pose:
+        files["poses"] = job.folder / "poses.csv"
+        write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
+    write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
+    told = Job(
+        job.cfg,
+        {**checkpoint["recipe"]["choices"], **chosen(job)},
+        job.overrides,
+        job.folder,
+        job.name,
+        job.swept,
+    )
+    return record(method.results(), told, data.describe(), Path(job.cfg.checkpoint)), files
+
+
+def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Score a BOP results file: of each instance that is there, its most confident estimate."""
+    if not job.cfg.get("data"):
+        raise UserError(
+            "estimates need to know of which data: give data=fat|ycb_video|bop|scenes "
+            "and data.root=DIR"
+        )
+    rows = read_poses_csv(Path(job.cfg.estimates))
+    data = build_data(data_settings(job, {}, None), job.cfg.console)
+    data.setup("test")
+    best = {}
+    for row in sorted(rows, key=lambda row: row.score):
+        best[row.scene_id, row.im_id, row.obj_id] = row
+    errors, iou = PoseErrors([data.object_model(i) for i in range(len(data.objects))]), BoxIoU()
+    used, table = 0, list[ImageError]()
+    for batch in data.test_dataloader():
+        own = [data.records("test")[i] for i in batch.frame_id.tolist()]
+        told = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
+        poses = torch.full_like(batch.camera_from_object, torch.nan)
+        for i, found in enumerate(told):
+            if found is not None:
+                used += 1
+                pose = to_mesh(
+                    found.camera_from_native, data.reader.native_from_mesh(own[i].object)
+                )
+                poses[i] = torch.from_numpy(pose.astype(np.float32))
+        errors.update(poses, batch.camera_from_object, batch.object_id)
+        pairs = [
+            (nan, nan) if row is None else (row.score, row.seconds if row.seconds >= 0 else nan)
+            for row in told
+        ]
+        scores, times = zip(*pairs, strict=True)
+        own_errors = [
+            (1000 * state[-1]).tolist() for state in (errors.add, errors.add_s, errors.diameter)
+        ]
+        table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
+        height, width = batch.rgb.shape[-2:]
+        for i, index in enumerate(batch.object_id.tolist()):
+            hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
+            truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)
+            guess = box_of_pose(poses[i : i + 1], hull, K, height, width).nan_to_num(0.0)
+            iou.update(guess, truth)
+    if not used:
+        raise UserError(
+            f"estimates={job.cfg.estimates}: none of its {len(rows)} rows is of an "
+            f"instance of this data"
+        )
+    results = {**errors.compute(), "iou": float(iou.compute()), "particles_on_object": None}
+    seconds = [row.seconds for row in best.values() if row.seconds >= 0]
+    results |= {
+        "seconds_per_image": sum(seconds) / len(seconds) if seconds else None,
+        "belief": None,
+    }
+    write_errors(job.folder / ERRORS, table)
+    metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
+    return metrics, {"errors": job.folder / ERRORS}
+
+
+def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictConfig:
+    """Return the settings of the data to test on.
+
+    Without `data=` they are those that the checkpoint was trained with: its held-out test split,
+    and it must lie where `check_data` lets it. With it, object and image size are the checkpoint's
+    unless typed; the split is the checkpoint's where it was trained on the same folder, and else
+    every frame is tested.
+    """
+    said = OmegaConf.to_container(job.cfg.data, resolve=False) if job.cfg.get("data") else {}
+    assert isinstance(said, dict)
+    own = trained.get("data") or {}
+    pairs = [
+        o.lstrip("+~").partition("=") for o in job.overrides if o.lstrip("+~").startswith("data.")
+    ]
+    typed = {key.removeprefix("data."): value.strip("'\"") for key, _, value in pairs}
+    chosen = "_target_" in said
+    if own and not chosen and "_target_" not in own:
+        raise UserError(
+            "data: exported weights carry no dataset; give "
+            "data=fat|ycb_video|bop|scenes and data.root=DIR"
+        )
+    settings = (
+        dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
+    )
+    tree = {**trained, "data": settings, "augment": {}, "seed": trained.get("seed", 0)}
+    if chosen and own:
+        before = OmegaConf.create(trained).data
+        for key in OF_THE_CHECKPOINT:
+            if key not in typed:
+                settings[key] = name if key == "object" else before.get(key)
+        root = OmegaConf.create(tree).data.root
+        if root is None:
+            raise UserError("data.root: is missing; name the dataset's folder")
+        same = "root" in before and Path(root).resolve() == Path(before.root).resolve()
+        if not any(key.startswith("split") for key in typed):
+            settings["split"] = before.split if same else {"test": 1.0}
+            settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
+        if "limit_test" not in typed:
+            settings["limit_test"] = before.limit_test if same else None
+        if same and "min_visibility_test" not in typed:
+            settings["min_visibility_test"] = before.min_visibility_test
+    elif chosen and not any(key.startswith("split") for key in typed):
+        settings["split"] = {"test": 1.0}
+    data = OmegaConf.create({**tree, "data": settings}).data
+    OmegaConf.resolve(data)
+    if not chosen:
+        plain = OmegaConf.to_container(data)
+        assert isinstance(plain, dict)
+        check_data({str(key): value for key, value in plain.items()}, typed)
+    return data
+
+
+def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
+    """Return the method's object with the points that the dataset defines ADD on, where the
+    dataset's meshes have it.
+
+    Raises UserError where its mesh there is another one: poses of the two could not be compared.
+    """
+    if own.name not in data.meshes.names():
+        return own
+    theirs = data.object_model(0)
+    shift = float((theirs.center - own.center).norm())
+    if shift > _SAME_OBJECT or abs(theirs.radius - own.radius) > _SAME_OBJECT:
+        raise UserError(
+            f"data.meshes={data.meshes.root}: its {own.name} is not the mesh that the checkpoint "
+            f"was trained on "
+            f"(center {1000 * shift:.1f} mm off, radius {1000 * theirs.radius:.1f} mm against "
+            f"{1000 * own.radius:.1f} mm)"
+        )
+    return own._replace(
+        points=theirs.points, diameter=theirs.diameter, symmetries=theirs.symmetries
+    )
+
+
+def keep_training_metrics(folder: Path) -> None:
+    """Set a run's own metrics aside before an evaluation in its folder writes others."""
+    path, kept = folder / "metrics.json", folder / "metrics_train.json"
+    if path.is_file() and not kept.is_file() and '"command"' not in path.read_text():
+        shutil.copy2(path, kept)

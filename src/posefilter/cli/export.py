@@ -1,0 +1,67 @@
+"""Strip a checkpoint to what predicts: weights, recipe (with pieces of the filter chosen anew, if
+wished) and object.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.components import changed, changes, chosen
+from posefilter.cli.console import ended, typed
+from posefilter.cli.evaluate import OF_THE_CHECKPOINT
+from posefilter.cli.job import Job
+from posefilter.errors import UserError
+from posefilter.models.quantization import pack, unpack
+
+_KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
+
+
+def export(job: Job) -> None:
+    """Write the stripped checkpoint; it works wherever the whole one did, but for going on with
+    training.
+    """
+    if job.cfg.out is None:
+        raise UserError("out: is missing; name the file to write, such as out=weights/carton.ckpt")
+    out = Path(job.cfg.out)
+    if out.suffix != ".ckpt":
+        raise UserError(f"out={out}: must end in .ckpt")
+    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
+    recipe = stripped["recipe"]
+    recipe["settings"] = changed(recipe["settings"], changes(job.cfg))
+    recipe["choices"] = {**recipe["choices"], **chosen(job)}
+    method_of(stripped)  # raises where it could not be used
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{out.name}.part")
+    torch.save(stripped, partial)
+    size = partial.stat().st_size / 1e6
+    if size > job.cfg.most_mb:
+        partial.unlink()
+        raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={job.cfg.most_mb}")
+    partial.replace(out)
+    following = [
+        f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
+        f"intrinsics=fx,fy,cx,cy depth_scale=10000"
+    ]
+    ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
+
+
+def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dict[str, Any]:
+    """Return a checkpoint without optimizer, loops and callbacks, its object with so many surface
+    points at most.
+
+    compact: kernels in 8 bits and the rest in 16, a quarter of the size (models/compact.py); they
+    are read back into 32.
+    """
+    kept = {key: checkpoint[key] for key in _KEPT if key in checkpoint}
+    model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
+    every = max(1, -(-len(model["points"]) // points))
+    model["points"] = model["points"][::every].clone()
+    settings = dict(kept["recipe"]["settings"])
+    data = settings.get("data") or {}
+    # no folders of the trainer's machine
+    settings["data"] = {key: data[key] for key in OF_THE_CHECKPOINT if key in data}
+    kept["recipe"] = {**kept["recipe"], "settings": settings}
+    state = pack(weights) if compact else {key: value.clone() for key, value in weights.items()}
+    return {**kept, "state_dict": state, "object_model": model}

@@ -1,0 +1,52 @@
+"""Render a dataset in the FAT format."""
+
+from pathlib import Path
+
+from posefilter.cli.console import JSON, ended, typed
+from posefilter.cli.instantiate import instantiate
+from posefilter.cli.job import Job
+from posefilter.data.readers.registry import open_reader
+from posefilter.errors import UserError
+from posefilter.figures.canvas import save_image
+from posefilter.figures.preview import draw_preview
+from posefilter.synthetic.generate import Summary
+
+
+def generate(job: Job) -> None:
+    """Render the frames that are still missing, and a picture of some."""
+    if job.cfg.out is None:
+        raise UserError("out: is missing; name the folder that the dataset goes to")
+    shown = bool(job.cfg.progress) and job.cfg.console != JSON
+    summary = instantiate({**job.cfg.generate, "progress": shown}, "generate")
+    assert isinstance(summary, Summary)
+    preview = draw(summary, job.cfg.object)
+    if job.cfg.console != JSON:
+        speed = f" ({summary.frames_per_second:.1f} frames/s)" if summary.rendered else ""
+        print(
+            f"{summary.frames} frames in {summary.folders} folders, {summary.rendered} of them "
+            f"rendered now{speed}"
+        )
+    following = typed(
+        "check_data",
+        data="fat",
+        data__root=summary.out,
+        data__object=job.cfg.object,
+        meshes=job.cfg.meshes,
+    )
+    ended(
+        job.cfg.console,
+        "generated",
+        {"data": summary.out, "preview": preview},
+        [following],
+        frames=summary.frames,
+        rendered=summary.rendered,
+        frames_per_second=summary.frames_per_second,
+    )
+
+
+def draw(summary: Summary, name: str) -> Path:
+    """Write preview.png: four of the frames."""
+    reader = open_reader("scenes", summary.out, name)
+    path = summary.out / "preview.png"
+    save_image(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
+    return path

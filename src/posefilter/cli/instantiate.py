@@ -1,0 +1,236 @@
+"""Build objects from configuration nodes: the one place in which a name in a YAML file becomes
+code.
+"""
+
+import difflib
+import functools
+import importlib
+import inspect
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from posefilter.cli.trust import (
+    Scope,
+    check_name,
+    is_component,
+    is_listed,
+    is_plugin,
+    listed_in,
+    trust,
+)
+from posefilter.errors import UserError
+
+__all__ = [
+    "accepted",
+    "check_arguments",
+    "hint",
+    "instantiate",
+    "instantiate_recipe",
+    "locate",
+    "trust",
+]
+
+_PLAIN = (bool, int, float, str)
+
+
+def instantiate(node: Any, where: str, **given: Any) -> Any:
+    """Build what a node of the user's settings describes.
+
+    `_target_` names a class or function, `_partial_: true` leaves it to be called later. Lists and
+    dictionaries are built element by element; a dictionary without a `_target_` stays one, an empty
+    one (the choice `none`) becomes None.
+
+    Args:
+        node: The settings.
+        where: The node's place in the configuration, for messages.
+        given: Arguments that no file can hold.
+
+    Raises:
+        UserError: The key, for a target that may not be built (see `trust`), or arguments that are unknown, missing or of
+            the wrong type.
+    """
+    return _build(node, where, Scope.CONFIG, given)
+
+
+def instantiate_recipe(node: Any, where: str) -> Any:
+    """Build what a node of a checkpoint's recipe describes: as `instantiate`, but components alone."""
+    return _build(node, where, Scope.RECIPE, {})
+
+
+def _build(node: Any, where: str, scope: Scope, given: Mapping[str, Any]) -> Any:
+    if isinstance(node, DictConfig | ListConfig):
+        node = OmegaConf.to_container(node, resolve=True)
+    if isinstance(node, list):
+        return [_build(item, f"{where}[{i}]", scope, {}) for i, item in enumerate(node)]
+    if not isinstance(node, Mapping):
+        return node
+    if not node:
+        return None
+    inner = {str(k): v for k, v in node.items() if k not in ("_target_", "_partial_")}
+    target = locate(str(node["_target_"]), where, scope) if "_target_" in node else None
+    arguments = {k: _build(v, f"{where}.{k}", scope, {}) for k, v in inner.items()}
+    if target is None:
+        return arguments
+    partial = bool(node.get("_partial_", False))
+    check_arguments(target, arguments, given, where, partial)
+    made = functools.partial(target, **arguments, **given)
+    return made if partial else made()
+
+
+def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., Any]:
+    """Import what a dotted name stands for: a class, or a listed or trusted function, defined in
+    the module that it names.
+
+    Raises UserError where it may not, or cannot, be imported. Nothing is imported for a name that
+    is not allowed.
+    """
+    check_name(name, where, scope)
+    module, _, attribute = name.rpartition(".")
+    try:
+        home = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name and not f"{module}.".startswith(f"{error.name}."):
+            raise UserError(
+                f"{where}._target_={name}: needs the package '{error.name}', which is not installed"
+            ) from error
+        raise UserError(f"{where}._target_={name}: there is no module {module}") from error
+    listed, plugin = is_listed(name, scope), is_plugin(name)
+    own = plugin or is_component(module, scope)
+    found = vars(home).get(attribute)
+    if found is None or not (listed or (own and _defined_in(found, module, attribute))):
+        known = listed_in(module, scope)
+        known += [
+            key for key, value in vars(home).items() if own and _defined_in(value, module, key)
+        ]
+        raise UserError(
+            f"{where}._target_={name}: there is no '{attribute}' defined in "
+            f"{module}{hint(attribute, known)}"
+        )
+    if not (listed or inspect.isclass(found) or (plugin and inspect.isfunction(found))):
+        raise UserError(f"{where}._target_={name}: is no class")
+    return typing.cast(Callable[..., Any], found)
+
+
+def _defined_in(thing: Any, module: str, name: str) -> bool:
+    """Tell whether a module defines a thing by this name, rather than importing it."""
+    return (
+        getattr(thing, "__module__", None) == module
+        and getattr(thing, "__qualname__", None) == name
+    )
+
+
+def hint(name: str, known: Sequence[str] | Any) -> str:
+    """Return `; did you mean 'x'?` for the nearest of the known names, "" where none is near."""
+    near = difflib.get_close_matches(name, [str(k) for k in known], n=1, cutoff=0.5)
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def accepted(target: Callable[..., Any]) -> tuple[dict[str, inspect.Parameter], bool]:
+    """Return the named parameters of a callable, and whether it takes others too.
+
+    A class that hands `**base` on to its parent takes the parent's parameters.
+    """
+    known: dict[str, inspect.Parameter] = {}
+    calls: list[Callable[..., Any]] = [target]
+    if inspect.isclass(target):
+        calls = [vars(kind)["__init__"] for kind in target.__mro__ if "__init__" in vars(kind)] or [
+            target
+        ]
+        if "__init__" not in {name for kind in target.__mro__[:-1] for name in vars(kind)}:
+            calls = [target]
+    for call in calls:
+        parameters = inspect.signature(call).parameters.values()
+        for parameter in parameters:
+            if (
+                parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
+                and parameter.name != "self"
+            ):
+                known.setdefault(parameter.name, parameter)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            return known, False
+    return known, True
+
+
+def check_arguments(
+    target: Callable[..., Any],
+    arguments: Mapping[str, Any],
+    given: Mapping[str, Any],
+    where: str,
+    partial: bool,
+) -> None:
+    """Raise UserError unless a callable takes these arguments."""
+    known, others = accepted(target)
+    for name in arguments:  # before any value: a misspelt name often leaves a wrong value elsewhere
+        if name not in known and not others:
+            label = getattr(target, "__name__", str(target))
+            raise UserError(f"{where}.{name}: {label} takes no such setting{hint(name, known)}")
+    for name, value in arguments.items():
+        if name in known and not fits(value, known[name].annotation):
+            raise UserError(f"{where}.{name}={value!r}: must be {describe(known[name].annotation)}")
+    # others' parents may be given what the child works out
+    if partial or not target.__module__.startswith("posefilter."):
+        return
+    for name, parameter in known.items():
+        if parameter.default is parameter.empty and name not in arguments and name not in given:
+            raise UserError(f"{where}.{name}: is missing, and has no default")
+
+
+def fits(value: Any, wanted: Any) -> bool:
+    """Tell whether a value may be what an annotation asks for; of types that are not plain, only
+    that it is not plain.
+    """
+    if wanted in (inspect.Parameter.empty, Any) or isinstance(wanted, str | typing.TypeVar):
+        return True
+    origin, inner = get_origin(wanted), get_args(wanted)
+    if origin in (Union, types.UnionType):
+        return any(fits(value, option) for option in inner)
+    if origin is Literal:
+        return value in inner
+    if wanted is None or wanted is type(None):
+        return value is None
+    if wanted is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if wanted is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if wanted in (bool, str, Path):
+        return isinstance(value, str if wanted is Path else wanted)
+    if origin is tuple and inner and inner[-1] is not Ellipsis:
+        return (
+            isinstance(value, list | tuple)
+            and len(value) == len(inner)
+            and all(map(fits, value, inner))
+        )
+    if isinstance(origin, type) and issubclass(origin, Sequence):
+        return isinstance(value, list | tuple) and all(fits(item, inner[0]) for item in value)
+    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+        return isinstance(value, Mapping)
+    return not isinstance(value, _PLAIN) and (value is not None or wanted is object)
+
+
+def describe(wanted: Any) -> str:
+    """Return an annotation in words."""
+    if get_origin(wanted) in (Union, types.UnionType):
+        return " or ".join(describe(option) for option in get_args(wanted))
+    if get_origin(wanted) is Literal:
+        return "one of " + ", ".join(map(str, get_args(wanted)))
+    words = {
+        int: "a whole number",
+        float: "a number",
+        bool: "true or false",
+        str: "text",
+        Path: "a path",
+    }
+    if wanted in (None, type(None)):
+        return "null"
+    if wanted in words:
+        return words[wanted]
+    return (
+        str(wanted).replace("typing.", "")
+        if get_origin(wanted)
+        else f"a {getattr(wanted, '__name__', wanted)}"
+    )

@@ -1,0 +1,70 @@
+"""What a command is asked to do."""
+
+import re
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from posefilter.errors import UserError
+
+_WHOLE = ("seed", "threads")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of one command."""
+
+    cfg: DictConfig
+    choices: dict[str, str]  # which file of each group
+    overrides: list[str]  # as typed
+    folder: Path  # where its files go
+    name: str  # of the command
+    swept: bool  # one of several that `-m` started
+
+
+def first(*values: Any) -> Any:
+    """Return the first value that is not null."""
+    return next((value for value in values if value is not None), None)
+
+
+def plain_name(text: str) -> str:
+    """Return a text fit for a folder's name: no slashes, no Hydra signs, at most 120 characters.
+
+    A longer one ends in a digest of the text, so that jobs of a sweep that differ only beyond have
+    folders of their own.
+    """
+    name = re.sub(r"[^\w.,=\-]+", "_", re.sub(r"(^|,)[+~]+", r"\1", str(text))).strip("_")
+    if len(name) > 120:
+        name = f"{name[:111]}_{sha256(str(text).encode()).hexdigest()[:8]}"
+    return name or "run"
+
+
+def run_of(path: Any) -> str:
+    """Return the folder that files about a checkpoint go to: its run, or one of their own below
+    outputs/evaluations.
+    """
+    if path is None:
+        return "outputs/evaluations/unnamed"
+    file = Path(str(path))
+    if file.is_dir():
+        return str(file)
+    return (
+        str(file.parent.parent)
+        if file.parent.name == "checkpoints"
+        else f"outputs/evaluations/{file.stem}"
+    )
+
+
+def check_settings(cfg: DictConfig) -> None:
+    """Raise UserError where a setting that every command has is not of its kind."""
+    for key in _WHOLE:
+        value = cfg.get(key)
+        if value is not None and (
+            not isinstance(value, int) or isinstance(value, bool) or value < 0
+        ):
+            raise UserError(f"{key}={value}: must be a whole number, 0 or more")
+    if cfg.get("console", "json") not in ("rich", "json"):
+        raise UserError(f"console={cfg.console}: choose rich or plain")

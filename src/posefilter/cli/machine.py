@@ -1,0 +1,93 @@
+"""Threads, seeds, and what to remember of the machine and the code that made a result."""
+
+import ctypes
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import cv2
+import lightning
+import torch
+
+_PACKAGES = (
+    "posefilter",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "numpy",
+    "scipy",
+    "opencv-python-headless",
+)
+
+
+# glibc's M_TRIM_THRESHOLD, M_TOP_PAD and M_MMAP_THRESHOLD [bytes]
+_MALLOC = {-1: 2**31 - 1, -2: 2**26, -3: 2**30}
+
+
+def settle(threads: int | None, seed: int) -> None:
+    """Use so many threads (null: what torch finds, OMP_NUM_THREADS included, at most 8), and seed
+    what is not explicit.
+    """
+    keep_freed_memory()
+    torch.set_num_threads(threads or min(8, torch.get_num_threads()))
+    cv2.setNumThreads(1)
+    lightning.seed_everything(seed, workers=True, verbose=False)
+
+
+def keep_freed_memory() -> bool:
+    """Have the C library keep what is freed for the tensors to come; tell whether it can (glibc).
+
+    By default each large tensor is mapped anew and given back, and the system fills its pages with
+    zeros every time: more than half of a filter's time on a processor.
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt = ctypes.CDLL(None).mallopt
+    taken = [mallopt(option, value) == 1 for option, value in _MALLOC.items()]
+    return all(taken)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide a result."""
+    out = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            out[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            out[name] = "not installed"
+    return out
+
+
+def device_name() -> str:
+    """Return the accelerator's name, or how many processor threads are used."""
+    if torch.cuda.is_available():
+        return torch.cuda.get_device_name(0)
+    return f"{platform.machine()}, {torch.get_num_threads()} threads"
+
+
+def git_state() -> str | None:
+    """Return the commit of the code, with `+` where files differ from it; None outside a
+    repository.
+    """
+    home = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", *arguments], cwd=home, capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def command_line() -> str:
+    """Return what was typed."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

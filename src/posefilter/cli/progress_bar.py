@@ -1,0 +1,202 @@
+"""What is seen on the console while a method trains or is tested."""
+
+import sys
+import time
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from posefilter.cli.console import JSON, say
+from posefilter.metrics.registry import find_metric
+from posefilter.report.diagnostics import format_duration
+
+SHOWN = ("train/total", "val/add/auc", "val/add/median_mm", "val/iou", "val/particles_on_object")
+
+
+def progress(console: str) -> Callback:
+    """Return the progress display: "rich" bars on a terminal, else lines ("json": as JSON)."""
+    return Bars() if console != JSON and sys.stdout.isatty() else Lines(console)
+
+
+def told(metrics: dict[str, Any]) -> str:
+    """Return the metrics that matter in words: `loss 1.25, ADD AUC 71.0`."""
+    known = [(find_metric(name), float(metrics[name])) for name in SHOWN if name in metrics]
+    return ", ".join(f"{info.short or info.label} {info.describe(value)}" for info, value in known)
+
+
+def briefly(metrics: dict[str, Any]) -> str:
+    """Return the two that fit beside a bar: the loss, and how well it finds the object."""
+    finds = "val/add/auc" if "val/add/auc" in metrics else "val/particles_on_object"
+    return told({name: metrics[name] for name in ("train/total", finds) if name in metrics})
+
+
+def is_whole(name: str) -> bool:
+    """Tell whether a metric is of a whole validation, not of a part of its images."""
+    return name.startswith("val/") and "/by_" not in name
+
+
+class Lines(Callback):
+    """A line at each validation; in a training or a test a sign of life every `pause` seconds: how
+    far, how long still.
+    """
+
+    def __init__(self, console: str = "rich", pause: float = 60.0) -> None:
+        self.console, self.pause = console, pause
+        self._began, self._step, self._last = 0.0, 0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._began, self._step = time.perf_counter(), trainer.global_step
+        self._last = self._began
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Print a line where nothing was said for long."""
+        if time.perf_counter() - self._last >= self.pause:
+            self._tell(
+                "training",
+                trainer,
+                {k: v for k, v in trainer.callback_metrics.items() if k == "train/total"},
+            )
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the line."""
+        if not trainer.sanity_checking:
+            self._tell("validation", trainer, trainer.callback_metrics)
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock again."""
+        self._began = self._last = time.perf_counter()
+
+    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *past: Any) -> None:
+        """Print a line where nothing was said for long."""
+        now = time.perf_counter()
+        if now - self._last < self.pause:
+            return
+        self._last, done, batches = now, int(past[2]) + 1, sum(map(int, trainer.num_test_batches))
+        left = format_duration((now - self._began) / done * (batches - done))
+        say(
+            self.console,
+            "testing",
+            f"batch {done} of {batches}: {left} left",
+            batch=done,
+            batches=batches,
+        )
+
+    def _tell(self, event: str, trainer: Trainer, seen: dict[str, Any]) -> None:
+        step, steps, self._last = trainer.global_step, trainer.max_steps, time.perf_counter()
+        rate = (step - self._step) / max(self._last - self._began, 1e-9)
+        left = (
+            f", {format_duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
+        )
+        words = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
+        numbers = {
+            name: float(value)
+            for name, value in seen.items()
+            if name == "train/total" or is_whole(name)
+        }
+        numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}
+        say(self.console, event, f"step {step} of {steps}: {words}", **numbers)
+
+
+class Bars(Callback):
+    """A bar over the training's steps with its loss and last figures, one for each validation or
+    test.
+    """
+
+    def __init__(self) -> None:
+        self._bars: Progress | None = None
+        self._training: TaskID | None = None
+        self._looking: TaskID | None = None
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open the bar."""
+        self._training = self._shown().add_task(
+            "training", total=trainer.max_steps, completed=trainer.global_step, said=""
+        )
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Move the bar; figures are fetched from the device as seldom as they are logged."""
+        if self._training is None:
+            return
+        said: dict[str, Any] = {}
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if trainer.global_step % every == 0 or trainer.global_step == trainer.max_steps:
+            said = {"said": briefly(trainer.callback_metrics)}
+        self._shown().update(self._training, completed=trainer.global_step, **said)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open a bar for the validation."""
+        if not trainer.sanity_checking:
+            self._look("validation", sum(map(int, trainer.num_val_batches)))
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, *_: Any
+    ) -> None:
+        """Move it."""
+        self._advance()
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Put a line in its place."""
+        self._looked()
+        if not trainer.sanity_checking:
+            self._shown().console.print(
+                f"step {trainer.global_step}: {told(trainer.callback_metrics)}", highlight=False
+            )
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open a bar for the test."""
+        self._look("test", sum(map(int, trainer.num_test_batches)))
+
+    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Move it."""
+        self._advance()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Leave the terminal as it was."""
+        self._stop()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Leave the terminal as it was."""
+        self._stop()
+
+    def _look(self, what: str, batches: int) -> None:
+        self._looking = self._shown().add_task(what, total=batches, said="")
+
+    def _advance(self) -> None:
+        if self._looking is not None:
+            self._shown().advance(self._looking)
+
+    def _looked(self) -> None:
+        if self._looking is not None:
+            self._shown().remove_task(self._looking)
+            self._looking = None
+
+    def _shown(self) -> Progress:
+        if self._bars is None:
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(24),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+            )
+            self._bars = Progress(
+                *columns, TimeRemainingColumn(), TextColumn("[dim]{task.fields[said]}")
+            )
+            self._bars.start()
+        return self._bars
+
+    def _stop(self) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+        self._bars = self._training = self._looking = None

@@ -1,0 +1,243 @@
+"""A checkpoint's recipe is data that others may have written: check it before anything is made of
+it.
+
+Its settings may refer to each other (`${filter}`), and that is all: no other interpolation is
+resolved, so that a recipe can neither read the environment nor call a function. It is small, and
+its numbers are such as methods have.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from posefilter.cli.trust import DATA_NAMES, is_plugin
+from posefilter.errors import UserError
+from posefilter.paths import stays_inside
+
+NOT_KEPT = (
+    "warm_start",
+    "out",
+    "folder",
+    "trainer",
+    "callbacks",
+    "logger",
+    "resume",
+    "debug",
+    "console",
+    "plugins",
+    "hydra",
+)
+# settings that name files to start a training from: the checkpoint has what came of them
+PRETRAINED = ("weights",)
+_DEEPEST, _MOST_NODES, _LONGEST = 16, 20_000, 1000
+_MOST = 1_000_000  # a setting that is a whole number
+_LIMITS = {
+    "seed": 1 << 63,
+    "split_seed": 1 << 63,
+    "workers": 64,
+    "particles": 100_000,
+    "first_particles": 100_000,
+}
+_KEY = re.compile(r"[\w./@#-]{1,100}")
+_REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}")
+_SELECT = re.compile(r"\$\{oc\.select:([A-Za-z_]\w*(?:\.\w+)*),(-?\d{1,6}|null)\}")
+
+
+def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the user's settings with every interpolation but references resolved: what a recipe
+    may hold.
+    """
+    tree = OmegaConf.create(settings)
+
+    def walk(node: Any, path: str) -> Any:
+        if isinstance(node, dict):
+            return {
+                key: walk(value, f"{path}.{key}" if path else str(key))
+                for key, value in node.items()
+            }
+        if isinstance(node, list):
+            return [walk(value, f"{path}[{i}]") for i, value in enumerate(node)]
+        if isinstance(node, str) and "${" in _REFERENCE.sub("", node):
+            found = OmegaConf.select(tree, path)
+            return (
+                OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
+            )
+        return node
+
+    out: dict[str, Any] = walk(settings, "")
+    return out
+
+
+def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
+    """Return a recipe that is safe to build from, without what it must not decide.
+
+    Args:
+        recipe: What the checkpoint holds under that name.
+        said: How the user named the checkpoint, for messages.
+
+    Raises:
+        UserError: It is no recipe, too large, or holds an interpolation that is no reference to another of its settings.
+    """
+    if not (isinstance(recipe, dict) and set(recipe) == {"choices", "settings"}):
+        raise UserError(f"{said}: its recipe should hold choices and settings, nothing else")
+    choices, settings = recipe["choices"], recipe["settings"]
+    if not (isinstance(choices, dict) and isinstance(settings, dict)):
+        raise UserError(f"{said}: its recipe's choices and settings should be mappings")
+    foreign = sorted(str(key) for key in settings if key in NOT_KEPT)
+    if foreign:
+        raise UserError(
+            f"{said}: its recipe holds {foreign[0]}, which a checkpoint does not decide"
+        )
+    for count, (path, depth, value) in enumerate(_nodes(recipe)):
+        if depth > _DEEPEST:
+            raise UserError(f"{said}: its recipe is nested more than {_DEEPEST} deep")
+        if count > _MOST_NODES:
+            raise UserError(f"{said}: its recipe holds more than {_MOST_NODES} settings")
+        _check_value(path, value, said)
+    if not all(isinstance(choice, str) and _KEY.fullmatch(choice) for choice in choices.values()):
+        raise UserError(f"{said}: its recipe's choices should be names")
+    settings = _without_selects(settings, settings)
+    _check_expansion(settings, said)
+    return {"choices": dict(choices), "settings": settings}
+
+
+def without_pretrained(node: Any) -> Any:
+    """Return settings in which no component names a file of weights: those of the checkpoint take
+    their place.
+    """
+    if isinstance(node, dict):
+        plain = {key: without_pretrained(value) for key, value in node.items()}
+        return plain | {key: None for key in PRETRAINED if key in node and "_target_" in node}
+    return [without_pretrained(value) for value in node] if isinstance(node, list) else node
+
+
+def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
+    """Raise UserError where settings of the data, of a recipe, name what only the user may.
+
+    A recipe's own folders count below the working folder alone: one that is there, or one below
+    `outputs`, where scenes may be rendered. Any other is to be typed.
+
+    Args:
+        data: The settings, resolved.
+        typed: The values that the user typed, by key, such as `root`.
+    """
+    own = set(map(str, typed.values()))
+    for path, _, value in _nodes(data):
+        key = path.lstrip(".")
+        if (
+            key.rpartition(".")[2] == "_target_"
+            and value not in DATA_NAMES
+            and not is_plugin(str(value))
+        ):
+            raise UserError(
+                f"data.{key}={value!r}: may not be built from a checkpoint; choose "
+                f"data=... yourself"
+            )
+        if not isinstance(value, str) or key in typed or value in own or key.endswith("_target_"):
+            continue
+        place = key in ("root", "cache_dir") or key.endswith("out")
+        if not stays_inside(value, Path()) or (
+            place and not (_below_outputs(value) or Path(value).is_dir())
+        ):
+            raise UserError(
+                f"data.{key}={value}: a checkpoint decides on no such place; if it is right, type "
+                f"data.{key}={value}"
+            )
+    if data.get("cache") == "disk" and "cache" not in typed:
+        raise UserError(
+            "data.cache=disk: a checkpoint does not decide where frames are kept; type "
+            "data.cache=disk or latent"
+        )
+
+
+def _below_outputs(value: str) -> bool:
+    parts = Path(value).parts
+    return len(parts) > 1 and parts[0] == "outputs"
+
+
+def _nodes(node: Any) -> Iterator[tuple[str, int, Any]]:
+    """Yield (path, depth, value) of every node, lazily and without recursion."""
+    stack = [("", 0, node)]
+    while stack:
+        path, depth, value = stack.pop()
+        yield path, depth, value
+        if isinstance(value, Mapping):
+            stack += [
+                (f"{path}.{key}" if isinstance(key, str) else f"{path}.?", depth + 1, v)
+                for key, v in value.items()
+            ]
+        elif isinstance(value, list | tuple):
+            stack += [(f"{path}[{i}]", depth + 1, v) for i, v in enumerate(value)]
+
+
+def _check_value(path: str, value: Any, said: str) -> None:
+    where = path.lstrip(".").removeprefix("settings.")[:100]
+    if isinstance(value, dict):
+        wrong = [key for key in value if not (isinstance(key, str) and _KEY.fullmatch(key))]
+        if wrong:
+            raise UserError(f"{said}: its recipe has the key {str(wrong[0])[:40]!r}")
+    elif isinstance(value, str):
+        if len(value) > _LONGEST or not value.isprintable():
+            raise UserError(
+                f"{said}: its recipe's {where} is no plain text of at most {_LONGEST} letters"
+            )
+        if "${" in _REFERENCE.sub("", _SELECT.sub("", value)):
+            raise UserError(
+                f"{said}: its recipe's {where}={value[:60]!r} may only refer to another setting, "
+                f"such as ${{filter}}"
+            )
+    elif isinstance(value, int) and not isinstance(value, bool):
+        if abs(value) > _LIMITS.get(where.rpartition(".")[2], _MOST):
+            raise UserError(f"{said}: its recipe's {where}={str(value)[:30]} is too large")
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            raise UserError(f"{said}: its recipe's {where}={value} is not finite")
+    elif not (value is None or isinstance(value, bool | list)):
+        raise UserError(
+            f"{said}: its recipe's {where} is a {type(value).__name__}; only plain "
+            f"settings may stand there"
+        )
+
+
+def _without_selects(node: Any, settings: dict[str, Any]) -> Any:
+    """Return settings with `${oc.select:a.b,0}`, of older checkpoints, as a reference to a.b, or 0
+    where there is none.
+    """
+    if isinstance(node, dict):
+        return {key: _without_selects(value, settings) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_without_selects(value, settings) for value in node]
+    found = _SELECT.fullmatch(node) if isinstance(node, str) else None
+    if found is None:
+        return node
+    if _at(settings, found[1]) is not None:
+        return f"${{{found[1]}}}"
+    return None if found[2] == "null" else int(found[2])
+
+
+def _at(settings: Any, path: str) -> Any:
+    for key in path.split("."):
+        settings = settings.get(key) if isinstance(settings, dict) else None
+    return settings
+
+
+def _check_expansion(settings: dict[str, Any], said: str) -> None:
+    """Raise UserError where settings that refer to each other would never end, or grow out of
+    bounds.
+    """
+    stack, count = [(0, settings)], 0
+    while stack:
+        depth, node = stack.pop()
+        count += 1
+        if depth > 4 * _DEEPEST or count > 10 * _MOST_NODES:
+            raise UserError(f"{said}: its recipe's settings refer to each other without end")
+        if isinstance(node, dict):
+            stack += [(depth + 1, value) for value in node.values()]
+        elif isinstance(node, list):
+            stack += [(depth + 1, value) for value in node]
+        elif isinstance(node, str):
+            stack += [(depth + 1, _at(settings, name)) for name in _REFERENCE.findall(node)]

@@ -1,0 +1,108 @@
+"""Explain a run or a sweep on one HTML page."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from posefilter.cli.console import ended
+from posefilter.cli.job import Job
+from posefilter.errors import UserError
+from posefilter.paths import check_links
+from posefilter.report.comparison_page import make_comparison_page, read_two_runs
+from posefilter.report.gather import Run, read_run
+from posefilter.report.run_page import make_run_page
+from posefilter.report.settings import Change, compare_settings
+from posefilter.report.sweep_page import make_sweep_page
+from posefilter.report.sweeps import find_best_job, read_sweep
+
+FOLDERS = ("run", "runs", "sweep", "out")
+# on the command line -> in the configuration
+KEYS = {"run": "run", "runs": "runs", "sweep": "sweep_folder"}
+
+
+def spelled(arguments: Sequence[str]) -> list[str]:
+    """Return the command line as Hydra reads it: `sweep` is a group of its own, and folders may
+    have `=` and `,` in them.
+    """
+    out = []
+    for argument in arguments:
+        key, found, value = argument.partition("=")
+        if found and key in FOLDERS and value and value[0] not in "'\"" and value != "null":
+            value = "'" + value.replace("'", "\\'") + "'"
+        out.append(f"{'sweep_folder' if key == 'sweep' else key}{found}{value}")
+    return out
+
+
+def report(job: Job) -> None:
+    """Write report.html and its charts as PNGs into `out`; else into the run or sweep, or the
+    second of two runs.
+    """
+    given = {
+        key: getattr(job.cfg, name)
+        for key, name in KEYS.items()
+        if getattr(job.cfg, name) is not None
+    }
+    if len(given) != 1:
+        raise UserError(
+            "give one of run=RUN, a run's folder, sweep=DIR, a sweep's, and runs=A,B, "
+            "two runs' folders"
+        )
+    ((kind, value),) = given.items()
+    folder, command = Path(str(value)), f"python report.py {kind}={value}"
+    if kind != "runs":
+        check_links(folder)
+    if kind == "run":
+        record = read_run(folder)
+        page = make_run_page(record, compared(record), command)
+    elif kind == "runs":
+        first, second = read_two_runs(str(value))
+        check_links(first.folder)
+        check_links(second.folder)
+        page, folder = make_comparison_page(first, second, command), second.folder
+    else:
+        found = read_sweep(folder)
+        winner = folder / find_best_job(found).folder
+        best = read_run(winner) if (winner / "metrics.json").is_file() else None
+        page = make_sweep_page(found, best, compared(best) if best else None, command)
+    out = (
+        Path(job.cfg.out)
+        if job.cfg.out
+        else folder / ("comparison" if kind == "runs" else "report")
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "report.html").write_text(page.render())
+    files = page.files()
+    for name, png in files.items():
+        (out / name).write_bytes(png)
+    ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})
+
+
+def compared(run: Run) -> list[Change] | None:
+    """Return how a run's settings differ from its method's defaults; None where these can no longer
+    be composed.
+    """
+    said = [
+        f"{key}={run.choices[key]}"
+        for key in ("model", "variant")
+        if re.fullmatch(r"\w+", run.choices.get(key, ""))
+    ]
+    if not run.config:
+        return None
+    loader = GlobalHydra.instance().config_loader()
+    try:
+        default = OmegaConf.to_container(
+            loader.load_configuration("train", said, RunMode.RUN), resolve=False
+        )
+    # the run is of another version, whose choices are gone
+    except (HydraException, OmegaConfBaseException):
+        return None
+    assert isinstance(default, dict)
+    return compare_settings(
+        run.config, {str(key): value for key, value in default.items() if key != "hydra"}
+    )

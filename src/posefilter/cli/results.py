@@ -1,0 +1,77 @@
+"""Results: metrics.json, and the table on the console."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from posefilter.cli.console import JSON, Files, ended, finite, show_table
+from posefilter.cli.job import Job
+from posefilter.cli.machine import device_name, git_state, versions
+from posefilter.metrics.registry import find_metric, read_number
+
+_ROWS = (
+    "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
+    "iou", "particles_on_object", "seconds_per_image",
+)  # fmt: skip
+_TOLD = (
+    "instances",
+    "missed",
+    "add",
+    "add_s",
+    "iou",
+    "particles_on_object",
+    "seconds_per_image",
+    "belief",
+)  # to machines
+
+
+def record(
+    results: dict[str, Any], job: Job, data: dict[str, Any], checkpoint: Path | None
+) -> dict[str, Any]:
+    """Return the whole of metrics.json: what was found, and all that it takes to find it again."""
+    return {
+        **results,
+        "model": job.choices.get("model"),
+        "loss": job.choices.get("loss"),
+        "variant": job.choices.get("variant"),
+        "seed": job.cfg.get("seed"),
+        "data": data,
+        "checkpoint": str(checkpoint) if checkpoint else None,
+        "git": git_state(),
+        "device": device_name(),
+        "versions": versions(),
+        "overrides": job.overrides,
+    }
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON that any parser reads: numbers that are none become null; whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.part")
+    partial.write_text(json.dumps(finite(content), indent=2, allow_nan=False) + "\n")
+    partial.replace(path)
+
+
+def show(
+    metrics: dict[str, Any],
+    title: str,
+    console: str,
+    event: str,
+    files: Files,
+    following: Sequence[str] = (),
+) -> None:
+    """Print the table, where everything was written, and what may be typed next; for machines, all
+    of it as one line.
+    """
+    rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
+    numbers = {key: read_number(metrics, key) for key in _ROWS}
+    rows += [
+        (find_metric(key).label, find_metric(key).describe(value))
+        for key, value in numbers.items()
+        if value is not None
+    ]
+    if console != JSON:
+        show_table(title, rows)
+    told = {key: metrics[key] for key in _TOLD if key in metrics}
+    ended(console, event, files, following, title=title, **told)

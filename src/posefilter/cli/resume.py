@@ -1,0 +1,105 @@
+"""Going on with a run that was cut short: the same settings, from its last checkpoint."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from posefilter.errors import UserError
+from posefilter.paths import check_links, stays_inside
+
+_DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
+_OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
+# that a run writes to
+_PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
+_LONGEST, _MOST = 1 << 16, 1000  # of a file of overrides [bytes], and of its lines
+
+
+def run_folder(resume: str | Path) -> Path:
+    """Return the folder of a run that is given by itself or by one of its checkpoints."""
+    path = Path(resume)
+    folder = path.parent.parent if path.suffix == ".ckpt" else path
+    if not (folder / ".hydra" / "overrides.yaml").is_file():
+        raise UserError(
+            f"resume={resume}: not a run's folder (no .hydra/overrides.yaml in {folder})"
+        )
+    return folder
+
+
+def last_checkpoint(resume: str | Path) -> Path:
+    """Return the checkpoint to go on from.  Raises UserError where there is none."""
+    path = Path(resume)
+    path = path if path.suffix == ".ckpt" else path / "checkpoints" / "last.ckpt"
+    if not path.is_file():
+        raise UserError(
+            f"resume={resume}: no {path}; the run was stopped before its first "
+            f"checkpoint: start it anew"
+        )
+    return path
+
+
+def with_resumed(arguments: list[str]) -> list[str]:
+    """Put the resumed run's own overrides ahead of the command line's, so that these may still
+    change a thing.
+    """
+    given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
+    if not given or given[-1] in ("", "null"):
+        return arguments
+    folder = run_folder(given[-1])
+    last_checkpoint(given[-1])
+    check_links(folder)
+    named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
+    kept = [o for o in overrides_of(folder) if _key(o) not in named and _key(o) not in _DROPPED]
+    for override in kept:
+        check_override(override, folder)
+    return [*kept, *arguments, f"out={folder}"]
+
+
+def overrides_of(folder: Path) -> list[str]:
+    """Return what was typed to start a run.  Raises UserError where its record is damaged."""
+    file = folder / ".hydra" / "overrides.yaml"
+    try:
+        before: Any = yaml.safe_load(file.read_text()) if file.stat().st_size <= _LONGEST else None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError):
+        before = None
+    before = [] if before == [] else before
+    if not (
+        isinstance(before, list)
+        and len(before) <= _MOST
+        and all(isinstance(one, str) for one in before)
+    ):
+        raise UserError(f"{file}: should be a list of settings, as train.py writes it")
+    return before
+
+
+def check_override(override: str, folder: Path) -> None:
+    """Raise UserError where a setting that a run's folder brings is one that only the user may
+    type.
+
+    Such are Hydra's own, interpolations that call something, and places outside of the working
+    folder.
+    """
+    found = _OVERRIDE.fullmatch(override)
+    if found is None or not override.isprintable() or re.match(r"hydra\b", found[2]):
+        raise UserError(
+            f"resume={folder}: {override[:80]!r} in its .hydra/overrides.yaml is no "
+            f"setting of a training"
+        )
+    key, value = found[2], (found[3] or "").strip("'\"")
+    if re.search(r"\$\{[^}]*:", value):
+        raise UserError(
+            f"resume={folder}: its {key} calls a function; if that is right, type "
+            f"{key}=... yourself"
+        )
+    words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
+    place = key.rpartition(".")[2] in _PLACES and value not in ("", "null")
+    if place or not all(stays_inside(word, Path()) for word in words):
+        raise UserError(
+            f"resume={folder}: its {key}={value} lies outside of the working folder; if it is "
+            f"right, type it as well"
+        )
+
+
+def _key(override: str) -> str:
+    return override.split("=", 1)[0].lstrip("+~")

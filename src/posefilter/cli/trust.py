@@ -1,0 +1,173 @@
+"""What a `_target_` may name: an explicit list, and the plug-ins that the user trusts.
+
+A name is allowed before its module is imported, and must then be defined where it is named, so that
+nothing is reached through another module's imports (`posefilter.cli.command.os.system`). There are
+two scopes. `CONFIG` is for settings that the user composes: components, data, callbacks, the
+trainer and loggers. `RECIPE` is for settings that a checkpoint carries: components alone, the
+pieces that a method is made of. They are classes that compute; none writes a file or starts a
+process.
+
+A plug-in is trusted by the user alone: `plugins=[my_package]` on the command line,
+`trust("my_package")` in Python, or an installed distribution with an entry point of the group
+`posefilter.plugins`. What is trusted may be built in both scopes.
+"""
+
+import sys
+from enum import Enum
+from functools import cache
+from importlib.metadata import entry_points
+
+from posefilter.errors import UserError
+
+ENTRY_POINTS = "posefilter.plugins"
+# packages of posefilter whose classes a recipe may name
+COMPONENTS = ("filters", "labels", "losses", "models", "nets")
+# packages of posefilter whose classes the user's own settings may name as well
+_LOOKING = ("callbacks",)
+_OPTIMIZERS = (
+    "ASGD",
+    "Adadelta",
+    "Adagrad",
+    "Adam",
+    "AdamW",
+    "Adamax",
+    "NAdam",
+    "RAdam",
+    "RMSprop",
+    "Rprop",
+    "SGD",
+)
+_LAYERS = ("ELU", "GELU", "Identity", "LeakyReLU", "Linear", "ReLU", "SiLU", "Tanh")
+_SCHEDULES = (
+    "ConstantLR",
+    "CosineAnnealingLR",
+    "ExponentialLR",
+    "LinearLR",
+    "MultiStepLR",
+    "OneCycleLR",
+    "StepLR",
+)
+_RECIPE_NAMES = frozenset(
+    {
+        "posefilter.models.schedules.warm_cosine",
+        *(f"torch.optim.{name}" for name in _OPTIMIZERS),
+        *(f"torch.optim.lr_scheduler.{name}" for name in _SCHEDULES),
+        *(f"torch.nn.{name}" for name in _LAYERS),
+    }
+)
+DATA_NAMES = frozenset(
+    {"posefilter.data.module.PoseDataModule", "posefilter.synthetic.generate.generate"}
+)
+_AUGMENTATIONS = ("posefilter.data.augmentation", "posefilter.data.photometric")
+_CALLBACKS = (
+    "DeviceStatsMonitor",
+    "EarlyStopping",
+    "LearningRateMonitor",
+    "ModelCheckpoint",
+    "ModelSummary",
+    "Timer",
+)
+_LOGGERS = ("CSVLogger", "MLFlowLogger", "TensorBoardLogger", "WandbLogger")
+_PROFILERS = ("AdvancedProfiler", "PyTorchProfiler", "SimpleProfiler")
+_CONFIG_NAMES = _RECIPE_NAMES | DATA_NAMES | {
+    "lightning.Trainer",
+    "posefilter.cli.best.Best",
+    "posefilter.cli.best.Last",
+    *(f"lightning.pytorch.callbacks.{name}" for name in _CALLBACKS),
+    *(f"lightning.pytorch.loggers.{name}" for name in _LOGGERS),
+    *(f"lightning.pytorch.profilers.{name}" for name in _PROFILERS),
+}  # fmt: skip
+_trusted: set[str] = set()
+
+
+class Scope(Enum):
+    """Where a `_target_` stands: in the user's own settings, or in those that a checkpoint carries."""
+
+    CONFIG = "your settings"
+    RECIPE = "a checkpoint"
+
+
+def trust(package: str) -> None:
+    """Let settings, and recipes of checkpoints, name what a plug-in package defines, until this
+    process ends.
+
+    Args:
+        package: The dotted name of the package; it is not imported yet.
+
+    Raises:
+        UserError: The name is none, or one of the standard library, posefilter, torch or lightning.
+    """
+    parts = package.split(".") if isinstance(package, str) else [""]
+    if not all(part.isidentifier() for part in parts):
+        raise UserError(f"plugins={package!r}: not the name of a package")
+    if parts[0] in sys.stdlib_module_names or parts[0] in (
+        "hydra",
+        "lightning",
+        "omegaconf",
+        "posefilter",
+        "torch",
+    ):
+        raise UserError(f"plugins={package}: only a package of your own can be a plug-in")
+    _trusted.add(package)
+
+
+def trusted() -> frozenset[str]:
+    """Return the plug-ins that the user trusts, installed ones included."""
+    return frozenset(_trusted) | _installed()
+
+
+@cache
+def _installed() -> frozenset[str]:
+    return frozenset(point.value.partition(":")[0] for point in entry_points(group=ENTRY_POINTS))
+
+
+def is_plugin(name: str) -> bool:
+    """Tell whether a dotted name lies in a plug-in that the user trusts."""
+    return any(name.startswith(f"{package}.") for package in trusted())
+
+
+def is_listed(name: str, scope: Scope) -> bool:
+    """Tell whether a dotted name is in the explicit list of a scope."""
+    return name in (_CONFIG_NAMES if scope is Scope.CONFIG else _RECIPE_NAMES)
+
+
+def is_component(module: str, scope: Scope) -> bool:
+    """Tell whether the classes that a module of posefilter defines may be built in a scope."""
+    top, _, rest = module.partition(".")
+    packages = COMPONENTS if scope is Scope.RECIPE else (*COMPONENTS, *_LOOKING)
+    own = top == "posefilter" and rest.split(".")[0] in packages and "." in rest
+    return own or (scope is Scope.CONFIG and module in _AUGMENTATIONS)
+
+
+def check_name(name: str, where: str, scope: Scope) -> None:
+    """Raise UserError unless a dotted name may be built in a scope, before anything is imported."""
+    module = name.rpartition(".")[0]
+    plain = all(
+        part.isidentifier() and part.isascii() and not part.startswith("_")
+        for part in name.split(".")
+    )
+    if plain and (
+        is_listed(name, scope)
+        or is_component(module, scope)
+        or is_listed_module(module)
+        or is_plugin(name)
+    ):
+        return
+    raise UserError(
+        f"{where}._target_={name[:100]!r}: may not be built from {scope.value}; allowed are "
+        f"posefilter's own components, "
+        "a list of torch and lightning classes, and packages that you trust: plugins=[...]"
+    )
+
+
+def is_listed_module(module: str) -> bool:
+    """Tell whether a module has names in the list: a misspelt one may then be told (it is built
+    only if listed itself).
+    """
+    return any(name.rpartition(".")[0] == module for name in _RECIPE_NAMES)
+
+
+def listed_in(module: str, scope: Scope) -> list[str]:
+    """Return the names of a module that are in the explicit list of a scope."""
+    names = _CONFIG_NAMES if scope is Scope.CONFIG else _RECIPE_NAMES
+    return sorted(name.rpartition(".")[2] for name in names if name.rpartition(".")[0] == module)

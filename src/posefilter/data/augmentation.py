@@ -1,0 +1,233 @@
+"""Augmentation of one training sample.  Every operation is exact: the pose, the intrinsics and the
+mask stay true.
+
+Operations are small callables `(Sample, draw, rng) -> Sample`, composed by `Compose`; `draw(rng)`
+returns another training sample, from which occluders are cut. All randomness comes from the numpy
+Generator handed in.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from numpy.random import Generator
+
+from posefilter.data.frames import Sample
+
+Draw = Callable[[Generator], Sample]
+Augment = Callable[[Sample, Draw, Generator], Sample]
+
+
+@dataclasses.dataclass(frozen=True)
+class Compose:
+    """Apply augmentations one after another."""
+
+    steps: Sequence[Augment]
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample after every step."""
+        for step in self.steps:
+            sample = step(sample, draw, rng)
+        return sample
+
+
+@dataclasses.dataclass(frozen=True)
+class RollAndZoom:
+    """Turn the camera about its optical axis and change its focal length: both are exact for RGB-D
+    images.
+
+    roll: spread of the usual roll [rad]; any_roll: share of samples with a uniform roll; zoom:
+    range of the factor on the focal length. A draw that would push most of the object out of the
+    frame is given up.
+    """
+
+    roll: float = 0.15
+    any_roll: float = 0.25
+    zoom: tuple[float, float] = (0.75, 1.3)
+    keep: float = 0.7
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample as the turned and zoomed camera sees it."""
+        angle = (
+            rng.uniform(-np.pi, np.pi) if rng.random() < self.any_roll else rng.normal() * self.roll
+        )
+        zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
+        c, s = np.cos(angle), np.sin(angle)
+        K = sample.intrinsics.astype(np.float64)
+        K_new = np.diag([zoom, zoom, 1.0]) @ K
+        K_new[:2, 2] = K[:2, 2]
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        warp = (K_new @ turn @ np.linalg.inv(K))[:2]
+        size = sample.mask.shape[::-1]
+        mask = cv2.warpAffine(sample.mask.astype(np.uint8), warp, size, flags=cv2.INTER_NEAREST) > 0
+        if mask.sum() < self.keep * sample.mask.sum() * min(zoom * zoom, 1.0):
+            return sample
+        fill = tuple(float(x) for x in rng.integers(0, 256, 3))
+        pose = sample.camera_from_object.astype(np.float64).copy()
+        pose[:3] = turn @ pose[:3]
+        return dataclasses.replace(
+            sample,
+            rgb=cv2.warpAffine(sample.rgb, warp, size, flags=cv2.INTER_LINEAR, borderValue=fill),
+            depth=cv2.warpAffine(sample.depth, warp, size, flags=cv2.INTER_NEAREST),
+            mask=mask,
+            intrinsics=K_new.astype(np.float32),
+            camera_from_object=pose.astype(np.float32),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """Cut a window of the image: most show the object, at any place in them; the rest are drawn
+    from anywhere.
+
+    A network that reads whole images learns as well from windows, and several times as fast.
+    size: (height, width) [px], multiples of 32; anywhere: share drawn without regard to the object.
+    """
+
+    size: tuple[int, int] = (160, 192)
+    anywhere: float = 0.1
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample as a camera with a smaller chip sees it."""
+        height, width = sample.mask.shape
+        h, w = min(self.size[0], height), min(self.size[1], width)
+        top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
+        rows, cols = np.nonzero(sample.mask)
+        if len(rows) and rng.random() >= self.anywhere:
+            at = rng.integers(len(rows))
+            top = int(np.clip(rows[at] - rng.integers(h // 8, h - h // 8), 0, height - h))
+            left = int(np.clip(cols[at] - rng.integers(w // 8, w - w // 8), 0, width - w))
+        cut = np.s_[top : top + h, left : left + w]
+        K = sample.intrinsics.copy()
+        K[:2, 2] -= (left, top)
+        return dataclasses.replace(
+            sample,
+            rgb=sample.rgb[cut].copy(),
+            depth=sample.depth[cut].copy(),
+            mask=sample.mask[cut].copy(),
+            intrinsics=K,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class PasteOccluder:
+    """Put a curved patch, cut from another image, in front of the object.
+
+    Leaves at least `keep` of the object's pixels; size in shares of the image width.
+    """
+
+    probability: float = 0.6
+    size: tuple[float, float] = (0.04, 0.18)
+    keep: float = 0.25
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample with the occluder's color and depth pasted in and the mask cut."""
+        if rng.random() >= self.probability:
+            return sample
+        rows, cols = np.nonzero(sample.mask)
+        if len(rows) == 0:
+            return sample
+        height, width = sample.mask.shape
+        at = rng.integers(len(rows))
+        half_w, half_h = rng.uniform(*self.size, 2) * width
+        angle = rng.uniform(0, np.pi)
+        reach = int(np.hypot(half_w, half_h)) + 1  # only so much of the image can change
+        top, left = max(rows[at] - reach, 0), max(cols[at] - reach, 0)
+        cut = np.s_[
+            top : min(rows[at] + reach + 1, height), left : min(cols[at] + reach + 1, width)
+        ]
+        down, right = np.mgrid[cut].astype(np.float32)
+        right, down = right - cols[at], down - rows[at]
+        a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
+        b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
+        patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
+        mask = sample.mask.copy()
+        mask[cut] &= ~patch
+        if mask.sum() < self.keep * sample.mask.sum():
+            return sample
+        distance = sample.camera_from_object[2, 3] * rng.uniform(0.72, 0.94)
+        surface = distance * (1 - 0.05 * (1 - a * a) + 0.03 * b * rng.normal())
+        # drawn samples have the size of whole images, as this one
+        other = jitter_color(draw(rng).rgb[cut], rng, 1.0)
+        rgb, depth = sample.rgb.copy(), sample.depth.copy()
+        rgb[cut][patch], depth[cut][patch] = other[patch], surface[patch]
+        visibility = float(sample.visibility * mask.sum() / sample.mask.sum())
+        return dataclasses.replace(sample, rgb=rgb, depth=depth, mask=mask, visibility=visibility)
+
+
+@dataclasses.dataclass(frozen=True)
+class Blank:
+    """Lose rectangles of depth (holes) or paint rectangles of color (stickers, glare)."""
+
+    most: int = 5
+    size: tuple[float, float] = (0.02, 0.18)
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample with up to `most` rectangles blanked."""
+        rgb, depth = sample.rgb.copy(), sample.depth.copy()
+        height, width = depth.shape
+        for _ in range(rng.integers(0, self.most + 1)):
+            h, w = (rng.uniform(*self.size, 2) * width).astype(int) + 1
+            top, left = rng.integers(height), rng.integers(width)
+            if rng.random() < 0.5:
+                depth[top : top + h, left : left + w] = 0
+            else:
+                rgb[top : top + h // 2 + 1, left : left + w // 2 + 1] = rng.integers(0, 256, 3)
+        return dataclasses.replace(sample, rgb=rgb, depth=depth)
+
+
+@dataclasses.dataclass(frozen=True)
+class DepthNoise:
+    """Scale and shift depth as a badly calibrated sensor does, and add noise that grows with z
+    squared.
+    """
+
+    scale: float = 0.004
+    noise: float = 0.0015  # [1/m]: standard deviation at 1 m, in meters
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample with noisy depth; unknown pixels stay unknown."""
+        d = sample.depth
+        coarse = rng.standard_normal((d.shape[0] // 2, d.shape[1] // 2), dtype=np.float32)
+        grain = cv2.resize(coarse, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        factor, noise = (
+            np.float32(1 + rng.normal() * self.scale),
+            np.float32(self.noise * rng.uniform()),
+        )
+        # 0, unknown, stays 0
+        return dataclasses.replace(sample, depth=d * (factor + d * grain * noise))
+
+
+@dataclasses.dataclass(frozen=True)
+class Color:
+    """Jitter white balance, exposure, gamma, contrast and saturation, blur and add noise; strength
+    1 is strong.
+    """
+
+    strength: float = 1.0
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample under another camera and light."""
+        return dataclasses.replace(sample, rgb=jitter_color(sample.rgb, rng, self.strength))
+
+
+def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray:
+    """Return the image (H, W, 3) uint8 as another camera under another light would have taken it."""
+    k = strength
+    gain = np.exp(rng.normal(size=3) * 0.1 * k + rng.normal() * 0.25 * k)
+    gamma = np.exp(rng.normal() * 0.2 * k)
+    contrast = np.exp(rng.normal() * 0.25 * k)
+    saturation = np.exp(rng.normal() * 0.3 * k)
+    levels = np.arange(256) / 255.0
+    curves = [0.5 + (np.clip(levels * g, 1e-4, 1) ** gamma - 0.5) * contrast for g in gain]
+    table = (np.clip(np.stack(curves, -1), 0, 1) * 255).astype(np.uint8)[None]
+    # towards or away from the gray of each pixel
+    mix = np.eye(3) * saturation + (1 - saturation) / 3
+    out = cv2.transform(cv2.LUT(rgb, table).astype(np.float32), mix)
+    if rng.random() < 0.4 * k:
+        out = cv2.GaussianBlur(out, (0, 0), rng.uniform(0.3, 1.1))
+    if rng.random() < 0.5:
+        each, common = (rng.standard_normal((*rgb.shape[:2], n), dtype=np.float32) for n in (3, 1))
+        out = out + (each + common) * np.float32(0.7 * 255 * 0.06 * k * rng.random() ** 2)
+    return np.clip(out, 0, 255).astype(np.uint8)

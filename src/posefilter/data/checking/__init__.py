@@ -1,0 +1,1 @@
+"""Check whether a dataset fits its meshes."""

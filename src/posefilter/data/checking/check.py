@@ -1,0 +1,187 @@
+"""Tell whether a dataset fits its meshes: render its own truth, and compare with its masks and its
+depth.
+"""
+
+import io
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from posefilter.data.checking.compare import Fit, View, compare, half_pixel, likely_causes
+from posefilter.data.checking.contact_figure import tile, write_sheet
+from posefilter.data.frames import NotShown, Reader
+from posefilter.data.silhouette import Geometry
+from posefilter.errors import BadData, UserError
+from posefilter.meshes.store import MeshStore
+from posefilter.progress import watched
+
+LEAST_IOU = 0.95
+# a depth error is a problem above 5 mm and above 0.8 % of the distance
+_DEPTH_MM, _DEPTH_SHARE = 5.0, 0.008
+_TRIED = 5  # frames on which causes are tried
+_TILES = 12  # on the contact sheet
+
+
+def check_dataset(
+    reader: Reader,
+    meshes: MeshStore,
+    limit: int = 50,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Compare up to `limit` frames of each of a reader's objects with its mesh.
+
+    Returns `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm",
+    "visible_share"}], "problems": [...]}`, medians all; None stands for what could not be measured.
+    Problems are sentences that name the likely cause. `out` gets data_report.json and
+    contact_sheet.png. Broken files are reported, not raised; open the reader with on_error="skip".
+    """
+    if limit < 1:
+        raise UserError(f"limit={limit}: compare at least one frame of each object")
+    geometry = Geometry(meshes)
+    problems = [
+        f"{reader.examples.get(cause, cause)} ({count} such)"
+        for cause, count in reader.skipped.items()
+    ]
+    rows, tiles = [], []
+    share = max(1, _TILES // max(len(reader.objects), 1))
+    for name in reader.objects:
+        row, found, drawn = _check_object(reader, geometry, name, limit, share, progress)
+        rows.append(row)
+        problems += found
+        tiles += drawn
+    report = {"objects": rows, "problems": problems}
+    if out is not None:
+        folder = Path(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "data_report.json").write_text(json.dumps(report, indent=2) + "\n")
+        if tiles:
+            write_sheet(folder / "contact_sheet.png", tiles)
+    return report
+
+
+def format_report(report: dict[str, Any]) -> str:
+    """Return the report as a table, and its problems below."""
+    table = Table("object", "frames", "silhouette IoU", r"depth error \[mm]", "visible share")
+    for row in report["objects"]:
+        numbers = (
+            _text(row["silhouette_iou"], 3),
+            _text(row["depth_error_mm"], 1),
+            _text(row["visible_share"], 2),
+        )
+        table.add_row(row["object"], str(row["frames"]), *numbers)
+    console = Console(width=110, record=True, file=io.StringIO(), color_system=None)
+    console.print(table)
+    lines = [f"  - {problem}" for problem in report["problems"]]
+    return console.export_text() + (
+        "\n".join(["problems:", *lines]) if lines else "no problems found"
+    )
+
+
+def _check_object(
+    reader: Reader, geometry: Geometry, name: str, limit: int, drawn: int, progress: bool
+) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
+    """Return an object's row, its problems and its tiles."""
+    mine = [i for i, record in enumerate(reader.records()) if record.object == name]
+    mesh = geometry.mesh(name)
+    if mesh is None:
+        return _row(name, 0, []), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
+    native = reader.native_from_mesh(name)
+    chosen = (
+        [
+            mine[k]
+            for k in np.unique(np.linspace(0, len(mine) - 1, min(limit, len(mine))).astype(int))
+        ]
+        if mine
+        else []
+    )
+    broken: Counter[str] = Counter()
+    examples: dict[str, str] = {}
+    views: list[View] = []
+    fits: list[Fit] = []
+    tiles: list[np.ndarray] = []
+    for i in watched(chosen, name, progress):
+        try:
+            view = View(reader.read(i), reader.others(i), mesh, native)
+        except NotShown:
+            continue
+        except BadData as error:
+            broken[error.cause] += 1
+            examples.setdefault(error.cause, str(error))
+            continue
+        fit = compare(view, geometry)
+        fits.append(fit)
+        if len(views) < _TRIED:
+            views.append(view)
+        if len(tiles) < drawn:
+            tiles.append(tile(view, fit, f"{reader.records()[i].name} {name}"))
+    problems = [
+        f"{examples[cause]} ({count} such of {len(chosen)} frames looked at)"
+        for cause, count in broken.items()
+    ]
+    row = _row(name, len(fits), fits)
+    return (
+        row,
+        problems + (_judge(row, views, fits, geometry) if fits else [f"{name}: no frame shows it"]),
+        tiles,
+    )
+
+
+def _judge(
+    row: dict[str, Any], views: Sequence[View], fits: Sequence[Fit], geometry: Geometry
+) -> list[str]:
+    """Return what is wrong with an object's frames, and the likely cause."""
+    name, iou, error = row["object"], row["silhouette_iou"], row["depth_error_mm"]
+    tried = float(np.median([fit.iou for fit in fits[: len(views)]]))
+    distance = float(
+        np.median(
+            [
+                np.median(fit.rendered[fit.rendered > 0]) if (fit.rendered > 0).any() else 1
+                for fit in fits
+            ]
+        )
+    )
+    bad_depth = error is not None and error > max(_DEPTH_MM, _DEPTH_SHARE * distance * 1000)
+    if iou < LEAST_IOU or bad_depth:
+        causes = likely_causes(views, geometry, tried)
+        if causes:
+            return [f"{name}: {cause}" for cause in causes]
+    slip = half_pixel(views, geometry, tried)
+    if slip:
+        return [f"{name}: {slip}"]
+    problems = []
+    if iou < LEAST_IOU:
+        problems.append(
+            f"{name}: silhouette IoU {iou:.3f}, below {LEAST_IOU}; no cause that was "
+            f"tried explains it"
+        )
+    if bad_depth:
+        problems.append(
+            f"{name}: depth is {error:.0f} mm off (median); no cause that was tried explains it"
+        )
+    return problems
+
+
+def _row(name: str, frames: int, fits: Sequence[Fit]) -> dict[str, Any]:
+    return {
+        "object": name,
+        "frames": frames,
+        "silhouette_iou": _median([fit.iou for fit in fits]),
+        "depth_error_mm": _median([fit.depth_error_mm for fit in fits]),
+        "visible_share": _median([fit.visible_share for fit in fits]),
+    }
+
+
+def _median(values: Sequence[float]) -> float | None:
+    known = [value for value in values if np.isfinite(value)]
+    return round(float(np.median(known)), 4) if known else None
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

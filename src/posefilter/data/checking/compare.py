@@ -1,0 +1,264 @@
+"""Compare what a dataset says of an object with what its mesh says, and look for the cause where
+they disagree.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from posefilter.data.frames import Sample
+from posefilter.data.silhouette import Geometry
+from posefilter.meshes import ycb
+from posefilter.meshes.store import Mesh
+
+IN_FRONT = 0.015  # [m] nearer than the rendered surface by this: something else is seen there
+_RATIO_TOLERANCE = 0.05
+# of pictures whose intrinsics may have been mixed up
+_WIDTHS = (160, 320, 480, 640, 720, 960, 1280, 1920)
+_POWERS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
+_UNITS = {0.001: "are in millimeters", 0.01: "are in centimeters", 0.1: "are in decimetres"}
+
+
+@dataclass(frozen=True)
+class View:
+    """One record as it was read, with the mesh that should be in it."""
+
+    sample: Sample
+    others: np.ndarray  # (H, W) bool, labeled as something else
+    mesh: Mesh
+    native_from_mesh: np.ndarray  # (4, 4) [m]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well mesh and frame agree."""
+
+    rendered: np.ndarray  # (H, W) [m], 0 where the mesh is not
+    iou: float  # of the silhouettes, where the label can tell
+    depth_error_mm: float  # median of the absolute difference, NaN without a common pixel
+    depth_ratio: float  # median of measured over rendered depth, NaN without a common pixel
+    ratio_spread: float  # half the width of its middle half
+    visible_share: float
+
+
+Change = Callable[[View], tuple[np.ndarray, np.ndarray]]  # -> camera_from_object (4, 4), K (3, 3)
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Something that may be wrong with a dataset: undo it, and mesh and frame agree."""
+
+    words: str
+    undo: Change
+
+
+def compare(
+    view: View, geometry: Geometry, pose: np.ndarray | None = None, K: np.ndarray | None = None
+) -> Fit:
+    """Render the mesh at a pose (the record's) by a camera (the record's) and compare with mask and
+    depth.
+
+    Silhouettes are compared where the label can tell: not where another object is labeled, nor
+    where the measured depth lies clearly in front of the mesh (provided that depth is to scale at
+    all).
+    """
+    sample = view.sample
+    pose = sample.camera_from_object if pose is None else pose
+    height, width = sample.mask.shape
+    depth, _ = geometry.render(
+        [view.mesh], [pose], sample.intrinsics if K is None else K, (height, width)
+    )
+    silhouette = depth > 0
+    both = silhouette & sample.mask & (sample.depth > 0)
+    error = ratio = spread = float("nan")
+    if both.any():
+        ratios = sample.depth[both] / depth[both]
+        low, ratio, high = (float(x) for x in np.percentile(ratios, [25, 50, 75]))
+        spread = (high - low) / 2
+        error = float(np.median(np.abs(sample.depth[both] - depth[both]))) * 1000
+    hidden = view.others & ~sample.mask
+    if abs(ratio - 1) < _RATIO_TOLERANCE:
+        hidden |= ~sample.mask & (sample.depth > 0) & (sample.depth < depth - IN_FRONT)
+    union = (silhouette | sample.mask) & ~hidden
+    common = silhouette & sample.mask
+    iou = float(common.sum() / union.sum()) if union.any() else 0.0
+    share = min(float(sample.mask.sum() / silhouette.sum()), 1.0) if silhouette.any() else 0.0
+    return Fit(depth, iou, error, ratio, spread, share)
+
+
+def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> list[str]:
+    """Return in words what is probably wrong with poses, frames, intrinsics and depth; `before`:
+    the median IoU as it is.
+    """
+    fits = [
+        [compare(view, geometry, *cause.undo(view)) for view in views] for cause in causes(views[0])
+    ]
+    scores = [float(np.median([fit.iou for fit in each])) for each in fits]
+    best = int(np.argmax(scores))
+    as_read = [compare(view, geometry) for view in views]
+    found, judged = [], as_read
+    if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > 0.7:
+        found.append(
+            f"{causes(views[0])[best].words} (silhouette IoU {before:.2f}, with that "
+            f"undone {scores[best]:.2f})"
+        )
+        judged = fits[best]
+    return found + _depth_scale(judged)
+
+
+def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str | None:
+    """Tell whether the principal point is off by half a pixel: the misfit of the outline must then
+    nearly vanish.
+    """
+    for shift in (0.5, -0.5):
+        after = float(
+            np.median(
+                [
+                    compare(v, geometry, None, _shifted(v.sample.intrinsics, shift)).iou
+                    for v in views
+                ]
+            )
+        )
+        if 1 - after < 0.4 * (1 - before) and after - before > 0.004:
+            corner = (
+                "pixel corners, not centers, have whole numbers"
+                if shift < 0
+                else "half a pixel was taken off twice"
+            )
+            ious = f"silhouette IoU {before:.3f}, corrected {after:.3f}"
+            return f"the principal point is off by {-shift:+.1f} px: {corner} ({ious})"
+    return None
+
+
+def causes(view: View) -> list[Cause]:
+    """Return every cause that is tried, with how to undo it."""
+    out = [
+        Cause(f"translations {_UNITS.get(k, f'are too small by a factor of {k:g}')}", _scaled(k))
+        for k in _POWERS
+    ]
+    out += [
+        Cause(
+            "poses are the wrong way round (object from camera)",
+            lambda v: (_inverse(v), v.sample.intrinsics),
+        ),
+        Cause("rotations are transposed", lambda v: (_transposed(v), v.sample.intrinsics)),
+        Cause(
+            "poses are in OpenGL's camera axes (y up, z backward)",
+            lambda v: (_opengl(v), v.sample.intrinsics),
+        ),
+    ]
+    out += [Cause(words, _reframed(step)) for words, step in _frames(view)]
+    width = view.sample.mask.shape[1]
+    for other in _WIDTHS:
+        if other != width:
+            out.append(
+                Cause(
+                    f"intrinsics belong to pictures {other} px wide, not {width}",
+                    _resized(width / other),
+                )
+            )
+    return out
+
+
+def _depth_scale(fits: Sequence[Fit]) -> list[str]:
+    """Return what is wrong with the scale of depth, where silhouettes agree."""
+    good = [fit for fit in fits if fit.iou > 0.7 and np.isfinite(fit.depth_ratio)]
+    if not good:
+        return []
+    ratio = float(np.median([fit.depth_ratio for fit in good]))
+    spread = float(np.median([fit.ratio_spread for fit in good]))
+    if abs(ratio - 1) < 0.02 or spread > 0.1 * ratio:
+        return []
+    power = next((p for p in _POWERS if abs(ratio / p - 1) < 0.1), None)
+    number = f"{power:g}" if power else f"{ratio:.3g}"
+    return [
+        f"depth is {number} times what the mesh says: correct the depth scale by "
+        f"{1 / (power or ratio):.3g}"
+    ]
+
+
+def _frames(view: View) -> list[tuple[str, np.ndarray]]:
+    """Return frames that may have been mixed up: words, and mesh_from_supposed."""
+    native = view.native_from_mesh
+    out = []
+    if not np.allclose(native, np.eye(4)):
+        out.append(
+            (
+                "poses are of the mesh file's frame already, not of the dataset's own",
+                np.linalg.inv(native),
+            )
+        )
+        out.append(
+            (
+                "the dataset's object frame was applied the wrong way round",
+                np.linalg.inv(native) @ np.linalg.inv(native),
+            )
+        )
+    if view.mesh.name in ycb.CLASSES and view.mesh.name not in ycb.WITHOUT_GEOMETRY:
+        step = ycb.ycbvideo_from_original(view.mesh.name)
+        out.append(
+            ("poses are of YCB-Video's object frame, meshes in the original (google_16k) one", step)
+        )
+        out.append(
+            (
+                "poses are of the original (google_16k) frame, meshes in YCB-Video's",
+                np.linalg.inv(step),
+            )
+        )
+    center = np.eye(4)
+    center[:3, 3] = -view.mesh.box_head.mean(0)
+    out.append(
+        (
+            "poses are of a frame at the center of the bounding box (as BOP's), the mesh has "
+            "another origin",
+            center,
+        )
+    )
+    return out
+
+
+def _scaled(factor: float) -> Change:
+    def undo(view: View) -> tuple[np.ndarray, np.ndarray]:
+        # the reader's pose is camera_from_native @ native_from_mesh: the factor sits in the first
+        # only
+        camera_from_native = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
+        camera_from_native[:3, 3] *= factor
+        return camera_from_native @ view.native_from_mesh, view.sample.intrinsics
+
+    return undo
+
+
+def _reframed(step: np.ndarray) -> Change:
+    return lambda view: (view.sample.camera_from_object @ step, view.sample.intrinsics)
+
+
+def _resized(scale: float) -> Change:
+    def undo(view: View) -> tuple[np.ndarray, np.ndarray]:
+        K = view.sample.intrinsics.astype(np.float64).copy()
+        K[:2] *= scale
+        K[:2, 2] += (scale - 1) / 2
+        return view.sample.camera_from_object, K
+
+    return undo
+
+
+def _inverse(view: View) -> np.ndarray:
+    camera_from_native = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
+    return np.linalg.inv(camera_from_native) @ view.native_from_mesh
+
+
+def _transposed(view: View) -> np.ndarray:
+    pose = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
+    pose[:3, :3] = pose[:3, :3].T.copy()
+    return pose @ view.native_from_mesh
+
+
+def _opengl(view: View) -> np.ndarray:
+    return np.diag([1.0, -1.0, -1.0, 1.0]) @ view.sample.camera_from_object
+
+
+def _shifted(K: np.ndarray, shift: float) -> np.ndarray:
+    out = K.copy()
+    out[:2, 2] += shift
+    return out

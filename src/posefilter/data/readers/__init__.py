@@ -1,0 +1,1 @@
+"""Readers of FAT, YCB-Video and BOP datasets."""

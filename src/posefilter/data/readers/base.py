@@ -1,0 +1,75 @@
+"""What all readers share: counting what they leave out, and asking meshes about masks."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.silhouette import Geometry
+from posefilter.errors import BadData
+from posefilter.meshes.store import BUILTIN, MeshStore
+from posefilter.paths import check_inside
+
+
+class BaseReader:
+    """A dataset on disk whose classes are `objects`."""
+
+    objects: tuple[str, ...]
+
+    def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
+        self.root, self.on_error = Path(root), on_error
+        self.skipped: Counter[str] = Counter()
+        self.examples: dict[str, str] = {}  # of each reason to skip, the first message
+        self.notes: Counter[str] = Counter()
+        self._geometry = None if meshes is None else Geometry(meshes)
+
+    def visible_share(self, sample: Sample) -> float:
+        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
+        return (
+            float("nan")
+            if self._geometry is None
+            else self._geometry.visible_share(self.objects[sample.object_id], sample)
+        )
+
+    def _files(self, record: FrameRecord) -> tuple[Path, ...]:
+        """Return a record's files.
+
+        Raises UserError where one is a link that leads out of the dataset.
+        """
+        return tuple(check_inside(path, self.root) for path in record.files)
+
+    def _leave_out(self, error: BadData) -> None:
+        """Count a broken frame, or raise its error."""
+        if self.on_error != "skip":
+            raise error
+        self.skipped[error.cause] += 1
+        self.examples.setdefault(error.cause, str(error))
+
+    def _distrust_builtin(self) -> None:
+        """Take no silhouettes from builtin meshes: they are not the objects of real photographs."""
+        if self._geometry is not None and str(self._geometry.meshes.root) == BUILTIN:
+            self._geometry = None
+            self.notes[
+                "builtin meshes are not the objects of these photographs: visibility stays unknown"
+            ] = 1
+
+    def _instance(
+        self,
+        name: str,
+        poses: tuple[np.ndarray, ...],
+        which: int,
+        K: np.ndarray,
+        mask: np.ndarray,
+        path: Path,
+    ) -> np.ndarray:
+        """Return one instance's part of a mask that several instances of a class share.
+
+        Raises BadData without a mesh.
+        """
+        parts = None if self._geometry is None else self._geometry.instances(name, poses, K, mask)
+        if parts is None:
+            raise BadData(
+                path, "two instances of one class, and no mesh that fits to tell them apart", name
+            )
+        return parts[which]

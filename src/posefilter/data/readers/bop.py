@@ -1,0 +1,260 @@
+"""Read datasets in BOP's format: millimeters, objects by number, one mask an instance."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from posefilter.data.frames import FrameRecord, NotShown, Sample
+from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.decode import (
+    expect_size,
+    need,
+    numbers,
+    read_color,
+    read_depth,
+    read_json,
+    read_label,
+)
+from posefilter.data.readers.naming import choose_objects
+from posefilter.errors import BadData, UserError
+from posefilter.geometry.pose import is_rigid
+from posefilter.meshes import ycb
+from posefilter.meshes.store import MeshStore
+from posefilter.paths import check_inside
+
+MM = 0.001  # meters a millimeter
+# Center of the bounding box of YCB-Video's models [m]: the origin of BOP's YCB-V models, which are
+# not turned.
+_YCBV_CENTERS = {
+    "002_master_chef_can": (-0.00134, 0.0005, -0.00351),
+    "003_cracker_box": (-0.00056, -0.0017, -0.0048),
+    "004_sugar_box": (0.00095, -0.00147, -0.00436),
+    "005_tomato_soup_can": (2e-05, 0.00153, -0.0084),
+    "006_mustard_bottle": (-0.0013, -0.00249, 0.01183),
+    "007_tuna_fish_can": (0.00016, -0.00012, -0.00426),
+    "008_pudding_box": (-0.00116, 0.0042, -0.00312),
+    "009_gelatin_box": (-0.00145, 0.00059, -0.00361),
+    "010_potted_meat_can": (-0.00242, -0.00031, -0.00807),
+    "011_banana": (0.01867, -0.01219, 0.00146),
+    "019_pitcher_base": (-0.00534, -0.00589, -0.02561),
+    "021_bleach_cleanser": (-0.00493, 0.00248, 0.01329),
+    "024_bowl": (0.00023, -0.00079, 0.00297),
+    "025_mug": (0.00847, 0.0007, 0.00161),
+    "035_power_drill": (-0.00907, -0.02094, 0.00212),
+    "037_scissors": (-0.00705, 0.02813, -4e-05),
+    "040_large_marker": (-5e-05, 0.0021, -0.00035),
+    "051_large_clamp": (-0.01052, 0.00196, 0.00047),
+    "052_extra_large_clamp": (0.00039, 0.01041, -0.00016),
+    "061_foam_brick": (8e-05, -8e-05, 0.00824),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One record, and what reading it takes."""
+
+    record: FrameRecord
+    K: np.ndarray  # (3, 3)
+    units: float  # depth image units a meter
+    camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
+    siblings: tuple[Path, ...]  # masks of the image's other instances
+
+
+class BopReader(BaseReader):
+    """A split's folder of a BOP dataset (`test`, `train_pbr`, ...), or the dataset's with `part`
+    naming the split.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        objects: str | Sequence[str] | None = None,
+        meshes: MeshStore | None = None,
+        part: str | None = None,
+        mesh_frame: str | None = None,
+        on_error: str = "raise",
+    ) -> None:
+        """List the frames.
+
+        objects: `obj_000002` as the models are named, or YCB's names for YCB-V. mesh_frame: "bop"
+        where meshes are the dataset's own (the default for obj_...; the mesh store wants
+        scale=0.001), "original" where they are google_16k (the default for YCB's names).
+        """
+        super().__init__(root, meshes, on_error)
+        base = self.root / part if part else self.root
+        folders = sorted(_scene_folders(base))
+        if not folders:
+            raise UserError(
+                f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
+                f"data.options.part)"
+            )
+        scenes = [(folder, self._read_scene(folder)) for folder in folders]
+        wanted = [objects] if isinstance(objects, str) else objects
+        self._by_ycb_name = bool(wanted) and all(str(name) in ycb.CLASSES for name in wanted or [])
+        self._mesh_frame = mesh_frame or ("original" if self._by_ycb_name else "bop")
+        if self._mesh_frame not in ("bop", "original"):
+            raise UserError(f"data.options.mesh_frame={mesh_frame}: choose bop or original")
+        numbers_seen = {
+            int(one.get("obj_id", 0))
+            for _, scene in scenes
+            for gt in scene[0].values()
+            for one in gt
+        }
+        self.objects = choose_objects(
+            wanted, sorted(self._name(n) for n in numbers_seen if n > 0), base
+        )
+        self._distrust_builtin()
+        self._native = {name: self.native_from_mesh(name) for name in self.objects}
+        self._entries = [
+            entry for folder, scene in scenes for entry in self._list_scene(base, folder, *scene)
+        ]
+
+    def records(self) -> list[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        return [entry.record for entry in self._entries]
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return BOP's object frame from the mesh file's.  -> (4, 4) [m], not millimeters."""
+        out = np.eye(4)
+        if self._mesh_frame == "original":
+            if name not in _YCBV_CENTERS:
+                raise UserError(
+                    f"{name}: no relation between a google_16k mesh and BOP's frame "
+                    f"is known; use BOP's models"
+                )
+            out = ycb.ycbvideo_from_original(name)
+            out[:3, 3] -= _YCBV_CENTERS[name]
+        return out
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.
+
+        Raises BadData.
+        """
+        entry = self._entries[i]
+        color_path, depth_path, mask_path = self._files(entry.record)[:3]
+        rgb, depth, mask = (
+            read_color(color_path),
+            read_depth(depth_path, entry.units),
+            read_label(mask_path) > 0,
+        )
+        height, width = rgb.shape[:2]
+        expect_size(depth_path, depth, height, width, color_path.name)
+        expect_size(mask_path, mask, height, width, color_path.name)
+        if not mask.any():
+            raise NotShown(mask_path, "listed, but not in the label", entry.record.object)
+        object_id = self.objects.index(entry.record.object)
+        K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
+        return Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels of any other labeled object.  -> (H, W) bool."""
+        entry = self._entries[i]
+        mask = read_label(self._files(entry.record)[2]) > 0
+        out = np.zeros_like(mask)
+        for path in entry.siblings:
+            out |= read_label(check_inside(path, self.root)) > 0
+        return out & ~mask
+
+    def _name(self, number: int) -> str:
+        if self._by_ycb_name and number <= len(ycb.CLASSES):
+            return ycb.CLASSES[number - 1]
+        return f"obj_{number:06d}"
+
+    def _read_scene(self, folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return a scene's truth and cameras by image, both empty where they are broken and
+        on_error is "skip".
+        """
+        try:
+            truth, cameras = (
+                read_json(check_inside(folder / f"scene_{kind}.json", self.root))
+                for kind in ("gt", "camera")
+            )
+            for name, content in (("gt", truth), ("camera", cameras)):
+                if not (isinstance(content, dict) and all(image.isdecimal() for image in content)):
+                    raise BadData(
+                        folder / f"scene_{name}.json", "not records by the number of the image"
+                    )
+            return truth, cameras
+        except BadData as error:
+            self._leave_out(error)
+            return {}, {}
+
+    def _list_scene(
+        self, base: Path, folder: Path, truth: dict[str, Any], cameras: dict[str, Any]
+    ) -> Iterator[_Entry]:
+        group = folder.name if folder != base else base.name
+        for image in sorted(truth, key=int):
+            try:
+                yield from self._list_frame(folder, group, image, truth[image], cameras)
+            except BadData as error:
+                self._leave_out(error)
+
+    def _list_frame(
+        self,
+        folder: Path,
+        group: str,
+        image: str,
+        truth: list[dict[str, Any]],
+        cameras: dict[str, Any],
+    ) -> list[_Entry]:
+        gt_path, camera_path = folder / "scene_gt.json", folder / "scene_camera.json"
+        stem = f"{int(image):06d}"
+        camera = need(cameras, image, camera_path)
+        K = numbers(camera, "cam_K", camera_path, (3, 3), f"{image}.")
+        scale = float(numbers(camera, "depth_scale", camera_path, (), f"{image}."))
+        if scale <= 0:
+            raise BadData(
+                camera_path,
+                "depth scale is not a positive number",
+                f"{image}.depth_scale = {scale}",
+            )
+        masks = [folder / "mask_visib" / f"{stem}_{k:06d}.png" for k in range(len(truth))]
+        entries = []
+        for k, one in enumerate(truth):
+            where = f"{image}[{k}]."
+            number = int(numbers(one, "obj_id", gt_path, (), where))
+            name = self._name(number)
+            if name not in self.objects:
+                continue
+            pose = np.eye(4)
+            pose[:3, :3] = numbers(one, "cam_R_m2c", gt_path, (3, 3), where)
+            pose[:3, 3] = numbers(one, "cam_t_m2c", gt_path, (3,), where) * MM
+            if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
+                raise BadData(gt_path, f"'{where}cam_R_m2c' is no rotation")
+            files = (
+                _color(folder, stem),
+                folder / "depth" / f"{stem}.png",
+                masks[k],
+                gt_path,
+                camera_path,
+            )
+            record = FrameRecord(
+                f"{group}/{stem}", group, int(folder.name), int(image), number, name, k, files
+            )
+            siblings = tuple(mask for j, mask in enumerate(masks) if j != k)
+            entries.append(_Entry(record, K, 1 / (scale * MM), pose @ self._native[name], siblings))
+        return entries
+
+
+def _color(folder: Path, stem: str) -> Path:
+    """Return where an image's color is: `rgb`, or `gray` where a sensor has no color."""
+    candidates = [
+        folder / sub / f"{stem}.{ending}" for sub in ("rgb", "gray") for ending in ("png", "jpg")
+    ]
+    return next((path for path in candidates if path.is_file()), candidates[0])
+
+
+def _scene_folders(base: Path) -> Iterator[Path]:
+    if not base.is_dir():
+        raise UserError(f"{base}: no such folder (data.root)")
+    if base.name.isdigit() and (base / "scene_camera.json").is_file():
+        yield base
+        return
+    for folder in base.iterdir():
+        if folder.is_dir() and folder.name.isdigit():
+            yield folder

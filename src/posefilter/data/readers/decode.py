@@ -1,0 +1,141 @@
+"""Decode a dataset's files, and say in one line what is wrong with them."""
+
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from posefilter.data.frames import SATURATED
+from posefilter.errors import BadData
+from posefilter.limits import check_picture, read_bytes
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+
+
+def read_color(path: Path) -> np.ndarray:
+    """Read a color image; gray is spread to three channels, alpha dropped.  -> (H, W, 3) uint8 RGB."""
+    image = _read_image(path)
+    if image.dtype != np.uint8:
+        raise BadData(path, "color image is not 8-bit", f"found {image.dtype}")
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=-1)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_depth(path: Path, units: float) -> np.ndarray:
+    """Read a 16-bit depth image of so many units a meter; saturated pixels count as unknown.  ->
+    (H, W) float32 [m].
+    """
+    image = _read_image(path)
+    if image.dtype.kind == "f" and not np.isfinite(image).all():
+        raise BadData(
+            path, "depth holds NaN or infinity", "expected a 16-bit image, 0 where unknown"
+        )
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise BadData(
+            path, "depth is not a 16-bit image of one channel", f"found {image.dtype} {image.shape}"
+        )
+    if not (np.isfinite(units) and units > 0):
+        raise BadData(path, "depth scale is not a positive number", f"{units} units a meter")
+    return np.where(image == SATURATED, 0, image / np.float32(units)).astype(np.float32)
+
+
+def read_label(path: Path) -> np.ndarray:
+    """Read an image of class ids.  -> (H, W) uint8 or uint16."""
+    image = _read_image(path)
+    if image.ndim == 3 and (image == image[..., :1]).all():
+        image = image[..., 0]
+    if image.ndim != 2 or image.dtype.kind != "u":
+        raise BadData(
+            path, "label image has more than one channel", f"found {image.dtype} {image.shape}"
+        )
+    return image
+
+
+def read_json(path: Path) -> Any:
+    """Parse a JSON file."""
+    try:
+        return json.loads(read_bytes(path))
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
+
+
+def need(record: Any, key: str, path: Path, where: str = "") -> Any:
+    """Return record[key].  Raises BadData where it is missing."""
+    if not isinstance(record, dict) or key not in record:
+        raise BadData(path, f"missing key '{where}{key}'")
+    return record[key]
+
+
+def numbers(
+    record: Any, key: str, path: Path, shape: tuple[int, ...], where: str = ""
+) -> np.ndarray:
+    """Return record[key] as finite float64 of a shape.
+
+    Raises BadData where it is missing or otherwise.
+    """
+    value = need(record, key, path, where)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise BadData(path, f"'{where}{key}' is not numbers", str(error)) from error
+    if array.size != int(np.prod(shape)):
+        raise BadData(
+            path, f"'{where}{key}' has the wrong size", f"{array.shape}, expected {shape}"
+        )
+    if not np.isfinite(array).all():
+        raise BadData(path, f"'{where}{key}' holds NaN or infinity")
+    return array.reshape(shape)
+
+
+def expect_size(path: Path, image: np.ndarray, height: int, width: int, of: str) -> None:
+    """Raise BadData where an image is not as large as `of` says."""
+    if image.shape[:2] != (height, width):
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise BadData(path, "wrong image size", f"{found}, but {of} says {width}x{height}")
+
+
+def _read_image(path: Path) -> np.ndarray:
+    data = read_bytes(path)
+    flaw = _flaw(data)
+    if flaw:
+        raise BadData(path, "truncated or corrupt image", flaw)
+    check_picture(path, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise BadData(path, "truncated or corrupt image", "cannot be decoded") from error
+    if image is None:
+        raise BadData(path, "truncated or corrupt image", "cannot be decoded")
+    return image
+
+
+def _flaw(data: bytes) -> str:
+    """Return what is wrong with a PNG's or JPEG's frame, "" for nothing: decoders fill what is
+    missing with gray.
+    """
+    if not data:
+        return "the file is empty"
+    if data[:2] == _JPEG:
+        return (
+            "" if data.rfind(b"\xff\xd9", max(len(data) - 4096, 0)) >= 0 else "the JPEG has no end"
+        )
+    if data[:8] != _PNG:
+        return ""
+    at = 8
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        (crc,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(data[at + 4 : end - 4]) != crc:
+            return "a PNG checksum does not match"
+        if data[at + 4 : at + 8] == b"IEND":
+            return ""
+        at = end
+    return "the PNG has no end"

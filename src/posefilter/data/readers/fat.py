@@ -1,0 +1,298 @@
+"""Read the Falling Things format: `single` and `mixed`, both cameras, any class; also what
+`generate.py` writes.
+
+The chain of a pose: mesh -> F (row vectors, meters to centimeters) -> aligned frame -> quaternion,
+location (cm) -> camera.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.data.frames import FrameRecord, NotShown, Sample
+from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.decode import (
+    expect_size,
+    need,
+    read_color,
+    read_depth,
+    read_json,
+    read_label,
+)
+from posefilter.data.readers.fat_settings import (
+    FRAME,
+    IMAGE,
+    FatCamera,
+    FatClass,
+    camera_from_aligned,
+    camera_settings,
+    mesh_name,
+    object_settings,
+    scene_folders,
+)
+from posefilter.data.readers.naming import choose_objects
+from posefilter.errors import BadData, UserError
+from posefilter.meshes import ycb
+from posefilter.meshes.store import MeshStore
+from posefilter.paths import check_inside
+
+DEPTH_UNITS = 10_000.0  # depth image units a meter
+# [m]; the wood block's public mesh is off by more, all others by less than 1 mm
+_CUBOID_TOLERANCE = 0.005
+_CLEARLY_VISIBLE = 0.2  # FAT's own visibility from which an empty mask contradicts the record
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One record, and what reading it takes."""
+
+    record: FrameRecord
+    kind: FatClass
+    camera: FatCamera
+    camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
+    visibility: float  # as FAT states it: not a share of pixels
+    # poses of every instance of the class in the image, this one's among them
+    twins: tuple[np.ndarray, ...]
+    twin: int  # which of them
+
+
+class FatReader(BaseReader):
+    """A folder in the FAT format: the whole dataset, `single`, `mixed`, or one scene's folder."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        objects: str | Sequence[str] | None = None,
+        meshes: MeshStore | None = None,
+        eyes: Sequence[str] = ("left", "right"),
+        parts: Sequence[str] = ("single", "mixed"),
+        on_error: str = "raise",
+    ) -> None:
+        """List the frames.
+
+        objects: classes, with or without FAT's `_16k`; None: all. meshes: for visibility, and to
+        tell two instances of a class apart (frames with two are left out without). on_error:
+        "raise", or "skip" broken frames and count.
+        """
+        super().__init__(root, meshes, on_error)
+        self.eyes = tuple(eyes)
+        self._native: dict[str, np.ndarray] = {}
+        # a folder whose frame of the class is not the first folder's
+        self._ambiguous: dict[str, Path] = {}
+        folders = sorted(scene_folders(self.root, set(parts)))
+        if not folders:
+            raise UserError(
+                f"{self.root}: no FAT scenes here: no folder with "
+                f"_object_settings.json and NNNNNN.left.json"
+            )
+        settings = [(folder, self._settings(folder)) for folder in folders]
+        known = sorted({name for _, one in settings if one for name in one[0]})
+        self.objects = choose_objects(
+            objects, known, self.root, strip=lambda name: name.removesuffix("_16k")
+        )
+        self._entries: list[_Entry] = []
+        for number, (folder, one) in enumerate(settings):
+            if one is not None:
+                self._entries += self._list_folder(number, folder, *one)
+        if objects is None:
+            self.objects = tuple(
+                name for name in self.objects if any(e.record.object == name for e in self._entries)
+            )
+
+    def records(self) -> list[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        return [entry.record for entry in self._entries]
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return FAT's aligned frame from the mesh file's.  -> (4, 4) [m]."""
+        if name not in self._native:
+            raise UserError(f"{self.root}: no object settings of class '{name}'")
+        if name in self._ambiguous:
+            path = self._ambiguous[name] / "_object_settings.json"
+            raise UserError(
+                f"{path}: another fixed_model_transform of '{name}' than in other folders"
+            )
+        return self._native[name].copy()
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.
+
+        Raises BadData.
+        """
+        entry = self._entries[i]
+        record, camera = entry.record, entry.camera
+        color_path, depth_path, seg_path = self._files(record)[:3]
+        rgb, depth, seg = (
+            read_color(color_path),
+            read_depth(depth_path, DEPTH_UNITS),
+            read_label(seg_path),
+        )
+        for path, image in zip(record.files, (rgb, depth, seg), strict=False):
+            expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
+        mask = self._mask(entry, seg, seg_path)
+        return Sample(
+            rgb,
+            depth,
+            mask,
+            camera.K.astype(np.float32),
+            entry.camera_from_object.astype(np.float32),
+            self.objects.index(record.object),
+            i,
+            float("nan"),
+        )
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels of any other labeled object.  -> (H, W) bool."""
+        entry = self._entries[i]
+        seg = read_label(self._files(entry.record)[2])
+        return (seg != 0) & ~self._mask(entry, seg, entry.record.files[2])
+
+    def _mask(self, entry: _Entry, seg: np.ndarray, path: Path) -> np.ndarray:
+        mask = seg == entry.kind.seg_id
+        if len(entry.twins) > 1:
+            mask = self._instance(
+                entry.record.object, entry.twins, entry.twin, entry.camera.K, mask, path
+            )
+        if not mask.any():
+            detail = f"no pixel of {entry.record.object}, id {entry.kind.seg_id}"
+            if (
+                entry.visibility >= _CLEARLY_VISIBLE
+                and len(entry.twins) == 1
+                and _center_in_frame(entry)
+            ):
+                raise BadData(
+                    path,
+                    "empty mask",
+                    f"{detail}, though its JSON says visibility {entry.visibility:.2f}",
+                )
+            raise NotShown(path, "listed, but not in the label", detail)
+        return mask
+
+    def _settings(self, folder: Path) -> tuple[dict[str, FatClass], dict[str, FatCamera]] | None:
+        """Return a folder's classes and cameras, None where they are broken and on_error is "skip"."""
+        try:
+            objects, cameras = (
+                check_inside(folder / f"_{kind}_settings.json", self.root)
+                for kind in ("object", "camera")
+            )
+            return object_settings(objects), camera_settings(cameras)
+        except BadData as error:
+            self._leave_out(error)
+            return None
+
+    def _list_folder(
+        self, number: int, folder: Path, classes: dict[str, FatClass], cameras: dict[str, FatCamera]
+    ) -> Iterator[_Entry]:
+        for name in self.objects:
+            if name in classes:
+                self._remember(name, classes[name], folder)
+        names = {path.name for path in folder.iterdir()}
+        stems = {f"{m[1]}.{m[2]}" for m in map(IMAGE.match, names) if m} | {
+            n[:-5] for n in names if FRAME.match(n)
+        }
+        for stem in sorted(stems):
+            frame, eye = stem.split(".")
+            if eye not in self.eyes:
+                continue
+            try:
+                if eye not in cameras:
+                    raise BadData(folder / "_camera_settings.json", f"no camera named '{eye}'")
+                color = (
+                    f"{stem}.png"
+                    if f"{stem}.png" in names and f"{stem}.jpg" not in names
+                    else f"{stem}.jpg"
+                )
+                files = tuple(
+                    folder / x
+                    for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
+                )
+                yield from self._list_frame(
+                    2 * number + (eye == "right"), int(frame), files, classes, cameras[eye]
+                )
+            except BadData as error:
+                self._leave_out(error)
+
+    def _list_frame(
+        self,
+        scene_id: int,
+        im_id: int,
+        files: tuple[Path, ...],
+        classes: dict[str, FatClass],
+        camera: FatCamera,
+    ) -> list[_Entry]:
+        path = files[3]
+        content = read_json(check_inside(path, self.root))
+        found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
+        for k, one in enumerate(need(content, "objects", path)):
+            name = mesh_name(need(one, "class", path, f"objects[{k}]."), path)
+            if name not in classes:
+                raise BadData(
+                    path, "unknown class", f"'{name}' is not in the folder's _object_settings.json"
+                )
+            if name in self.objects:
+                pose = (
+                    camera_from_aligned(one, path, f"objects[{k}].")
+                    @ classes[name].aligned_from_mesh
+                )
+                found.setdefault(name, []).append((k, pose, float(one.get("visibility", 1.0))))
+        entries = []
+        for name, many in found.items():
+            if len(many) > 1 and self._geometry is None:
+                self.skipped["two instances of one class, and no meshes to tell them apart"] += len(
+                    many
+                )
+                continue
+            if len(many) > 1:
+                self.notes["masks split between instances of one class by geometry"] += len(many)
+            twins = tuple(pose for _, pose, _ in many)
+            for twin, (k, pose, visibility) in enumerate(many):
+                scene = (
+                    path.parent.relative_to(self.root)
+                    if path.parent != self.root
+                    else Path(path.parent.name)
+                )
+                record = FrameRecord(
+                    name=f"{scene.as_posix()}/{path.name.removesuffix('.json')}",
+                    # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
+                    group=path.parent.name,
+                    scene_id=scene_id,
+                    im_id=im_id,
+                    obj_id=ycb.ycbvideo_index(name)
+                    if name in ycb.CLASSES
+                    else classes[name].seg_id,
+                    object=name,
+                    instance=k,
+                    files=files,
+                )
+                entries.append(_Entry(record, classes[name], camera, pose, visibility, twins, twin))
+        return entries
+
+    def _remember(self, name: str, kind: FatClass, folder: Path) -> None:
+        """Keep a class's frame, and see whether the mesh is the one that the cuboid was measured
+        on.
+        """
+        known = self._native.setdefault(name, kind.aligned_from_mesh)
+        if not np.allclose(known, kind.aligned_from_mesh, atol=1e-4):
+            self._ambiguous.setdefault(name, folder)
+        mesh = None if self._geometry is None else self._geometry.mesh(name)
+        if mesh is None or kind.dimensions is None or self._geometry is None:
+            return
+        aligned = mesh.vertices @ kind.aligned_from_mesh[:3, :3].T + kind.aligned_from_mesh[:3, 3]
+        low, high = aligned.min(0), aligned.max(0)
+        off = max(np.abs(high - low - kind.dimensions).max(), np.abs(high + low).max() / 2)
+        if off > _CUBOID_TOLERANCE:
+            self._geometry.without.add(name)
+            self.notes[
+                f"mesh of {name} is not the one that FAT measured ({off * 1000:.0f} mm "
+                f"off): no visibility"
+            ] = 1
+
+
+def _center_in_frame(entry: _Entry) -> bool:
+    x, y, z = entry.camera_from_object[:3] @ np.linalg.inv(entry.kind.aligned_from_mesh)[:, 3]
+    if z <= 0:
+        return False
+    u, v, _ = entry.camera.K @ [x / z, y / z, 1]
+    return bool(0 <= u < entry.camera.width and 0 <= v < entry.camera.height)

@@ -1,0 +1,126 @@
+"""Parse the JSON files of the Falling Things format."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from posefilter.data.readers.decode import need, numbers, read_json
+from posefilter.errors import BadData, UserError
+from posefilter.geometry.pose import is_rigid
+from posefilter.geometry.rotation import matrix_from_quat_xyzw
+from posefilter.paths import is_plain_name
+
+CM = 0.01  # meters a centimeter
+FRAME = re.compile(r"^(\d+)\.(left|right)\.json$")
+IMAGE = re.compile(r"^(\d+)\.(left|right)\.(jpg|png)$")
+_NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
+
+
+@dataclass(frozen=True, eq=False)
+class FatClass:
+    """A class, as a folder's settings have it."""
+
+    seg_id: int
+    aligned_from_mesh: np.ndarray  # (4, 4) rigid [m]
+    dimensions: np.ndarray | None  # (3,) of the cuboid [m]
+
+
+@dataclass(frozen=True, eq=False)
+class FatCamera:
+    K: np.ndarray  # (3, 3)
+    height: int
+    width: int
+
+
+def scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
+    """Yield the folders that hold frames, not looking below them."""
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder (data.root)")
+    names = [path.name for path in root.iterdir()]
+    if (
+        any(FRAME.match(name) or IMAGE.match(name) for name in names)
+        or "_object_settings.json" in names
+    ):
+        yield root
+        return
+    if any(_NEWER.search(name) for name in names):
+        raise UserError(
+            f"{root}: these names (.cs.png, .depth.16.png) are a newer export's; FAT "
+            f"has .seg.png, .depth.png"
+        )
+    for name in names:
+        if (
+            (root / name).is_dir()
+            and not name.startswith(".")
+            and (name not in {"single", "mixed"} or name in parts)
+        ):
+            yield from scene_folders(root / name, parts)
+
+
+def mesh_name(fat_class: Any, path: Path) -> str:
+    """Return the name of a class's mesh.  Raises BadData where it is no plain name."""
+    name = str(fat_class).removesuffix("_16k")
+    if not is_plain_name(name):
+        raise BadData(path, "class with an impossible name", repr(name[:40]))
+    return name
+
+
+def object_settings(path: Path) -> dict[str, FatClass]:
+    classes = {}
+    for k, one in enumerate(need(read_json(path), "exported_objects", path)):
+        where = f"exported_objects[{k}]."
+        F = numbers(one, "fixed_model_transform", path, (4, 4), where)
+        aligned = F.T.copy()  # row vectors -> columns
+        aligned[:3] *= CM  # x100 in the rotation, centimeters in the translation
+        if not is_rigid(torch.from_numpy(aligned), tolerance=2e-3):
+            raise BadData(
+                path,
+                f"'{where}fixed_model_transform' is not 100 x a rotation with its "
+                f"shift in the last row",
+            )
+        size = (
+            numbers(one, "cuboid_dimensions", path, (3,), where) * CM
+            if "cuboid_dimensions" in one
+            else None
+        )
+        seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
+        classes[mesh_name(need(one, "class", path, where), path)] = FatClass(seg_id, aligned, size)
+    return classes
+
+
+def camera_settings(path: Path) -> dict[str, FatCamera]:
+    cameras = {}
+    for k, one in enumerate(need(read_json(path), "camera_settings", path)):
+        where = f"camera_settings[{k}]."
+        inner = need(one, "intrinsic_settings", path, where)
+        fx, fy, cx, cy = (
+            float(numbers(inner, key, path, (), f"{where}intrinsic_settings."))
+            for key in ("fx", "fy", "cx", "cy")
+        )
+        size = need(one, "captured_image_size", path, where)
+        width, height = (
+            int(numbers(size, key, path, (), f"{where}captured_image_size."))
+            for key in ("width", "height")
+        )
+        K = np.array([[fx, float(inner.get("s", 0.0)), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        cameras[str(need(one, "name", path, where))] = FatCamera(K, height, width)
+    return cameras
+
+
+def camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
+    quat = numbers(record, "quaternion_xyzw", path, (4,), where)
+    if abs(np.linalg.norm(quat) - 1) > 0.01:  # four decimals leave it 1e-4 off
+        raise BadData(
+            path,
+            f"'{where}quaternion_xyzw' is not a unit quaternion",
+            f"norm {np.linalg.norm(quat):.3f}",
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / np.linalg.norm(quat))).numpy()
+    pose[:3, 3] = numbers(record, "location", path, (3,), where) * CM
+    return pose

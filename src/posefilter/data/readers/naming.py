@@ -1,0 +1,30 @@
+"""Find the classes that a user names among those that a dataset has."""
+
+import difflib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from posefilter.errors import UserError
+
+
+def choose_objects(
+    wanted: str | Sequence[str] | None,
+    known: Sequence[str],
+    root: Path,
+    strip: Callable[[str], str] = str,
+) -> tuple[str, ...]:
+    """Return the wanted classes as the dataset spells them; None: all.
+
+    Raises UserError for any other class.
+    """
+    if wanted is None:
+        return tuple(known)
+    names = tuple(strip(str(name)) for name in ([wanted] if isinstance(wanted, str) else wanted))
+    for name in names:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none'}"
+            raise UserError(f"{root}: unknown class '{name}' (data.object): {hint}")
+    if not names:
+        raise UserError(f"{root}: data.object is an empty list: name a class")
+    return names

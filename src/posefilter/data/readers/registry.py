@@ -1,0 +1,54 @@
+"""Open a dataset by the name of its format."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from posefilter.data.frames import Reader
+from posefilter.data.readers.bop import BopReader
+from posefilter.data.readers.fat import FatReader
+from posefilter.data.readers.ycb_video import YCBVideoReader
+from posefilter.errors import UserError
+from posefilter.meshes.store import MeshStore
+
+READERS: dict[str, Callable[..., Reader]] = {
+    "scenes": FatReader,
+    "fat": FatReader,
+    "ycb_video": YCBVideoReader,
+    "bop": BopReader,
+}
+
+
+def open_reader(
+    source: str,
+    root: str | Path,
+    objects: str | Sequence[str] | None = None,
+    meshes: MeshStore | None = None,
+    on_error: str = "raise",
+    **options: Any,
+) -> Reader:
+    """Return the reader of a dataset: source "scenes" (rendered here), "fat", "ycb_video" or "bop".
+
+    options: the format's own, see the readers. Raises UserError for a source, class, folder or
+    option that there is not.
+    """
+    if source not in READERS:
+        raise UserError(f"data.source={source}: unknown; choose from {', '.join(READERS)}")
+    if on_error not in ("raise", "skip"):
+        raise UserError(f"data.on_error={on_error}: choose raise or skip")
+    try:
+        return READERS[source](root, objects, meshes=meshes, on_error=on_error, **options)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise UserError(
+            f"data.options: {str(error).split('() ')[-1]} of the {source} reader"
+        ) from error
+
+
+def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> float:
+    """Return meters a unit of the mesh files that belong to a dataset: BOP's own models are in
+    millimeters.
+    """
+    names = [objects] if isinstance(objects, str) else list(objects or [])
+    return 0.001 if source == "bop" and all(name.startswith("obj_") for name in names) else 1.0

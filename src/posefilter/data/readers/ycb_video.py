@@ -1,0 +1,309 @@
+"""Read YCB-Video as it was published: `data/<scene>/NNNNNN-{color,depth,label}.png` and
+`-meta.mat`, and `data_syn`.
+"""
+
+import io
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import torch
+from scipy.io.matlab import MatReadError
+
+from posefilter.data.frames import FrameRecord, NotShown, Sample
+from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.decode import expect_size, numbers, read_color, read_depth, read_label
+from posefilter.data.readers.naming import choose_objects
+from posefilter.errors import BadData, UserError
+from posefilter.geometry.pose import is_rigid
+from posefilter.limits import read_bytes
+from posefilter.meshes import ycb
+from posefilter.meshes.store import MeshStore
+from posefilter.paths import check_inside, is_plain_name
+
+_KEYS = ["cls_indexes", "poses", "factor_depth", "intrinsic_matrix"]
+# bytes of a -meta.mat, of which there may be 2 MB, and of a list
+_LARGEST_META, _LONGEST_LIST = 1 << 25, 1 << 22
+# rendered frames have no scenes: blocks stand in, numbered from here
+_SYN, _SYN_SCENE, _SYN_BLOCK = "data_syn", 1000, 100
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One record, and what reading it takes."""
+
+    record: FrameRecord
+    label: int
+    K: np.ndarray  # (3, 3)
+    units: float  # depth image units a meter
+    camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
+    twins: tuple[np.ndarray, ...]  # poses of every instance of the class in the image
+    twin: int  # which of them is this one
+
+
+class YCBVideoReader(BaseReader):
+    """YCB-Video's folder, its `data` or `data_syn`, or any other in its layout."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        objects: str | Sequence[str] | None = None,
+        meshes: MeshStore | None = None,
+        parts: Sequence[str] = ("data",),
+        frames: str | Path | None = None,
+        mesh_frame: str = "original",
+        on_error: str = "raise",
+    ) -> None:
+        """List the frames.
+
+        parts: "data", "data_syn" or both. frames: a list such as image_sets/keyframe.txt; nothing
+        else is looked at. mesh_frame: "original" where meshes are YCB's google_16k, "ycb_video"
+        where they are YCB-Video's own models.
+        """
+        super().__init__(root, meshes, on_error)
+        if mesh_frame not in ("original", "ycb_video"):
+            raise UserError(f"data.options.mesh_frame={mesh_frame}: choose original or ycb_video")
+        self._mesh_frame = mesh_frame
+        self._classes = _class_names(self.root)
+        usable = [
+            c for c in self._classes if mesh_frame == "ycb_video" or c not in ycb.WITHOUT_GEOMETRY
+        ]
+        self.objects = choose_objects(
+            objects, usable if objects is None else self._classes, self.root
+        )
+        self._native = {name: self.native_from_mesh(name) for name in self.objects}
+        self._distrust_builtin()
+        self._entries: list[_Entry] = []
+        for scene_id, im_id, name, stem in self._frames(set(parts), frames):
+            try:
+                self._entries += self._list_frame(scene_id, im_id, name, stem)
+            except BadData as error:
+                self._leave_out(error)
+        if objects is None:
+            self.objects = tuple(
+                name for name in self.objects if any(e.record.object == name for e in self._entries)
+            )
+
+    def records(self) -> list[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        return [entry.record for entry in self._entries]
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return YCB-Video's object frame from the mesh file's.  -> (4, 4) [m]."""
+        if self._mesh_frame == "ycb_video":
+            return np.eye(4)
+        try:
+            return ycb.ycbvideo_from_original(name)
+        except KeyError as error:
+            hint = "use YCB-Video's own models, and data.options.mesh_frame=ycb_video"
+            raise UserError(
+                f"{name}: no relation between a google_16k mesh and YCB-Video's frame is known; "
+                f"{hint}"
+            ) from error
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.
+
+        Raises BadData.
+        """
+        entry = self._entries[i]
+        color_path, depth_path, label_path, _ = self._files(entry.record)
+        rgb, depth, label = (
+            read_color(color_path),
+            read_depth(depth_path, entry.units),
+            read_label(label_path),
+        )
+        height, width = rgb.shape[:2]
+        expect_size(depth_path, depth, height, width, color_path.name)
+        expect_size(label_path, label, height, width, color_path.name)
+        object_id = self.objects.index(entry.record.object)
+        K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
+        return Sample(rgb, depth, self._mask(entry, label), K, pose, object_id, i, float("nan"))
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels of any other labeled object.  -> (H, W) bool."""
+        entry = self._entries[i]
+        label = read_label(self._files(entry.record)[2])
+        return (label != 0) & ~self._mask(entry, label)
+
+    def _mask(self, entry: _Entry, label: np.ndarray) -> np.ndarray:
+        path = entry.record.files[2]
+        if int(label.max()) > len(self._classes):
+            raise BadData(
+                path,
+                "unknown class",
+                f"label {int(label.max())}, but there are {len(self._classes)} classes",
+            )
+        mask = label == entry.label
+        if len(entry.twins) > 1:
+            mask = self._instance(entry.record.object, entry.twins, entry.twin, entry.K, mask, path)
+        if not label.any():
+            raise BadData(path, "empty mask", "no object at all in the label image")
+        if not mask.any():
+            raise NotShown(path, "listed, but not in the label", entry.record.object)
+        return mask
+
+    def _frames(
+        self, parts: set[str], listed: str | Path | None
+    ) -> Iterator[tuple[int, int, str, Path]]:
+        """Yield (scene_id, im_id, name, path without its ending) of every frame, in order."""
+        if not self.root.is_dir():
+            raise UserError(f"{self.root}: no such folder (data.root)")
+        folders = dict(_scene_folders(self.root, parts))
+        if not folders:
+            raise UserError(
+                f"{self.root}: no YCB-Video scenes here: no <scene>/NNNNNN-meta.mat "
+                f"in data or data_syn"
+            )
+        if listed is not None:
+            names = _read_list(self.root, listed)
+        else:
+            names = [
+                f"{scene}/{stem}"
+                for scene, folder in sorted(folders.items())
+                for stem in sorted(_stems(folder))
+            ]
+        missing = 0
+        for name in names:
+            scene, stem = name.rsplit("/", 1)
+            if not stem.isdigit():
+                raise UserError(
+                    f"{folders.get(scene, self.root)}/{stem}: frames are named by "
+                    f"numbers, such as 000001"
+                )
+            if scene not in folders:
+                missing += 1
+                continue
+            scene_id = (
+                _SYN_SCENE + int(stem) // _SYN_BLOCK
+                if scene == _SYN
+                else int("".join(filter(str.isdigit, scene)) or 0)
+            )
+            yield scene_id, int(stem), name, folders[scene] / stem
+        if missing == len(names):
+            raise UserError(
+                f"{listed or self.root}: none of its {missing} frames is in {self.root}"
+            )
+        if missing:
+            self.notes[f"frames in {listed} whose scenes are not in {self.root}"] = missing
+
+    def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
+        path = stem.with_name(f"{stem.name}-meta.mat")
+        meta = _read_meta(check_inside(path, self.root))
+        indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
+        if (
+            (indices != np.round(indices)).any()
+            or indices.min() < 1
+            or indices.max() > len(self._classes)
+        ):
+            raise BadData(
+                path,
+                "unknown class",
+                f"cls_indexes {indices.tolist()}, but there are {len(self._classes)} classes",
+            )
+        classes = [self._classes[int(k) - 1] for k in indices]
+        if not set(classes) & set(self.objects):
+            return []
+        poses = numbers(meta, "poses", path, (3, 4, len(classes))).transpose(2, 0, 1)
+        K = numbers(meta, "intrinsic_matrix", path, (3, 3))
+        units = float(numbers(meta, "factor_depth", path, ()))
+        files = tuple(
+            stem.with_name(f"{stem.name}-{ending}")
+            for ending in ("color.png", "depth.png", "label.png", "meta.mat")
+        )
+        entries = []
+        for k, each in enumerate(classes):
+            if each not in self.objects:
+                continue
+            same = [j for j, other in enumerate(classes) if other == each]
+            twins = tuple(self._in_mesh_frame(poses[j], each, path) for j in same)
+            scene = name.rsplit("/", 1)[0]
+            group = f"{scene}/{im_id // _SYN_BLOCK}" if scene == _SYN else scene
+            record = FrameRecord(name, group, scene_id, im_id, int(indices[k]), each, k, files)
+            entries.append(
+                _Entry(
+                    record, int(indices[k]), K, units, twins[same.index(k)], twins, same.index(k)
+                )
+            )
+        return entries
+
+    def _in_mesh_frame(self, camera_from_native: np.ndarray, name: str, path: Path) -> np.ndarray:
+        pose = np.eye(4)
+        pose[:3] = camera_from_native
+        if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
+            raise BadData(path, "'poses' holds a matrix that is no rotation", name)
+        return pose @ self._native[name]
+
+
+def _class_names(root: Path) -> tuple[str, ...]:
+    for path in (
+        root / "image_sets" / "classes.txt",
+        root / "classes.txt",
+        root.parent / "classes.txt",
+    ):
+        if path.is_file():
+            names = tuple(
+                line.strip()
+                for line in read_bytes(path, _LONGEST_LIST).decode().splitlines()
+                if line.strip()
+            )
+            wrong = [name for name in names if not is_plain_name(name)]
+            if wrong:
+                raise UserError(f"{path}: class with an impossible name {wrong[0][:40]!r}")
+            return names
+    return ycb.CLASSES
+
+
+def _scene_folders(root: Path, parts: set[str]) -> Iterator[tuple[str, Path]]:
+    """Yield scenes by name: those of `data` by number, `data_syn` as one."""
+    if _stems(root):
+        yield (_SYN if root.name == _SYN else root.name), root
+        return
+    if _SYN in parts and (root / _SYN).is_dir():
+        yield _SYN, root / _SYN
+    data = root / "data" if (root / "data").is_dir() else root
+    if "data" in parts:
+        for folder in data.iterdir():
+            if folder.is_dir() and folder.name.isdigit():
+                yield folder.name, folder
+
+
+def _stems(folder: Path) -> list[str]:
+    return [path.name.removesuffix("-meta.mat") for path in folder.glob("*-meta.mat")]
+
+
+def _read_list(root: Path, listed: str | Path) -> list[str]:
+    candidates = [Path(listed), root / listed, root / "image_sets" / listed, root.parent / listed]
+    path = next((p for p in candidates if p.is_file()), None)
+    if path is None:
+        raise UserError(f"{listed}: no such list of frames (data.options.frames), nor below {root}")
+    names = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    if not names or any("/" not in name for name in names):
+        raise UserError(f"{path}: not a list of frames; expected lines such as 0048/000001")
+    return names
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    """Return the few arrays that are needed of a -meta.mat file."""
+    data = io.BytesIO(read_bytes(path, _LARGEST_META))
+    try:
+        meta = scipy.io.loadmat(data, variable_names=_KEYS)
+    except (
+        MemoryError,
+        MatReadError,
+        ValueError,
+        TypeError,
+        OSError,
+        NotImplementedError,
+        EOFError,
+        zlib.error,
+    ) as error:
+        raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error
+    for key in _KEYS:
+        if key not in meta:
+            raise BadData(path, f"missing key '{key}'")
+    return meta

@@ -1,0 +1,184 @@
+"""Drawing the first cloud."""
+
+import torch
+from torch import Generator, Tensor, nn
+
+from posefilter.errors import UserError
+from posefilter.geometry.camera import rays
+from posefilter.geometry.pose import pose_about
+from posefilter.geometry.rotation import random_rotation
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.protocols import HasRelevance, Initialize, Method, ProposesPoses, Scene
+from posefilter.types import Batch
+
+
+def draw_cells(weight: Tensor, count: int, generator: Generator) -> Tensor:
+    """Draw cells of a map by weight, with replacement.
+
+    (B, h, w) >= 0 -> (B, count, 2) int64 as (column, row).
+    """
+    pick = torch.multinomial(weight.flatten(1), count, replacement=True, generator=generator)
+    return torch.stack([pick % weight.shape[2], pick // weight.shape[2]], dim=-1)
+
+
+def draw_from_depth(
+    depth: Tensor,
+    K: Tensor,
+    space: PoseSpace,
+    count: int,
+    generator: Generator,
+    prior: Tensor | None = None,
+    behind: tuple[float, float] = (0.1, 0.9),
+) -> Tensor:
+    """Draw poses at measured points: uniform rotations, the center pushed along the ray behind the
+    surface.
+
+    depth (B, 1, H, W) [m]; K (B, 3, 3) [px]; prior (B, 1, H, W) >= 0, how likely the object is at
+    each pixel (uniform if None); behind: by how many radii, uniformly -> (B, count, 4, 4) [m]. An
+    image in which nothing was measured, or nothing where the prior allows it, counts as 1 m away
+    everywhere: the start must be somewhere.
+    """
+    weight = (depth[:, 0] > 0).to(depth.dtype)
+    if prior is not None:
+        weight = weight * prior[:, 0]
+    empty = ~(weight > 0).flatten(1).any(1)
+    z = torch.where(empty[:, None, None], torch.ones_like(depth[:, 0]), depth[:, 0])
+    cell = draw_cells(
+        torch.where(empty[:, None, None], torch.ones_like(weight), weight), count, generator
+    )
+    at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
+    ray = rays(cell.to(depth.dtype), K)
+    push = torch.empty_like(at).uniform_(*behind, generator=generator) * space.radius
+    center = ray * at + ray / ray.norm(dim=-1, keepdim=True) * push
+    R = random_rotation(*center.shape[:2], generator=generator, device=depth.device)
+    return pose_about(R, center, depth.new_tensor(space.center))
+
+
+def pose_space(method: Method, choice: str) -> PoseSpace:
+    """Return the method's space if its particles are poses; raise UserError, naming the choice, if
+    not.
+    """
+    if not isinstance(method.space, PoseSpace):
+        raise UserError(
+            f"initialize={choice} draws poses, but the particles of "
+            f"{type(method).__name__} are pixels"
+        )
+    return method.space
+
+
+def must_be_pixels(method: Method, choice: str) -> None:
+    """Raise UserError, naming the choice, if the method's particles are poses."""
+    if isinstance(method.space, PoseSpace):
+        raise UserError(
+            f"initialize={choice} draws pixels, but the particles of "
+            f"{type(method).__name__} are poses"
+        )
+
+
+class UniformPixels:
+    """Pixels uniformly over the image."""
+
+    def __call__(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return (B, N, 2) [px], from the frame's outer edge to its outer edge."""
+        must_be_pixels(method, "uniform")
+        B, _, H, W = batch.rgb.shape
+        share = torch.rand(B, particles, 2, generator=generator, device=batch.rgb.device)
+        return share * share.new_tensor([W, H]) - 0.5
+
+
+class FromDepth:
+    """Poses at measured points of the image, with uniform rotations.
+
+    behind: how many radii the object's center lies behind the surface, drawn uniformly.
+    """
+
+    def __init__(self, behind: tuple[float, float] = (0.1, 0.9)) -> None:
+        self.behind = (float(behind[0]), float(behind[1]))
+
+    def __call__(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return (B, N, 4, 4) [m]."""
+        space = pose_space(method, "from_depth")
+        return draw_from_depth(
+            batch.depth, batch.intrinsics, space, particles, generator, behind=self.behind
+        )
+
+
+class FromRelevance:
+    """Pixels where the scene's own map says that it matters (the paper, section 6, idea 4).
+
+    anywhere: the share of the draws that ignores the map, so that no place is out of reach.
+    """
+
+    def __init__(self, anywhere: float = 0.1) -> None:
+        self.anywhere = anywhere
+
+    def __call__(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return (B, N, 2) [px], uniform within the drawn cells."""
+        must_be_pixels(method, "from_relevance")
+        if not isinstance(scene, HasRelevance):
+            raise UserError(
+                f"initialize=from_relevance: {type(method).__name__} makes no map of "
+                f"relevance; choose uniform"
+            )
+        weight = scene.relevance[:, 0].detach()
+        weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
+        weight = (1 - self.anywhere) * weight + max(self.anywhere, 1e-6) / weight[0].numel()
+        cell = draw_cells(weight, particles, generator)
+        H, W = batch.rgb.shape[-2:]
+        size = weight.new_tensor([W / weight.shape[2], H / weight.shape[1]])
+        return (
+            cell + torch.rand(cell.shape, generator=generator, device=weight.device)
+        ) * size - 0.5
+
+
+class FromProposals:
+    """Poses that the method itself proposes."""
+
+    def __call__(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return (B, N, 4, 4) [m]."""
+        if not isinstance(method, ProposesPoses):
+            raise UserError(
+                f"initialize=from_proposals: {type(method).__name__} proposes no "
+                f"poses; choose another start"
+            )
+        return method.propose_poses(scene, particles, generator)
+
+
+class Informed(nn.Module):
+    """In training, start a share of the pixels on or around the object (the paper, section 4.3);
+    else as `otherwise` does.
+
+    The mask is the truth, so it is read in training mode only: in evaluation every particle starts
+    as `otherwise` says. around_px: standard deviation by which they miss the mask's pixels.
+    """
+
+    def __init__(self, otherwise: Initialize, share: float = 0.5, around_px: float = 10.0) -> None:
+        super().__init__()
+        self.otherwise, self.share, self.around_px = otherwise, share, around_px
+
+    def forward(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return (B, N, 2) [px]."""
+        state = self.otherwise(batch, scene, method, particles, generator)
+        count = round(self.share * particles)
+        if not self.training or count == 0:
+            return state
+        must_be_pixels(method, "informed")
+        mask = batch.mask[:, 0].to(state.dtype)
+        seen = (mask > 0).flatten(1).any(1)[:, None, None]
+        near = draw_cells(torch.where(seen, mask, torch.ones_like(mask)), count, generator).to(
+            state.dtype
+        )
+        near = near + self.around_px * torch.randn(
+            near.shape, generator=generator, device=state.device
+        )
+        return torch.cat([torch.where(seen, near, state[:, :count]), state[:, count:]], dim=1)

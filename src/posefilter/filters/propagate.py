@@ -1,0 +1,101 @@
+"""Moving the children of a resampling.
+
+`state` (B, N, *S), `displacement` (B, N, D) -> moved states (B, N, *S).
+"""
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.protocols import Propagate, Space
+from posefilter.types import Step
+
+
+class Identity:
+    """Leave every particle where it is."""
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return the states as they are."""
+        return state
+
+
+class Gaussian:
+    """Diffuse by `factor` x the step's noise level; the space says what that is in each of its
+    axes.
+    """
+
+    def __init__(self, factor: float = 0.4) -> None:
+        self.factor = factor
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return perturbed states."""
+        B, N = state.shape[:2]
+        scale = space.noise_scale((step.sigma * self.factor).expand(B))[:, None]
+        noise = torch.randn(
+            B, N, space.dimensions, generator=generator, device=state.device, dtype=state.dtype
+        )
+        return space.move(state, scale * noise)
+
+
+class LearnedDisplacement:
+    """Go where the method's network says."""
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return displaced states, differentiable in the displacement."""
+        return space.move(state, displacement)
+
+
+class HalfTurns:
+    """Turn a share of the poses by pi about a random axis of the object through its center, so that
+    flips are found.
+    """
+
+    def __init__(self, share: float = 0.1) -> None:
+        self.share = share
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return the states, some turned."""
+        return half_turns(state, space, generator, self.share)
+
+
+def half_turns(poses: Tensor, space: Space, generator: Generator, share: float = 1.0) -> Tensor:
+    """Turn a share of poses by pi about a random object axis through its center.
+
+    (B, N, 4, 4) -> (B, N, 4, 4).
+    """
+    if space.dimensions != 6:
+        raise UserError(
+            "propagate: half turns need particles that are poses; leave them out for "
+            "a method on pixels"
+        )
+    B, N = poses.shape[:2]
+    axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
+    chosen = torch.rand(B, N, generator=generator, device=poses.device) < share
+    turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * chosen[..., None]
+    return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
+
+
+class Chain:
+    """Apply several proposals one after the other."""
+
+    def __init__(self, pieces: Iterable[Propagate]) -> None:
+        self.pieces = list(pieces)
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return the states that the last piece leaves."""
+        for piece in self.pieces:
+            state = piece(state, displacement, step, space, generator)
+        return state

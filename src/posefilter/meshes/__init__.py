@@ -1,0 +1,1 @@
+"""Mesh files, stores of meshes, symmetries."""

@@ -1,0 +1,174 @@
+"""Read OBJ, PLY and GLB files into `Mesh`."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.meshes.obj import JSON, Material, RawMesh, read_image, read_obj
+
+SUFFIXES = (".obj", ".ply", ".glb")
+
+
+def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
+    """Read one mesh file; `scale` turns its unit into meters.
+
+    Raises UserError, naming the file, where it is missing, corrupt, empty, or lacks its texture.
+    """
+    readers: dict[str, Callable[[Path], RawMesh]] = {
+        ".obj": read_obj,
+        ".ply": _read_other,
+        ".glb": _read_other,
+    }
+    if path.suffix.lower() not in readers:
+        raise UserError(f"{path}: cannot read meshes of this kind; known are {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise UserError(f"{path}: no such mesh file")
+    try:
+        raw = readers[path.suffix.lower()](path)
+    except UserError:
+        raise
+    # the file decides what breaks: parsers raise anything from KeyError to struct.error
+    except Exception as error:
+        reason = next(iter(str(error).splitlines()), "")
+        raise UserError(
+            f"{path}: not a readable mesh; is it cut short? ({type(error).__name__}: {reason})"
+        ) from error
+    return _finish(raw, path, name, scale)
+
+
+def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
+    if len(raw.faces) == 0 or len(raw.vertices) == 0:
+        raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
+    if raw.faces.min() < 0 or raw.faces.max() >= len(raw.vertices):
+        raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
+    if not np.isfinite(raw.vertices).all():
+        raise UserError(f"{path}: vertices that are not finite numbers")
+    # stray vertices would spoil bounds, hull and diameter
+    used, faces = np.unique(raw.faces, return_inverse=True)
+    faces = faces.reshape(-1, 3).astype(np.int64)
+    vertices = raw.vertices[used].astype(np.float64) * scale
+    normals = creased_normals(vertices, faces)
+    if raw.corner_normals is not None:
+        length = np.linalg.norm(raw.corner_normals, axis=-1, keepdims=True)
+        given = raw.corner_normals / np.maximum(length, 1e-12)
+        normals = np.where(length > 1e-6, given, normals).astype(np.float32)
+    uv, texture = _one_texture(raw)
+    colors = None if raw.corner_colors is None else raw.corner_colors.astype(np.float32)
+    return Mesh(name, vertices, faces, uv, texture, colors, normals)
+
+
+def _one_texture(raw: RawMesh) -> tuple[np.ndarray | None, np.ndarray]:
+    """Put all materials into one picture, stacked; a mesh of one plain color gets one pixel."""
+    used = np.unique(raw.face_material)
+    pictures = [_picture(raw.materials[i]) for i in used]
+    if len(used) == 1 and (raw.corner_uv is None or pictures[0].shape[:2] == (1, 1)):
+        return None, pictures[0][:1, :1]
+    uv = (
+        np.zeros((len(raw.faces), 3, 2))
+        if raw.corner_uv is None
+        else raw.corner_uv.astype(np.float64)
+    )
+    if len(used) == 1:
+        return uv.astype(np.float32), pictures[0]
+    height = max(p.shape[0] for p in pictures)
+    width = max(p.shape[1] for p in pictures)
+    stack = np.concatenate([cv2.resize(p, (width, height)) for p in pictures])
+    which = np.searchsorted(used, raw.face_material)
+    # a stacked picture cannot repeat: fold each face back
+    uv = uv - np.floor(uv.mean(axis=1, keepdims=True))
+    inset = 0.5 / np.array([width, height])
+    uv = uv.clip(inset, 1 - inset)
+    uv[..., 1] = (uv[..., 1] + (len(used) - 1 - which)[:, None]) / len(used)
+    return uv.astype(np.float32), stack
+
+
+def _picture(material: Material) -> np.ndarray:
+    if material.image is None:
+        return np.round(material.color * 255).astype(np.uint8).reshape(1, 1, 3)
+    if np.allclose(material.color, 1):
+        return material.image
+    return np.round(material.image * material.color).astype(np.uint8)
+
+
+def _read_other(path: Path) -> RawMesh:
+    """Read PLY and GLB with trimesh; the parts of a scene become one mesh."""
+    if path.suffix.lower() == ".ply":
+        _check_ply_texture(path)
+    loaded = trimesh.load(path, process=False)
+    parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
+    if not raws:
+        raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
+    vertex_start = np.cumsum([0] + [len(r.vertices) for r in raws])
+    both_uv = [np.zeros((len(r.faces), 3, 2)) if r.corner_uv is None else r.corner_uv for r in raws]
+    colors = [
+        np.ones((len(r.faces), 3, 3)) if r.corner_colors is None else r.corner_colors for r in raws
+    ]
+    normals = [
+        np.zeros((len(r.faces), 3, 3)) if r.corner_normals is None else r.corner_normals
+        for r in raws
+    ]
+    return RawMesh(
+        np.concatenate([r.vertices for r in raws]),
+        np.concatenate([r.faces + start for r, start in zip(raws, vertex_start[:-1], strict=True)]),
+        None if all(r.corner_uv is None for r in raws) else np.concatenate(both_uv),
+        np.concatenate(normals),
+        None if all(r.corner_colors is None for r in raws) else np.concatenate(colors),
+        np.concatenate([np.full(len(r.faces), i) for i, r in enumerate(raws)]),
+        [r.materials[0] for r in raws],
+    )
+
+
+def _check_ply_texture(path: Path) -> None:
+    """Raise UserError where the texture that a PLY's header names cannot be read: trimesh would go
+    on without it.
+    """
+    header = path.read_bytes()[:4096].partition(b"end_header")[0].decode(errors="replace")
+    for line in header.splitlines():
+        if line.lower().startswith("comment texturefile "):
+            read_image(path.parent / line.split(maxsplit=2)[2].strip(), path)
+
+
+def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    visual = mesh.visual
+    uv = colors = None
+    material = JSON
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        uv = None if visual.uv is None else np.asarray(visual.uv)[faces]
+        material = _trimesh_material(visual.material)
+    elif visual is not None and visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors)[:, :3][faces] / 255
+        material = Material(np.ones(3), None)
+    elif visual is not None and visual.kind == "face":
+        colors = np.asarray(visual.face_colors)[:, None, :3].repeat(3, axis=1) / 255
+        material = Material(np.ones(3), None)
+    # set by trimesh's readers only where the file has normals
+    given = mesh._cache.cache.get("vertex_normals")
+    normals = None if given is None else np.asarray(given)[faces]
+    return RawMesh(
+        np.asarray(mesh.vertices),
+        faces,
+        uv,
+        normals,
+        colors,
+        np.zeros(len(faces), dtype=np.int64),
+        [material],
+    )
+
+
+def _trimesh_material(material: object) -> Material:
+    factor = getattr(material, "baseColorFactor", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    color = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255
+    if image is not None:
+        return Material(color, np.asarray(image.convert("RGB")))
+    diffuse = getattr(material, "diffuse", None)
+    if factor is None and diffuse is not None:
+        color = np.asarray(diffuse, dtype=np.float64)[:3] / 255
+    return Material(color, None)

@@ -1,0 +1,136 @@
+"""Read Wavefront OBJ and its materials as written: seams in the texture and normals a corner
+survive.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.limits import check_picture, read_bytes
+from posefilter.paths import check_inside
+
+
+class Material(NamedTuple):
+    """A picture and the color that it is multiplied by."""
+
+    color: np.ndarray  # (3,) in [0, 1]
+    image: np.ndarray | None  # (h, w, 3) uint8 RGB
+
+
+JSON = Material(np.full(3, 0.7), None)
+
+
+class RawMesh(NamedTuple):
+    """What a file says, before its materials are put into one picture."""
+
+    vertices: np.ndarray  # (V, 3)
+    faces: np.ndarray  # (F, 3)
+    corner_uv: np.ndarray | None  # (F, 3, 2)
+    corner_normals: np.ndarray | None  # (F, 3, 3)
+    corner_colors: np.ndarray | None  # (F, 3, 3)
+    face_material: np.ndarray  # (F,)
+    materials: list[Material]
+
+
+def read_image(path: Path, source: Path) -> np.ndarray:
+    """Read a texture as (h, w, 3) uint8 RGB; it must lie in the folder of what names it."""
+    check_inside(path, source.parent)
+    if not path.is_file():
+        raise UserError(f"{path}: missing texture, named by {source.name}")
+    data = read_bytes(path)
+    check_picture(path, data)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise UserError(
+            f"{path}: not a readable picture (is it cut short?), named by {source.name}"
+        )
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _read_mtl(path: Path, source: Path) -> dict[str, Material]:
+    check_inside(path, source.parent)
+    if not path.is_file():
+        raise UserError(f"{path}: missing material file, named by {source.name}")
+    materials: dict[str, Material] = {}
+    name = ""
+    for line in path.read_text(errors="replace").splitlines():
+        key, _, rest = line.strip().partition(" ")
+        rest = rest.strip()
+        if key == "newmtl":
+            name = rest
+            materials[name] = JSON
+        elif key == "Kd" and name:
+            materials[name] = materials[name]._replace(
+                color=np.array([float(x) for x in rest.split()[:3]])
+            )
+        elif key == "map_Kd" and name:
+            # options such as -s come before the file
+            file = rest.split()[-1] if rest.startswith("-") else rest
+            materials[name] = materials[name]._replace(image=read_image(path.parent / file, path))
+    # A picture is shown as it is: exporters leave Kd at any gray beside it.
+    return {k: m if m.image is None else m._replace(color=np.ones(3)) for k, m in materials.items()}
+
+
+def read_obj(path: Path) -> RawMesh:
+    """Parse Wavefront OBJ: v (with colors), vt, vn, f (any polygon, as a fan), mtllib, usemtl."""
+    numbers: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    corners: list[tuple[int, int, int]] = []
+    face_material: list[int] = []
+    library: dict[str, Material] = {}
+    materials: dict[str, int] = {}
+    current = 0
+    for line in path.read_text(errors="replace").splitlines():
+        key, _, rest = line.partition(" ")
+        if key in numbers:
+            numbers[key].append([float(x) for x in rest.split()])
+        elif key == "f":
+            polygon = [_corner(word, numbers) for word in rest.split()]
+            for i in range(1, len(polygon) - 1):
+                corners += [polygon[0], polygon[i], polygon[i + 1]]
+                face_material.append(current)
+        elif key == "mtllib":
+            library |= _read_mtl(path.parent / rest.strip(), path)
+        elif key == "usemtl":
+            current = materials.setdefault(rest.strip(), len(materials))
+    index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
+    vertices = _rectangle(numbers["v"], 3)
+    colors = (
+        _rectangle(numbers["v"], 6)[:, 3:] if numbers["v"] and len(numbers["v"][0]) >= 6 else None
+    )
+    known = [library.get(name, JSON) for name in materials] or list(library.values())[:1] or [JSON]
+    faces = index[..., 0]
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")
+    return RawMesh(
+        vertices,
+        faces,
+        _gather(_rectangle(numbers["vt"], 2), index[..., 1]),
+        _gather(_rectangle(numbers["vn"], 3), index[..., 2]),
+        None if colors is None else colors[faces].clip(0, 1),
+        np.array(face_material, dtype=np.int64),
+        known,
+    )
+
+
+def _corner(word: str, numbers: dict[str, list[list[float]]]) -> tuple[int, int, int]:
+    """Parse v, v/vt, v//vn or v/vt/vn into indices from 0; -1 where absent."""
+    parts = [*word.split("/"), "", ""][:3]
+    found = []
+    for part, key in zip(parts, ("v", "vt", "vn"), strict=True):
+        value = int(part) if part else 0
+        found.append(value - 1 if value >= 0 else len(numbers[key]) + value)
+    return found[0], found[1], found[2]
+
+
+def _rectangle(rows: list[list[float]], width: int) -> np.ndarray:
+    return np.array([row[:width] for row in rows], dtype=np.float64).reshape(-1, width)
+
+
+def _gather(values: np.ndarray, index: np.ndarray) -> np.ndarray | None:
+    """Return values[index], or None where the file leaves any corner without one."""
+    if len(values) == 0 or len(index) == 0 or index.min() < 0:
+        return None
+    return values[index]

@@ -1,0 +1,146 @@
+"""Where meshes come from: folders of one's own, YCB's layout, BOP's models, or the meshes that the
+project draws itself.
+"""
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.meshes import ycb
+from posefilter.meshes.builtin import catalog as builtin
+from posefilter.meshes.files import SUFFIXES, read_mesh
+from posefilter.meshes.mesh import Mesh, diameter, object_model
+from posefilter.meshes.symmetries import identity_first, read_symmetries, symmetry_group
+
+__all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
+
+# [m] no object of ours is larger or smaller across: the unit must be wrong
+_LARGEST, _SMALLEST = 10.0, 1e-3
+BUILTIN = "builtin"
+
+
+class MeshStore:
+    """Meshes by name, read once.
+
+    `root` is "builtin" or a folder: `<class>/google_16k/textured.obj` (YCB),
+    `<class>/*.{obj,ply,glb}`, or flat `<name>.{obj,ply,glb}`. `scale` turns the files' unit into
+    meters (0.001 for BOP). `symmetries` maps names to (S, 4, 4) object_from_object [m]; it beats
+    `symmetries.json` or BOP's `models_info.json` in the folder, which beat the tables of YCB and
+    the builtin meshes.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        scale: float = 1.0,
+        symmetries: Mapping[str, np.ndarray] | None = None,
+        symmetry_steps: int = 36,
+    ) -> None:
+        self.root, self.scale, self.symmetry_steps = root, scale, symmetry_steps
+        self._given = dict(symmetries or {})
+        self._files = {} if str(root) == BUILTIN else _find_meshes(Path(root))
+        self._loaded: dict[str, Mesh] = {}
+
+    def names(self) -> list[str]:
+        """Return every mesh's name, sorted."""
+        return builtin.names() if str(self.root) == BUILTIN else sorted(self._files)
+
+    def load(self, name: str) -> Mesh:
+        """Return a mesh, read or drawn on first use.
+
+        Raises UserError for unknown names, bad files and wrong units.
+        """
+        if name not in self._loaded:
+            self._loaded[name] = self._load(name)
+        return self._loaded[name]
+
+    def _load(self, name: str) -> Mesh:
+        if name not in self.names():
+            near = difflib.get_close_matches(name, self.names(), n=1, cutoff=0.3)
+            hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(self.names())}"
+            raise UserError(f"no mesh named '{name}' in {self.root}: {hint}")
+        if str(self.root) == BUILTIN:
+            mesh = builtin.build(name)
+        else:
+            mesh = read_mesh(self._files[name], name, self.scale)
+            _check_unit(mesh, self._files[name])
+        symmetries = self._symmetries(name)
+        return mesh if symmetries is None else replace(mesh, symmetries=symmetries)
+
+    def _symmetries(self, name: str) -> np.ndarray | None:
+        """Return the declared symmetries, None where nothing but the mesh itself says."""
+        if name in self._given:
+            return identity_first(
+                np.asarray(self._given[name], dtype=np.float64), f"symmetries of '{name}'"
+            )
+        if str(self.root) == BUILTIN:
+            return None
+        file = self._files[name]
+        for folder in dict.fromkeys([file.parent, Path(self.root) / name, Path(self.root)]):
+            for info in (folder / "symmetries.json", folder / "models_info.json"):
+                if info.is_file():
+                    return read_symmetries(info, name, self.scale, self.symmetry_steps)
+        return ycb.symmetries(name, self.symmetry_steps)
+
+
+def _find_meshes(root: Path) -> dict[str, Path]:
+    if not root.is_dir():
+        raise UserError(
+            f"{root}: no such folder of meshes (use 'builtin' for those that the "
+            f"project draws itself)"
+        )
+    files: dict[str, Path] = {}
+    for entry in sorted(root.iterdir()):
+        found = (
+            _mesh_in(entry)
+            if entry.is_dir()
+            else entry
+            if entry.suffix.lower() in SUFFIXES
+            else None
+        )
+        if found is not None:
+            files.setdefault(entry.name if entry.is_dir() else entry.stem, found)
+    if not files:
+        kinds = "{obj,ply,glb}"
+        raise UserError(
+            f"{root}: no meshes here; expected <class>/google_16k/textured.obj, "
+            f"<class>/*.{kinds} or *.{kinds}"
+        )
+    return files
+
+
+def _mesh_in(folder: Path) -> Path | None:
+    """Return the mesh that stands for a class's folder, None where there is none."""
+    preferred = [
+        folder / "google_16k" / "textured.obj",
+        *(folder / f"textured{suffix}" for suffix in SUFFIXES),
+    ]
+    for path in preferred:
+        if path.is_file():
+            return path
+    others = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    if len({p.stem for p in others}) > 1:
+        raise UserError(
+            f"{folder}: {len(others)} meshes and none named textured.*: cannot tell "
+            f"which one is meant"
+        )
+    # one mesh in several formats
+    return min(others, key=lambda p: SUFFIXES.index(p.suffix.lower()), default=None)
+
+
+def _check_unit(mesh: Mesh, path: Path) -> None:
+    across = diameter(mesh.vertices)
+    if across > _LARGEST:
+        factor, unit = 0.001, "millimeters"
+    elif across < _SMALLEST:
+        factor, unit = 1000.0, "kilometres, or scaled twice"
+    else:
+        return
+    raise UserError(
+        f"{path}: {across:.3g} m across: the mesh is probably in {unit}; give the "
+        f"mesh store scale={factor:g}"
+    )

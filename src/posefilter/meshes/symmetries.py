@@ -1,0 +1,90 @@
+"""Symmetries of objects: declared transforms that change nothing one can see."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from posefilter.errors import UserError
+from posefilter.geometry.rotation import exp_so3
+
+
+def symmetry_group(
+    discrete: list[np.ndarray] | None = None,
+    continuous: list[tuple[np.ndarray, np.ndarray]] | None = None,
+    steps: int = 36,
+) -> np.ndarray:
+    """Return every product of discrete symmetries and steps about continuous axes.  -> (S, 4, 4),
+    the identity first.
+
+    `discrete`: (4, 4) each, as BOP lists them (all but the identity). `continuous`: (axis, a point
+    on it [m]) each, cut into `steps` equal turns.
+    """
+    group = [np.eye(4), *(discrete or [])]
+    for axis, offset in continuous or []:
+        unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        turns = [turn_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
+        group = [a @ b for a in group for b in turns]
+    return np.stack(group)
+
+
+def turn_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndarray:
+    """Return the turn by an angle [rad] about a line.
+
+    Unit axis (3,), a point on it (3,) [m] -> (4, 4).
+    """
+    out = np.eye(4)
+    out[:3, :3] = exp_so3(torch.as_tensor(np.asarray(axis, dtype=np.float64) * angle)).numpy()
+    out[:3, 3] = point - out[:3, :3] @ point
+    return out
+
+
+def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarray:
+    """Read an entry of BOP's models_info.json (or a symmetries.json of the same kind), lengths in
+    the mesh file's unit.
+    """
+    try:
+        table = json.loads(info.read_text())
+        digits = "".join(c for c in name if c.isdigit())
+        keys = [name, digits.lstrip("0")] if name.startswith("obj_") else [name]
+        entry = next(
+            (table[k] for k in keys if k in table), table if "symmetries_discrete" in table else {}
+        )
+        discrete = [
+            np.array(m, dtype=np.float64).reshape(4, 4)
+            for m in entry.get("symmetries_discrete", [])
+        ]
+        for matrix in discrete:
+            matrix[:3, 3] *= scale
+        continuous = [
+            (
+                np.array(c["axis"], dtype=np.float64),
+                np.array(c.get("offset", [0, 0, 0]), dtype=np.float64) * scale,
+            )
+            for c in entry.get("symmetries_continuous", [])
+        ]
+        return identity_first(symmetry_group(discrete, continuous, steps), str(info))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(
+            f"{info}: cannot read the symmetries of '{name}' ({error}); the format is BOP's "
+            f"models_info"
+        ) from error
+
+
+def identity_first(symmetries: np.ndarray, source: str) -> np.ndarray:
+    """Return the symmetries with the identity first and once; UserError, naming their source,
+    unless rigid.  (S, 4, 4).
+    """
+    if symmetries.ndim != 3 or symmetries.shape[1:] != (4, 4):
+        raise UserError(f"{source}: symmetries must be of shape (S, 4, 4), not {symmetries.shape}")
+    R = symmetries[:, :3, :3]
+    if (
+        not np.allclose(R @ R.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+        or (np.linalg.det(R) < 0).any()
+    ):
+        raise UserError(
+            f"{source}: a symmetry is not a rigid transform (rotation and translation, no mirror)"
+        )
+    is_identity = np.abs(symmetries - np.eye(4)).max(axis=(1, 2)) < 1e-9
+    return np.concatenate([np.eye(4)[None], symmetries[~is_identity]])

@@ -1,0 +1,208 @@
+"""What the pose-space method is trained on: clouds whose scores its loss judges.
+
+A lesson returns a Trace of one step.
+"""
+
+import math
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth
+from posefilter.geometry.camera import back_project, rays
+from posefilter.geometry.pose import invert, transform
+from posefilter.nets.paper_likelihood import PaperLikelihood
+from posefilter.protocols import Scene
+from posefilter.types import Batch, Belief, ParticleOutput, Particles, Step, Trace
+
+if TYPE_CHECKING:
+    from posefilter.models.pose_pf import PosePF
+
+
+class CandidateSampler(Protocol):
+    """Make one training cloud of a batch."""
+
+    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+        """Return a trace of one step, its scores differentiable."""
+        ...
+
+    def state(self) -> dict[str, Tensor]:
+        """Return what it remembers from batch to batch, for a run that is to be resumed."""
+        ...
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Remember what `state` returned."""
+        ...
+
+
+def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) -> Trace:
+    """Wrap a scored cloud of poses as a trace whose belief is the softmax of the scores."""
+    log_weights = torch.log_softmax(output.log_likelihood, dim=1)
+    top = log_weights.argmax(1)
+    best = output.pose[torch.arange(len(top), device=top.device), top]
+    belief = Belief(output.pose, log_weights, best, output.log_likelihood.amax(1))
+    return Trace((particles,), (output,), (Step(0, 1, sigma),), belief)
+
+
+def make_even_particles(state: Tensor) -> Particles:
+    """Wrap states (B, N, *S) as an evenly weighted cloud without latent."""
+    B, N = state.shape[:2]
+    weights = state.new_full((B, N), -math.log(N))
+    return Particles(
+        state, state.new_zeros(B, N, 0), weights, torch.arange(N, device=state.device).expand(B, N)
+    )
+
+
+class CandidatePoses:
+    """Candidates from everywhere, at one noise level an image: the working variant's lesson.
+
+    each: candidates of each kind around the truth; proposed: poses from the proposal network, where
+    there is one; particles: the filter's own persistent particles (0 puts self-generated negatives
+    back to none); sigma: range of noise levels [m]; start: level at which those particles leave
+    proposals, as they do at test time [m] (without proposals they leave from depth, at the
+    broadest); levels: their steps from there to the sharpest; own_level: share of images read at
+    their level.
+    """
+
+    def __init__(
+        self,
+        each: int = 8,
+        proposed: int = 8,
+        particles: int = 16,
+        sigma: tuple[float, float] = (0.004, 0.25),
+        start: float = 0.05,
+        levels: int = 12,
+        own_level: float = 0.5,
+    ) -> None:
+        self.each, self.proposed, self.sigma, self.own_level = (
+            each,
+            proposed,
+            (float(sigma[0]), float(sigma[1])),
+            own_level,
+        )
+        self.start = float(start)
+        self.persistent = (
+            PersistentParticles(particles, levels, self.sigma[0]) if particles else None
+        )
+
+    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+        """Draw candidates, read them, and let the persistent particles take a step."""
+        B, device = len(batch.rgb), batch.rgb.device
+        model = method.model
+        low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
+        sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
+        groups = [around_truth(batch, model, method.space, self.each, self.sigma, generator)]
+        proposals = scene.said is not None
+        if self.proposed and proposals:
+            groups.append(method.propose_poses(scene, self.proposed, generator))
+        own = torch.zeros(B, dtype=torch.bool, device=device)
+        if self.persistent is not None:
+            count, space = self.persistent.particles, method.space
+            fresh = (
+                method.propose_poses(scene, count, generator)
+                if proposals
+                else from_depth(batch, space, count, generator)
+            )
+            states, level = self.persistent.recall(
+                batch, fresh, self.start if proposals else self.sigma[1]
+            )
+            own = torch.rand(B, device=device, generator=generator) < self.own_level
+            sigma = torch.where(own, level, sigma)
+            groups.append(states)
+        particles = make_even_particles(torch.cat(groups, dim=1))
+        output = method.measure(scene, particles, Step(0, 1, sigma), generator)
+        if self.persistent is not None:
+            scores = output.log_likelihood[:, -self.persistent.particles :].detach()
+            self.persistent.advance(batch, groups[-1], scores, sigma, own, method.space, generator)
+        return one_step_trace(particles, output, sigma)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return the persistent particles."""
+        return self.persistent.state() if self.persistent is not None else {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Take persistent particles back."""
+        if self.persistent is not None:
+            self.persistent.restore(state)
+
+
+class LabeledRays:
+    """The paper's lesson: points along the rays of the object's pixels, scored one by one (section
+    5).
+
+    rays: mask pixels an image and step (not stated; the paper takes all of them); samples: points a
+    ray, evenly spaced from `start` in front of the camera to `past` behind the observed point;
+    tolerance: the half width of the surface, where a second sample keeps the observed color. Colors
+    are random otherwise.
+    """
+
+    def __init__(
+        self,
+        rays: int = 64,
+        samples: int = 30,
+        start: float = 0.10,
+        past: float = 0.05,
+        tolerance: float = 0.01,
+    ) -> None:
+        self.rays, self.samples, self.start, self.past, self.tolerance = (
+            rays,
+            samples,
+            start,
+            past,
+            tolerance,
+        )
+
+    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+        """Draw samples and read each; the cloud's states are (B, N, 4): u, v, offset behind the
+        surface [m], own color.
+        """
+        net = method.likelihood
+        if not isinstance(net, PaperLikelihood):
+            raise UserError(
+                "model.lesson: labeled rays teach the paper's likelihood only; choose "
+                "likelihood=paper or candidate_sampler=candidates"
+            )
+        B, _, _, W = batch.depth.shape
+        device = batch.rgb.device
+        depth = batch.depth.flatten(1)
+        usable = (batch.mask.flatten(1) & (depth > self.start)).float()
+        empty = usable.sum(1) == 0  # such an image teaches nothing: its samples get no weight below
+        pick = torch.multinomial(
+            usable + empty[:, None], self.rays, replacement=True, generator=generator
+        )
+        pixel = torch.stack([pick % W, pick // W], dim=-1).float()
+        z = depth.gather(1, pick)[..., None]
+        share = torch.linspace(0, 1, self.samples, device=device)
+        at = self.start + (z + self.past - self.start) * share  # (B, rays, samples) z-depth [m]
+        length = rays(pixel, batch.intrinsics).norm(dim=-1, keepdim=True)
+        offset = ((at - z) * length).flatten(1)
+        pixel = pixel[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)
+        point = transform(
+            invert(batch.camera_from_object), back_project(pixel, at.flatten(1), batch.intrinsics)
+        )
+        observed = scene.image.values.gather(1, pick[..., None].expand(-1, -1, 3))
+        observed = observed[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)
+        random = torch.rand(observed.shape, generator=generator, device=device)
+        near = (offset.abs() <= self.tolerance) & ~empty[:, None]
+        state = [
+            torch.cat([pixel, offset[..., None], torch.full_like(offset, own)[..., None]], -1)
+            for own in (0.0, 1.0)
+        ]
+        weight = torch.cat([(~empty[:, None]).expand_as(near), near], dim=1).float()
+        judged = net.judge_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
+        log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
+        particles = make_even_particles(torch.cat(state, dim=1))._replace(log_weights=log_weights)
+        pose = batch.camera_from_object[:, None].expand(-1, judged.shape[1], -1, -1)
+        output = ParticleOutput(
+            judged, judged.new_zeros(B, judged.shape[1], 6), pose, particles.latent
+        )
+        return one_step_trace(particles, output, torch.full((B,), self.tolerance, device=device))
+
+    def state(self) -> dict[str, Tensor]:
+        """Return nothing: every batch is new to it."""
+        return {}
+
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Remember nothing."""

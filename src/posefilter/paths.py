@@ -1,0 +1,68 @@
+"""Keep what files say about other files inside one folder: no absolute path, no `..`, no link that
+leads out.
+"""
+
+import os
+from functools import lru_cache
+from pathlib import Path, PureWindowsPath
+
+from posefilter.errors import UserError
+
+
+def is_plain_name(name: str) -> bool:
+    """Tell whether a name is one part of a path and nothing else: no separator, no leading dot,
+    only what can be printed.
+    """
+    return (
+        0 < len(name) <= 100
+        and name.isprintable()
+        and not name.startswith((".", "~"))
+        and not set(name) & set("/\\:")
+    )
+
+
+def stays_inside(path: str, folder: Path) -> bool:
+    """Tell whether a path that a file states is relative and stays below a folder, links resolved.
+
+    A folder `outputs` that the user has made a link counts as a part of the folder.
+    """
+    if "\0" in path or "://" in path or path.startswith("~"):
+        return False
+    for kind in (Path(path), PureWindowsPath(path)):
+        if kind.is_absolute() or kind.drive or ".." in kind.parts:
+            return False
+    homes = (Path(os.path.realpath(folder)), Path(os.path.realpath(folder / "outputs")))
+    return any(Path(os.path.realpath(folder / path)).is_relative_to(home) for home in homes)
+
+
+def check_inside(path: Path, root: Path) -> Path:
+    """Return a path below a root as it is.
+
+    Raises UserError where links or `..` lead out of the root.
+    """
+    folder, home = _real(str(path.parent)), _real(str(root))
+    real = os.path.realpath(path) if path.is_symlink() else f"{folder}/{path.name}"
+    if path.name == ".." or os.path.commonpath([real, home]) != home:
+        raise UserError(
+            f"{path}: leads out of {root}; what a dataset or mesh names must lie in its own folder"
+        )
+    return path
+
+
+def check_links(folder: Path) -> None:
+    """Raise UserError where a link in a folder leads out of it: what is written there would go
+    elsewhere.
+    """
+    home = os.path.realpath(folder)
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if path.is_symlink() and os.path.commonpath([os.path.realpath(path), home]) != home:
+                raise UserError(
+                    f"{path}: is a link that leads out of its run's folder; remove it, or give out="
+                )
+
+
+@lru_cache(maxsize=4096)
+def _real(folder: str) -> str:
+    return os.path.realpath(folder)

@@ -1,0 +1,214 @@
+"""Every protocol on one page.  Each verb of the filter is one injected piece; a Hydra group chooses
+which.
+
+DataModule -> Batch -> method.encode -> [read -> reweight -> resample -> move] x steps -> estimate
+-> refine -> Belief The order on this page is the order in which filters/loop.py calls them.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Generator, Tensor
+
+from posefilter.types import (
+    Batch,
+    Belief,
+    ObjectModel,
+    ParticleOutput,
+    Particles,
+    Resampled,
+    Step,
+    Trace,
+)
+
+Scene = Any  # what a method keeps of an image: nothing, a pyramid, a feature map, proposals
+
+
+class Space(Protocol):
+    """Where particles live."""
+
+    @property
+    def dimensions(self) -> int:
+        """Return the width of a tangent vector."""
+        ...
+
+    def move(self, state: Tensor, tangent: Tensor) -> Tensor:
+        """Displace states.  (*, *S), (*, D) -> (*, *S)."""
+        ...
+
+    def noise_scale(self, sigma: Tensor) -> Tensor:
+        """Return the standard deviation an axis of a move of size sigma.  (*) -> (*, D)."""
+        ...
+
+    def mean(self, state: Tensor, weights: Tensor) -> Tensor:
+        """Return the weighted mean of states.  (*, N, *S), (*, N) -> (*, *S)."""
+        ...
+
+    def distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Return a distance in the space's unit.  (*, *S) x 2 -> (*)."""
+        ...
+
+
+class Method(Protocol):
+    """A way to turn an image and a particle into a likelihood, a pose and a displacement."""
+
+    @property
+    def space(self) -> Space:
+        """Return the space this method's particles live in."""
+        ...
+
+    @property
+    def latent_width(self) -> int:
+        """Return L, the width of a particle's latent (0 for none)."""
+        ...
+
+    def encode(self, batch: Batch) -> Scene:
+        """Look at the images once.  Must not read `batch.mask` or `batch.camera_from_object`."""
+        ...
+
+    def measure(
+        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        """Judge every particle of a cloud."""
+        ...
+
+
+@runtime_checkable
+class ScoresPoses(Protocol):
+    """A method that can score any poses: refinement asks for it."""
+
+    def score_poses(
+        self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
+        """Score (B, N, 4, 4) at noise level sigma, from `pixels` image points each -> (B, N),
+        differentiable in poses.
+        """
+        ...
+
+
+@runtime_checkable
+class ProposesPoses(Protocol):
+    """A method that can draw likely poses from an image: the start `from proposals` asks for it."""
+
+    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+        """Return (B, particles, 4, 4) camera_from_object."""
+        ...
+
+
+@runtime_checkable
+class HasSurfacePoints(Protocol):
+    """A method whose particles each stand on one measured point of its object: the estimate
+    `agreement` asks for it.
+    """
+
+    model: ObjectModel
+
+    def surface_points(self, scene: Scene, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
+        N) bool.
+        """
+        ...
+
+
+@runtime_checkable
+class HasRelevance(Protocol):
+    """A scene that tells where in its images to look: the start `from relevance` asks for it."""
+
+    @property
+    def relevance(self) -> Tensor:
+        """Return how much each cell matters, (B, 1, h, w) >= 0, cells evenly over the image."""
+        ...
+
+
+class Schedule(Protocol):
+    """Set the noise level of each step."""
+
+    def __call__(self, steps: int) -> list[float]:
+        """Return sigma for each of the steps."""
+        ...
+
+
+class Initialize(Protocol):
+    """Draw the first cloud's states."""
+
+    def __call__(
+        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+    ) -> Tensor:
+        """Return states (B, N, *S)."""
+        ...
+
+
+class Reweight(Protocol):
+    """Turn likelihoods into weights."""
+
+    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+        """Return log weights (B, N), to be normalized by the caller; their log sum is the step's
+        log evidence.
+
+        log_weights (B, N), normalized: what the particles start the step with; log_likelihood (B,
+        N): read at this step; inherited (B, N): each one's parent's log_likelihood, read at the
+        step before (zeros at the first).
+        """
+        ...
+
+
+class Resample(Protocol):
+    """Draw children from a weighted cloud."""
+
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
+        """Return parents **and** the weights that children start with, so that none can be
+        forgotten.
+        """
+        ...
+
+
+class Propagate(Protocol):
+    """Move the children of a resampling."""
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """(B, N, *S), learned displacement (B, N, D) -> moved states (B, N, *S)."""
+        ...
+
+
+class Estimate(Protocol):
+    """Bet on one pose."""
+
+    def __call__(
+        self,
+        particles: Particles,
+        output: ParticleOutput,
+        scene: Scene,
+        method: Method,
+        generator: Generator,
+    ) -> Belief:
+        """Return the belief that the last cloud amounts to."""
+        ...
+
+
+class Refine(Protocol):
+    """Polish an estimate."""
+
+    def __call__(
+        self, belief: Belief, scene: Scene, method: Method, generator: Generator
+    ) -> Belief:
+        """Return the belief with its `best` (and `score`) improved."""
+        ...
+
+
+class Label(Protocol):
+    """Say, for each particle, what the truth asks of it."""
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return a target for each particle of each step, (T, B, N) or (T, B, N, D)."""
+        ...
+
+
+class Loss(Protocol):
+    """Judge a run of the filter, or a scored cloud of candidates."""
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return one value an image, (B,)."""
+        ...

@@ -1,0 +1,1 @@
+"""Render color, depth and labels of meshes."""

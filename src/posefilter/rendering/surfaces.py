@@ -1,0 +1,146 @@
+"""What a picture is made of: instances, planes and lights go in; surfaces, then a lit picture come
+out.
+
+Camera axes as everywhere (OpenCV, pixel centers at integers). Rays are left as [x, y, 1], so that
+the distance along a ray *is* the z-depth.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from posefilter.meshes.mesh import Mesh
+
+NEAR = 0.02  # [m]; nothing nearer is drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """One mesh in the picture."""
+
+    mesh: Mesh
+    camera_from_object: np.ndarray  # (4, 4) [m]; its linear part may stretch
+    texture: np.ndarray | None = None  # (h, w, 3) uint8, instead of the mesh's own
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A textured rectangle in its own z = 0."""
+
+    camera_from_plane: np.ndarray  # (4, 4) [m], rigid
+    half_extent: tuple[float, float]  # [m] along its x and y
+    texture: np.ndarray  # (h, w, 3) uint8, repeated
+    tile: float  # the side of one copy of the texture [m]
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Ambient light, and lights infinitely far away."""
+
+    ambient: float = 0.6
+    # towards the light, camera axes
+    directions: tuple[tuple[float, float, float], ...] = ((0.3, -0.7, -0.6),)
+    strengths: tuple[float, ...] = (0.5,)
+    specular: float = 0.0
+    shininess: float = 20.0
+    shadows: bool = False  # of the instances, cast by the first light
+    shadow_blur: float = 1.0  # [px / 3]
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # color where nothing is
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """What each pixel sees, before light."""
+
+    albedo: np.ndarray  # (H, W, 3) float32 in [0, 1]
+    normal: np.ndarray  # (H, W, 3) float32 unit, camera axes, towards the camera
+    depth: np.ndarray  # (H, W) float32 [m], 0 = nothing
+    index: np.ndarray  # (H, W) int32 into the instances, -1 = none of them
+    alone: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A lit picture."""
+
+    rgb: np.ndarray  # (H, W, 3) float32, 1 = white, may exceed it
+    depth: np.ndarray  # (H, W) float32 [m], 0 = nothing
+    index: np.ndarray  # (H, W) int32 into the instances, -1 = none of them
+    alone: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
+
+
+class Renderer(Protocol):
+    """Anything that turns instances into pictures."""
+
+    def render(
+        self,
+        instances: Sequence[Instance],
+        K: np.ndarray,
+        height: int,
+        width: int,
+        lights: Lights,
+        planes: Sequence[Plane] = (),
+    ) -> Rendered:
+        """Return the picture of the instances before the planes."""
+        ...
+
+
+def pixel_rays(K: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return the ray [x, y, 1] of every pixel center.  -> (H, W, 3) float32."""
+    rays = np.ones((height, width, 3), np.float32)
+    rays[..., 0] = (np.arange(width) - K[0, 2]) / K[0, 0]
+    rays[..., 1] = ((np.arange(height) - K[1, 2]) / K[1, 1])[:, None]
+    return rays
+
+
+def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the flat indices of the pixels that the convex hull of camera points may cover."""
+    height, width = shape
+    if (points[:, 2] < NEAR).all():
+        return np.zeros(0, np.int64)
+    if (points[:, 2] < NEAR).any():
+        return np.arange(height * width)
+    pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+    pixels = np.clip(pixels, [-4.0 * width, -4.0 * height], [5.0 * width, 5.0 * height])
+    low = np.maximum(np.floor(pixels.min(0)).astype(int) - 2, 0)
+    high = np.minimum(np.ceil(pixels.max(0)).astype(int) + 3, [width, height])
+    if (high <= low).any():
+        return np.zeros(0, np.int64)
+    outline = cv2.convexHull(np.round((pixels - low) * 16).astype(np.int32))
+    mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
+    cv2.fillConvexPoly(mask, outline, 1, shift=4)
+    cv2.polylines(mask, [outline], True, 1, thickness=3, shift=4)  # a margin: the fill rounds
+    y, x = np.nonzero(mask)
+    return (y + low[1]) * width + x + low[0]
+
+
+def light(
+    seen: Surfaces, rays: np.ndarray, lights: Lights, shadow: np.ndarray | None = None
+) -> np.ndarray:
+    """Light the surfaces: ambient, Lambert, and a Blinn-Phong highlight of the first light.  -> (H,
+    W, 3) float32.
+    """
+    shade = np.full(seen.depth.shape, np.float32(lights.ambient))
+    highlight = np.zeros_like(shade)
+    for k, (direction, strength) in enumerate(
+        zip(lights.directions, lights.strengths, strict=True)
+    ):
+        L = unit(np.asarray(direction, np.float32))
+        arriving = np.float32(strength) if k or shadow is None else np.float32(strength) * shadow
+        shade += arriving * np.maximum(seen.normal @ L, 0)
+        if k == 0 and lights.specular > 0:
+            half = L - rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+            half /= np.linalg.norm(half, axis=-1, keepdims=True) + 1e-6
+            glint = np.maximum((seen.normal * half).sum(-1), 0) ** np.float32(lights.shininess)
+            highlight = glint * np.float32(lights.specular) * (1 if shadow is None else shadow)
+    rgb = seen.albedo * shade[..., None] + highlight[..., None]
+    rgb[seen.depth == 0] = lights.background
+    return rgb
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """Return a vector at length one."""
+    return v / np.linalg.norm(v)

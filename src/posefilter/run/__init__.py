@@ -1,6 +1,0 @@
-"""The only part of the project that knows Hydra: from a command line to files in a folder."""
-
-from posefilter.run.command import run_command
-from posefilter.run.job import Job
-
-__all__ = ["Job", "run_command"]

@@ -1,0 +1,1 @@
+"""Synthetic scenes: placing, textures, sensor, writing them."""

@@ -1,0 +1,200 @@
+"""The Falling Things format on disk: its constants, and how to write it.
+
+A folder holds `_object_settings.json`, `_camera_settings.json` and for each frame and camera
+`NNNNNN.left.jpg`, `.json`, `.depth.png` and `.seg.png`. Lengths in the JSON files are centimeters,
+depth images are 0.1 mm a unit. Poses are of an *aligned* object frame: y down, centerd on the
+bounding box. How the mesh gets there, each folder's `fixed_model_transform` F says, for row
+vectors: p_aligned_cm = [x y z 1] @ F.
+"""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from posefilter.geometry.rotation import quat_xyzw_from_matrix
+from posefilter.meshes.mesh import Mesh
+
+CM = 100.0  # centimeters a meter
+DEPTH_UNITS = 10_000.0  # depth image units a meter
+BASELINE = 0.06  # [m] from the left camera to the right
+CLASS_SUFFIX = "_16k"
+OBJECT_SETTINGS = "_object_settings.json"
+CAMERA_SETTINGS = "_camera_settings.json"
+CUBOID_SIGNS = np.array(
+    [
+        [1, -1, 1],
+        [-1, -1, 1],
+        [-1, 1, 1],
+        [1, 1, 1],
+        [1, -1, -1],
+        [-1, -1, -1],
+        [-1, 1, -1],
+        [1, 1, -1],
+    ],
+    dtype=np.float64,
+)  # the order of a cuboid's corners, in the aligned frame
+# z up -> y down, as FAT's cracker box has it
+_ALIGNED_FROM_UPRIGHT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedObject:
+    """An object class as a folder's settings describe it."""
+
+    name: str  # without FAT's suffix
+    seg_id: int
+    aligned_from_mesh: np.ndarray  # (4, 4) rigid [m], column vectors
+    dimensions: np.ndarray  # (3,) of the cuboid [m], aligned axes
+
+    @property
+    def fat_class(self) -> str:
+        """Return the class as FAT spells it."""
+        return self.name + CLASS_SUFFIX
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectInFrame:
+    """One object of one frame."""
+
+    exported: ExportedObject
+    camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
+    visibility: float  # visible share of the pixels that it would have in the frame were it alone
+    truncated: float  # share of its outline that leaves the frame
+
+
+def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
+    """Describe a mesh by its own bounding box: upright turned y down, centerd."""
+    center = mesh.box_head.mean(0)
+    aligned = np.eye(4)
+    aligned[:3, :3] = _ALIGNED_FROM_UPRIGHT
+    aligned[:3, 3] = -_ALIGNED_FROM_UPRIGHT @ center
+    sides = np.abs(_ALIGNED_FROM_UPRIGHT @ (mesh.box_head[1] - mesh.box_head[0]))
+    return ExportedObject(mesh.name, seg_id, aligned, sides)
+
+
+def object_settings(objects: Sequence[ExportedObject]) -> dict[str, Any]:
+    """Return what `_object_settings.json` says of a folder's classes."""
+    exported = []
+    for one in objects:
+        F = one.aligned_from_mesh.T.copy()
+        F[:, :3] *= CM
+        entry = {
+            "class": one.fat_class,
+            "segmentation_class_id": one.seg_id,
+            "fixed_model_transform": _numbers(F, 7),
+            "cuboid_dimensions": _numbers(one.dimensions * CM, 6),
+        }
+        exported.append(entry)
+    return {
+        "exported_object_classes": [one.fat_class for one in objects],
+        "exported_objects": exported,
+    }
+
+
+def camera_settings(
+    K: np.ndarray, height: int, width: int, cameras: Sequence[str]
+) -> dict[str, Any]:
+    """Return what `_camera_settings.json` says of a folder's cameras."""
+    one = {
+        "horizontal_fov": float(np.rad2deg(2 * np.arctan(width / 2 / K[0, 0]))),
+        "intrinsic_settings": {
+            "fx": float(K[0, 0]),
+            "fy": float(K[1, 1]),
+            "cx": float(K[0, 2]),
+            "cy": float(K[1, 2]),
+            "s": 0,
+        },
+        "captured_image_size": {"width": width, "height": height},
+    }
+    return {"camera_settings": [{"name": name, **one} for name in cameras]}
+
+
+def frame_record(
+    objects: Sequence[ObjectInFrame], K: np.ndarray, eye: float = 0.0
+) -> dict[str, Any]:
+    """Return a frame's JSON.  eye: how far right of the left camera this one stands [m].
+
+    There is no world here: the world frame (left-handed, x forward, y right, z up, centimeters) is
+    the left camera's place.
+    """
+    camera = {
+        "location_worldframe": [0.0, eye * CM, 0.0],
+        "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
+    }
+    return {"camera_data": camera, "objects": [_object_record(one, K) for one in objects]}
+
+
+def _object_record(one: ObjectInFrame, K: np.ndarray) -> dict[str, Any]:
+    camera_from_aligned = one.camera_from_object @ np.linalg.inv(one.exported.aligned_from_mesh)
+    R, t = camera_from_aligned[:3, :3], camera_from_aligned[:3, 3]
+    corners = (CUBOID_SIGNS * one.exported.dimensions / 2) @ R.T + t
+    pixels = _project(corners, K)
+    # aligned axes permuted as the exporter does: x' = z, y' = x, z' = -y; row vectors
+    permuted = np.eye(4)
+    permuted[:3, :3] = np.stack([R[:, 2], R[:, 0], -R[:, 1]])
+    permuted[3, :3] = t * CM
+    low, high = pixels.min(0)[::-1], pixels.max(0)[::-1]
+    return {
+        "class": one.exported.fat_class,
+        "visibility": round(float(one.visibility), 4),
+        "truncated": round(float(one.truncated), 4),
+        "location": _numbers(t * CM, 6),
+        "quaternion_xyzw": _numbers(quat_xyzw_from_matrix(torch.from_numpy(R.copy())).numpy(), 9),
+        "pose_transform_permuted": _numbers(permuted, 6),
+        "cuboid_centroid": _numbers(t * CM, 6),
+        "projected_cuboid_centroid": _numbers(_project(t[None], K)[0], 4),
+        "bounding_box": {"top_left": _numbers(low, 4), "bottom_right": _numbers(high, 4)},
+        "cuboid": _numbers(corners * CM, 6),
+        "projected_cuboid": _numbers(pixels, 4),
+    }
+
+
+def write_image(path: Path, image: np.ndarray) -> None:
+    """Write a JPEG (RGB) or PNG; PNGs at a fast level.
+
+    Raises OSError where it cannot be written.
+    """
+    if path.suffix == ".jpg":
+        ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+    else:
+        ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])
+    if not ok:
+        raise OSError(f"{path}: the image could not be encoded")
+    write_bytes(path, data.tobytes())
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write JSON, whole or not at all."""
+    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file, whole or not at all: beside it first, then renamed."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial.write_bytes(data)
+    partial.replace(path)
+
+
+def depth_units(depth: np.ndarray) -> np.ndarray:
+    """Return depth as it is stored.
+
+    (H, W) [m] -> (H, W) uint16, 0.1 mm a unit; 0 where nothing or beyond 6.5535 m.
+    """
+    units = np.round(depth * DEPTH_UNITS)
+    return np.where(units > 65535, 0, units).astype(np.uint16)
+
+
+def _project(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    return points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+
+
+def _numbers(array: np.ndarray, decimals: int) -> Any:
+    """Return nested lists of floats with so many decimals."""
+    return (np.round(np.asarray(array, dtype=np.float64), decimals) + 0.0).tolist()

@@ -1,0 +1,291 @@
+"""Render cluttered scenes in the FAT format: the same for any number of processes, resumable after
+a kill.
+"""
+
+import importlib.metadata
+import json
+import logging
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+
+from posefilter.errors import UserError
+from posefilter.meshes.store import MeshStore
+from posefilter.progress import bars
+from posefilter.synthetic import fat_format as fat
+from posefilter.synthetic.painter import Job, Painter, make_renderer
+from posefilter.synthetic.scenes import SceneSettings
+from posefilter.synthetic.sensor import sensor_model
+from posefilter.synthetic.settle import load_mujoco
+
+log = logging.getLogger(__name__)
+
+GENERATOR = "_generator.json"
+VERSION = 4  # of the scenes that a seed gives: raise it when they change
+FRAMES_PER_TASK = 5
+_YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
+_FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run did."""
+
+    out: Path
+    frames: int  # that the dataset holds now
+    rendered: int  # of them by this run
+    folders: int
+    seconds: float
+
+    @property
+    def frames_per_second(self) -> float:
+        """Return this run's speed."""
+        return self.rendered / max(self.seconds, 1e-9)
+
+
+def generate(
+    out: Path | str,
+    frames: int,
+    meshes: str | Path = "builtin",
+    object: str = "003_cracker_box",
+    seed: int = 0,
+    workers: int = 2,
+    size: tuple[int, int] = (640, 480),
+    stereo: bool = False,
+    sensor: str = "kinect",
+    camera: str | Sequence[float] = "ycb_video",
+    occlusion: float = 0.75,
+    occluded_share: float = 0.4,
+    distractors: tuple[int, int] = (2, 8),
+    tabletop_share: float = 0.65,
+    frames_per_scene: int = 50,
+    settle: bool = False,
+    renderer: str = "embree",
+    progress: bool = True,
+) -> Summary:
+    """Render `frames` frames of `object` into a FAT dataset at `out`, or go on with one that was
+    begun.
+
+    size: (width, height) [px]. camera: "ycb_video", "fat", or (fx, fy, cx, cy) [px] for that size.
+    sensor: "kinect" or "ideal". occlusion: the largest share of the target that may be hidden;
+    occluded_share: of frames in which something stands right in front of it. Frame i depends on the
+    settings, the seed and i alone. Raises UserError for bad values, and where `out` was begun with
+    other settings.
+    """
+    out = Path(out)
+    scenes = SceneSettings(
+        distractors=(int(distractors[0]), int(distractors[1])),
+        occlusion=float(occlusion),
+        occluded_share=float(occluded_share),
+        tabletop_share=float(tabletop_share),
+        settle=bool(settle),
+    )
+    width, height = (int(n) for n in size)
+    K = camera_matrix(camera, width, height)
+    rows = tuple(tuple(float(x) for x in row) for row in K)
+    job = Job(
+        object,
+        str(meshes),
+        int(seed),
+        width,
+        height,
+        rows,
+        stereo,
+        sensor,
+        int(frames_per_scene),
+        renderer,
+        scenes,
+    )
+    _check(job, frames, workers)
+    store = MeshStore(meshes)
+    if object not in store.names():
+        store.load(object)  # says what is wrong with the name
+    _claim(out, job, frames)
+    todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
+    if todo:
+        log.info("rendering %d frames of %s into %s", len(todo), object, out)
+    began = time.perf_counter()
+    for _ in _run(job, out, todo, workers, progress):
+        pass
+    folders = len({job.folder(i) for i in range(frames)})
+    return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
+
+
+def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
+    """Return K (3, 3) [px] of a named camera, scaled to the size, or of (fx, fy, cx, cy) as given.
+
+    Raises UserError.
+    """
+    named = {"ycb_video": _YCB_VIDEO, "fat": _FAT}
+    if isinstance(camera, str):
+        if camera not in named:
+            raise UserError(
+                f"camera={camera}: unknown; choose from {', '.join(named)}, or give fx,fy,cx,cy"
+            )
+        fx, fy, cx, cy, w, h = named[camera]
+        scale = width / w
+        # another shape of picture: same field of view across, centerd
+        if abs(height / h - scale) > 0.01 * scale:
+            cy = (h - 1) / 2 + ((height / scale) - h) / 2
+        fx, fy, cx, cy = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
+    else:
+        if len(camera) != 4:
+            raise UserError(f"camera={list(camera)}: needs four numbers, fx,fy,cx,cy [px]")
+        fx, fy, cx, cy = (float(x) for x in camera)
+        if min(fx, fy) <= 0:
+            raise UserError(f"camera={list(camera)}: focal lengths must be positive [px]")
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _check(job: Job, frames: int, workers: int) -> None:
+    """Raise UserError for values that cannot be meant."""
+    low, high = job.scenes.distractors
+    rules = [
+        (frames < 1, f"frames={frames}: must be at least 1"),
+        (workers < 1, f"workers={workers}: must be at least 1"),
+        (job.frames_per_scene < 1, f"frames_per_scene={job.frames_per_scene}: must be at least 1"),
+        (
+            min(job.width, job.height) < 32,
+            f"size={job.width},{job.height}: at least 32 pixels a side",
+        ),
+        (low < 0 or high < low, f"distractors={low},{high}: needs 0 <= least <= most"),
+        (not 0 <= job.scenes.occlusion < 1, f"occlusion={job.scenes.occlusion}: a share in [0, 1)"),
+        (
+            not 0 <= job.scenes.occluded_share <= 1,
+            f"occluded_share={job.scenes.occluded_share}: a share in [0, 1]",
+        ),
+        (
+            not 0 <= job.scenes.tabletop_share <= 1,
+            f"tabletop_share={job.scenes.tabletop_share}: a share in [0, 1]",
+        ),
+    ]
+    for wrong, message in rules:
+        if wrong:
+            raise UserError(message)
+    sensor_model(job.sensor)
+    make_renderer(job.renderer)
+    if job.scenes.settle:
+        load_mujoco()
+
+
+def _claim(out: Path, job: Job, frames: int) -> None:
+    """Write the settings into a new dataset, or make sure that the one there has the same."""
+    settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
+    path = out / GENERATOR
+    if path.is_file():
+        try:
+            record = json.loads(path.read_text())
+            there, frames = record["settings"], max(frames, int(record["frames"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"{path}: not a generator's record any more ({error}); choose another out="
+            ) from error
+        differing = sorted(k for k in {*there, *settings} if there.get(k) != settings.get(k))
+        if differing:
+            keys = ", ".join(differing)
+            raise UserError(
+                f"{path}: this dataset was begun with other settings ({keys}); choose another out="
+            )
+        for partial in out.glob("mixed/*/.*.part"):
+            partial.unlink(missing_ok=True)
+    elif out.is_dir() and any(out.iterdir()):
+        raise UserError(
+            f"{out}: not empty, and not begun by this generator (no {GENERATOR}); "
+            f"choose another out="
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
+    versions = {name: importlib.metadata.version(name) for name in packages}
+    fat.write_json(path, {"settings": settings, "frames": frames, "versions": versions})
+
+
+def _run(job: Job, out: Path, todo: list[int], workers: int, progress: bool) -> Iterator[int]:
+    """Render frames, here or in processes; yield the number done after each lot."""
+    lots: dict[tuple[int, int], list[int]] = {}
+    for i in todo:
+        lots.setdefault((i // job.frames_per_scene, i // FRAMES_PER_TASK), []).append(i)
+    speed = TextColumn("{task.fields[rate]}")
+    columns = (
+        TextColumn("rendering"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        speed,
+    )
+    with bars(*columns, shown=progress) as bar:
+        task = bar.add_task("frames", total=len(todo), rate="")
+        began, done = time.perf_counter(), 0
+        for count in _results(job, out, list(lots.values()), workers):
+            done += count
+            bar.update(
+                task, completed=done, rate=f"{done / (time.perf_counter() - began):.1f} frames/s"
+            )
+            yield done
+
+
+def _results(job: Job, out: Path, lots: list[list[int]], workers: int) -> Iterator[int]:
+    """Yield how many frames each lot had, as they finish."""
+    if workers == 1 or len(lots) <= 1:
+        painter = Painter(job, out)
+        for lot in lots:
+            for frame in lot:
+                painter.write(frame)
+            yield len(lot)
+        return
+    context = multiprocessing.get_context("spawn")
+    with _single_threaded_children():
+        pool = ProcessPoolExecutor(min(workers, len(lots)), context, _start_worker, (job, out))
+        with pool:
+            futures = [pool.submit(_paint_lot, lot) for lot in lots]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+
+_painter: Painter | None = None  # one a worker process
+
+
+def _start_worker(job: Job, out: Path) -> None:
+    """Set up a worker process."""
+    global _painter
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    _painter = Painter(job, out)
+
+
+def _paint_lot(lot: list[int]) -> int:
+    """Render some frames in a worker."""
+    assert _painter is not None
+    for frame in lot:
+        _painter.write(frame)
+    return len(lot)
+
+
+@contextmanager
+def _single_threaded_children() -> Iterator[None]:
+    """Have processes started meanwhile compute with one thread each: as many threads as cores in
+    each would fight.
+    """
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -1,0 +1,87 @@
+"""Distractors easily taken for the target: its shape in another print, its print on another shape,
+boxes of its color.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from posefilter.meshes.mesh import Mesh, creased_normals
+from posefilter.synthetic.textures import as_bytes, label, random_texture, recolor, typical_color
+
+
+def make_lookalike(
+    target: Mesh, name: str, photos: Sequence[np.ndarray], rng: np.random.Generator
+) -> Mesh:
+    """Draw a look-alike of the target: itself stretched, recolored or reprinted, or a box, of its
+    color or not.
+    """
+    kind = rng.random()
+    printed = target.corner_uv is not None and min(target.texture.shape[:2]) >= 16
+    if printed and kind < 0.2:
+        return stretched(target, name, _clear_stretch(rng), target.texture)
+    if printed and kind < 0.4:
+        return stretched(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
+    if printed and kind < 0.55:
+        return stretched(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
+    sides = (target.box_head[1] - target.box_head[0]) * rng.uniform(0.45, 1.25, 3)
+    base = typical_color(target.texture) if kind < 0.85 else None
+    return box(name, np.maximum(sides, 0.02), [as_bytes(label(rng, 96, base)) for _ in range(6)])
+
+
+def stretched(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:
+    """Return a mesh drawn out along its axes, in another texture.  factors: (3,)."""
+    normals = mesh.corner_normals / factors
+    normals = normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12)
+    return replace(
+        mesh,
+        name=name,
+        vertices=mesh.vertices * factors,
+        corner_normals=normals.astype(np.float32),
+        texture=texture,
+        symmetries=np.eye(4)[None],
+    )
+
+
+def box(name: str, sides: np.ndarray, faces: Sequence[np.ndarray]) -> Mesh:
+    """Return a box centerd on its origin with six printed faces.  sides: (3,) [m]; faces: six (n,
+    n, 3) uint8.
+    """
+    corners, triangles, uv = [], [], []
+    for k in range(6):
+        axis, sign = k // 2, 1 - 2 * (k % 2)
+        a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3] * sign
+        middle = np.eye(3)[axis] * sign
+        corners += [
+            (middle + x * a + y * b) * sides / 2 for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        ]
+        column, row = k % 3, k // 3
+        cell = ((0.02, 0.02), (0.98, 0.02), (0.98, 0.98), (0.02, 0.98))
+        spots = np.array([[column + x, row + y] for x, y in cell]) / [3, 2]
+        for i in ((0, 1, 2), (0, 2, 3)):
+            triangles.append([4 * k + j for j in i])
+            uv.append(spots[list(i)])
+    # the atlas's row 0 is its bottom
+    rows = [np.concatenate(list(faces[3 * row : 3 * row + 3]), axis=1) for row in (1, 0)]
+    atlas = np.concatenate(rows, axis=0)
+    vertices, index = np.array(corners), np.array(triangles)
+    return Mesh(
+        name,
+        vertices,
+        index,
+        np.array(uv, np.float32),
+        atlas,
+        None,
+        creased_normals(vertices, index),
+    )
+
+
+def _clear_stretch(rng: np.random.Generator) -> np.ndarray:
+    """Draw factors that no one would take for the target's own proportions: 20 % off or more on
+    some axis.
+    """
+    factors = rng.uniform(0.6, 1.4, 3)
+    axis = int(rng.integers(3))
+    factors[axis] = rng.uniform(0.55, 0.78) if rng.random() < 0.6 else rng.uniform(1.25, 1.5)
+    return factors

@@ -1,0 +1,194 @@
+"""Draw the frames of a generated dataset, one at a time, each from the job's settings, the seed and
+its number alone.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.meshes.store import MeshStore
+from posefilter.rendering.embree import EmbreeRenderer
+from posefilter.rendering.surfaces import Rendered, Renderer
+from posefilter.synthetic import fat_format as fat
+from posefilter.synthetic.scenes import (
+    Layout,
+    Library,
+    SceneSet,
+    SceneSettings,
+    draw_layout,
+    draw_set,
+    shift_camera,
+)
+from posefilter.synthetic.sensor import sense, sensor_model
+
+ATTEMPTS = 400
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that decides what is rendered; written beside the frames."""
+
+    object: str
+    meshes: str
+    seed: int
+    width: int
+    height: int
+    K: tuple[tuple[float, ...], ...]
+    stereo: bool
+    sensor: str
+    frames_per_scene: int
+    renderer: str
+    scenes: SceneSettings
+
+    def folder(self, frame: int) -> str:
+        """Return the folder of a frame."""
+        return f"mixed/scene{frame // self.frames_per_scene:04d}_0"
+
+    def eyes(self) -> tuple[tuple[str, float], ...]:
+        """Return the cameras, and how far right of the left one they stand [m]."""
+        return (("left", 0.0), ("right", fat.BASELINE)) if self.stereo else (("left", 0.0),)
+
+    def files(self, out: Path, frame: int) -> list[Path]:
+        """Return the files of a frame, the one that is written last at the end."""
+        stem = out / self.folder(frame) / f"{frame % self.frames_per_scene:06d}"
+        endings = ("jpg", "depth.png", "seg.png", "json")
+        return [
+            stem.with_name(f"{stem.name}.{eye}.{ending}")
+            for eye, _ in reversed(self.eyes())
+            for ending in endings
+        ]
+
+
+def make_renderer(name: str) -> Renderer:
+    """Return a renderer by its name.
+
+    Raises UserError for an unknown one, and where one cannot run here.
+    """
+    if name == "embree":
+        return EmbreeRenderer()
+    if name == "moderngl":
+        from posefilter.rendering.opengl import GLRenderer
+
+        return GLRenderer()
+    raise UserError(f"renderer={name}: unknown; choose from embree, moderngl")
+
+
+class Painter:
+    """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
+
+    def __init__(self, job: Job, out: Path) -> None:
+        self.job, self.out = job, out
+        self.K = np.array(job.K)
+        self.library = Library(MeshStore(job.meshes))
+        self.renderer = make_renderer(job.renderer)
+        self.sensor = sensor_model(job.sensor)
+        self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
+
+    def scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
+        """Return a folder's set, and its classes by name; write the folder's settings."""
+        if self._scene is None or self._scene[0] != number:
+            rng = np.random.default_rng([self.job.seed, 1, number])
+            scene = draw_set(self.library, self.job.object, self.job.scenes, rng)
+            solids = (scene.target, *scene.distractors, *scene.lookalikes)
+            step = min(12, 255 // len(solids))
+            exported = [fat.export_object(s.mesh, step * (k + 1)) for k, s in enumerate(solids)]
+            folder = self.out / self.job.folder(number * self.job.frames_per_scene)
+            folder.mkdir(parents=True, exist_ok=True)
+            cameras = [name for name, _ in self.job.eyes()]
+            fat.write_json(folder / fat.OBJECT_SETTINGS, fat.object_settings(exported))
+            camera = fat.camera_settings(self.K, self.job.height, self.job.width, cameras)
+            fat.write_json(folder / fat.CAMERA_SETTINGS, camera)
+            self._scene = number, scene, {one.name: one for one in exported}
+        return self._scene[1], self._scene[2]
+
+    def draw(self, frame: int) -> tuple[Layout, Rendered, np.random.Generator]:
+        """Return a frame's layout and picture, and its generator as the drawing left it."""
+        scene, _ = self.scene(frame // self.job.frames_per_scene)
+        rng = np.random.default_rng([self.job.seed, 2, frame])
+        height, width = self.job.height, self.job.width
+        for _ in range(ATTEMPTS):
+            layout = draw_layout(scene, self.job.scenes, self.K, height, width, rng)
+            if layout is None:
+                continue
+            picture = self.renderer.render(
+                layout.instances(), self.K, height, width, layout.lights, layout.planes
+            )
+            if self._shows_target(picture):
+                return layout, picture, rng
+        raise UserError(
+            f"frame {frame}: no layout of {self.job.object} fits after {ATTEMPTS} tries; "
+            "the object may be too large or small for this camera, or occlusion and distractors "
+            "leave no room"
+        )
+
+    def write(self, frame: int) -> None:
+        """Render a frame and write its files."""
+        layout, picture, rng = self.draw(frame)
+        _, exported = self.scene(frame // self.job.frames_per_scene)
+        pending = []
+        for k, (_, eye) in enumerate(self.job.eyes()):
+            if k > 0:
+                layout_here = shift_camera(layout, eye)
+                picture = self.renderer.render(
+                    layout_here.instances(),
+                    self.K,
+                    self.job.height,
+                    self.job.width,
+                    layout_here.lights,
+                    layout_here.planes,
+                )
+            else:
+                layout_here = layout
+            pending.append(self._images(layout_here, picture, exported, eye, rng))
+        files = iter(self.job.files(self.out, frame))
+        for images, record in reversed(pending):
+            for image in images:
+                fat.write_image(next(files), image)
+            fat.write_json(next(files), record)
+
+    def _shows_target(self, picture: Rendered) -> bool:
+        """Tell whether enough of the target is seen."""
+        seen, alone = int((picture.index == 0).sum()), int(picture.alone[0])
+        least = 0.002 * self.job.width * self.job.height
+        return alone >= least and seen >= (1 - self.job.scenes.occlusion) * alone
+
+    def _images(
+        self,
+        layout: Layout,
+        picture: Rendered,
+        exported: dict[str, fat.ExportedObject],
+        eye: float,
+        rng: np.random.Generator,
+    ) -> tuple[list[np.ndarray], dict[str, Any]]:
+        """Return a camera's color, depth and segment images, and its record."""
+        photo, depth = sense(picture.rgb, picture.depth, self.sensor, rng)
+        ids = np.array([*(exported[p.solid.mesh.name].seg_id for p in layout.placed), 0], np.uint8)
+        seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
+        objects = []
+        for k, one in enumerate(layout.placed):
+            if k == 0 or seen[k] > 0:
+                share = float(seen[k] / max(int(picture.alone[k]), 1))
+                truncated = self._truncated(one.hull)
+                objects.append(
+                    fat.ObjectInFrame(
+                        exported[one.solid.mesh.name], one.camera_from_object, share, truncated
+                    )
+                )
+        return [photo, fat.depth_units(depth), ids[picture.index]], fat.frame_record(
+            objects, self.K, eye
+        )
+
+    def _truncated(self, hull: np.ndarray) -> float:
+        """Return the share of a hull's outline, by area, that leaves the frame."""
+        pixels = (
+            hull[:, :2] / hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [self.K[0, 2], self.K[1, 2]]
+        ).astype(np.float32)
+        outline = cv2.convexHull(pixels)
+        w, h = self.job.width - 0.5, self.job.height - 0.5
+        frame = np.array([[[-0.5, -0.5]], [[w, -0.5]], [[w, h]], [[-0.5, h]]], np.float32)
+        inside, _ = cv2.intersectConvexConvex(outline, frame)
+        return float(np.clip(1 - inside / max(cv2.contourArea(outline), 1e-6), 0, 1))

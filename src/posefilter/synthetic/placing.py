@@ -1,0 +1,242 @@
+"""Find places for objects: the target before the camera, distractors round it, something in front
+of it when asked.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from posefilter.synthetic.solids import Solid, outline_mask, separated
+
+_STRIDE = 8  # [px] of the masks that foresee who hides whom
+_NEAREST = 0.2  # [m] no object comes nearer to the camera
+_GAP = 0.001  # [m] between objects
+_RIM = 0.03  # [m] how far inside the table's edge the centers of objects stay
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A solid somewhere."""
+
+    solid: Solid
+    camera_from_object: np.ndarray  # (4, 4) [m]
+
+    @cached_property
+    def hull(self) -> np.ndarray:
+        """Return the hull's vertices in the camera.  -> (V, 3) [m]."""
+        return self.solid.hull @ self.camera_from_object[:3, :3].T + self.camera_from_object[:3, 3]
+
+    @cached_property
+    def center(self) -> np.ndarray:
+        """Return the box's center in the camera.  -> (3,) [m]."""
+        return self.camera_from_object[:3, :3] @ self.solid.center + self.camera_from_object[:3, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera, and what it would roughly see of hulls."""
+
+    K: np.ndarray
+    height: int
+    width: int
+
+    def ray(self, u: float, v: float) -> np.ndarray:
+        """Return the ray through a point of the frame given in shares of its sides."""
+        x, y = u * self.width - self.K[0, 2], v * self.height - self.K[1, 2]
+        return np.array([x / self.K[0, 0], y / self.K[1, 1], 1.0])
+
+    def holds(self, one: Placed, largest_truncation: float) -> bool:
+        """Tell whether enough of an object's outline lies in the frame."""
+        if one.hull[:, 2].min() < _NEAREST:
+            return False
+        pixels = one.hull[:, :2] / one.hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [
+            self.K[0, 2],
+            self.K[1, 2],
+        ]
+        inside = ((pixels >= 0) & (pixels < [self.width, self.height])).all(1)
+        return bool(inside.mean() >= 1 - largest_truncation)
+
+    def mask(self, one: Placed) -> np.ndarray:
+        """Return an object's outline, coarsely."""
+        return outline_mask(one.hull, self.K, self.height, self.width, _STRIDE)
+
+    def free(self, placed: list[Placed]) -> tuple[np.ndarray, int]:
+        """Return the coarse mask of the first object that no nearer one covers, and how large it
+        would be alone.
+        """
+        whole = self.mask(placed[0])
+        free = whole.copy()
+        for one in placed[1:]:
+            if one.center[2] < placed[0].center[2]:
+                free &= ~self.mask(one)
+        return free, max(int(whole.sum()), 1)
+
+    def visible(self, placed: list[Placed]) -> float:
+        """Return the share of the first object's outline in the frame that no nearer one covers."""
+        free, whole = self.free(placed)
+        return float(free.sum() / whole)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table top, and the spot of it that the target stands on."""
+
+    camera_from_spot: np.ndarray  # (4, 4) [m], z up, the origin under the target
+    camera_from_top: np.ndarray  # (4, 4) [m], z up, the origin in the middle, axes along the sides
+    half_extent: tuple[float, float]  # [m]
+
+    def carries(self, one: Placed) -> bool:
+        """Tell whether an object's center is over the table."""
+        x, y, _ = self.camera_from_top[:3, :3].T @ (one.center - self.camera_from_top[:3, 3])
+        return bool(abs(x) < self.half_extent[0] - _RIM and abs(y) < self.half_extent[1] - _RIM)
+
+
+def set_table(
+    camera_from_spot: np.ndarray, half_extent: tuple[float, float], rng: np.random.Generator
+) -> Table:
+    """Lay a table under a spot, turned by up to 45 degrees, the spot not too near to its edge."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
+    room = np.maximum(0.75 * np.array(half_extent) - 0.1, 0.05)
+    turn[:2, 3] = turn[:2, :2] @ (rng.uniform(-1, 1, 2) * room)
+    return Table(camera_from_spot, camera_from_spot @ turn, half_extent)
+
+
+def stand_target(
+    solid: Solid, view: View, distance: float, elevation_deg: float, rng: np.random.Generator
+) -> tuple[Placed, np.ndarray]:
+    """Put the target on a table, the camera so far from it and so high.  -> it, and
+    camera_from_spot under it.
+    """
+    elevation = np.deg2rad(elevation_deg)
+    roll = Rotation.from_euler("z", rng.normal(0, 6), degrees=True).as_matrix()
+    up = roll @ np.array([0, -np.cos(elevation), -np.sin(elevation)])
+    right = roll @ np.array([1.0, 0, 0])
+    camera_from_spot = np.eye(4)
+    camera_from_spot[:3, :3] = np.stack([right, np.cross(up, right), up], 1)
+    rest = _draw_rest(solid, rng, 0.5)
+    bottom = (solid.hull @ rest.T).min(0)[2]
+    middle = float((rest @ solid.center)[2] - bottom)
+    center = view.ray(rng.uniform(0.15, 0.85), rng.uniform(0.18, 0.85)) * distance
+    camera_from_spot[:3, 3] = center - up * middle
+    return _stand(solid, rest, np.zeros(2), camera_from_spot), camera_from_spot
+
+
+def hang_target(solid: Solid, view: View, distance: float, rng: np.random.Generator) -> Placed:
+    """Put the target anywhere in the view, turned anyhow."""
+    rotation = Rotation.random(rng=rng).as_matrix()
+    center = view.ray(rng.uniform(0.12, 0.88), rng.uniform(0.12, 0.88)) * distance
+    return _hang(solid, rotation, center)
+
+
+def apart(a: Placed, b: Placed) -> bool:
+    """Tell whether two objects stand apart, by their spheres or else by their hulls."""
+    far = np.linalg.norm(a.center - b.center) > a.solid.radius + b.solid.radius + _GAP
+    return bool(far) or separated(a.hull, b.hull, _GAP)
+
+
+def face(solid: Solid) -> float:
+    """Return the second largest side of a solid's box [m]: how much it hides at best."""
+    low, high = solid.mesh.box_head
+    return float(np.sort(high - low)[1])
+
+
+def place(
+    solid: Solid,
+    placed: list[Placed],
+    view: View,
+    table: Table | None,
+    wanted: float,
+    in_front: bool,
+    rng: np.random.Generator,
+) -> Placed | None:
+    """Find a free place for a distractor, afloat where there is no table; None where none was
+    found.
+
+    wanted: the share of the target (the first of `placed`) that should stay visible. In front of
+    the target if asked, so that about that much is left; else anywhere that leaves no less.
+    """
+    best, best_error = None, np.inf
+    free, whole = view.free(placed)
+    for _ in range(48 if in_front else 16):
+        if table is None:
+            one = _draw_afloat(solid, placed[0], in_front, rng)
+        else:
+            one = _draw_on_table(solid, placed[0], table.camera_from_spot, in_front, rng)
+            if not table.carries(one):
+                continue
+        if one.hull[:, 2].min() < _NEAREST or not all(apart(one, other) for other in placed):
+            continue
+        nearer = one.center[2] < placed[0].center[2]
+        share = float((free & ~view.mask(one)).sum() / whole) if nearer else free.sum() / whole
+        if share < wanted - 0.08:
+            continue
+        error = abs(share - wanted)
+        if not in_front or error < 0.04:
+            return one
+        if error < best_error:
+            best, best_error = one, error
+    return best
+
+
+def _draw_on_table(
+    solid: Solid, target: Placed, frame: np.ndarray, in_front: bool, rng: np.random.Generator
+) -> Placed:
+    """Stand a solid somewhere on the table."""
+    rest = _draw_rest(solid, rng, 0.6)
+    reach = target.solid.radius + solid.radius
+    if in_front:
+        towards = -(frame[:3, :2].T @ frame[:3, 3])
+        towards /= np.linalg.norm(towards) + 1e-9
+        across = np.array([-towards[1], towards[0]])
+        spot = towards * reach * rng.uniform(0.25, 1.4) + across * reach * rng.uniform(-0.6, 0.6)
+    else:
+        spot = rng.uniform(-1, 1, 2) * (rng.uniform(0.08, 0.3) + 0.5 * reach)
+    return _stand(solid, rest, spot, frame)
+
+
+def _draw_afloat(solid: Solid, target: Placed, in_front: bool, rng: np.random.Generator) -> Placed:
+    """Hang a solid somewhere near the target, or before it."""
+    rotation = Rotation.random(rng=rng).as_matrix()
+    z = target.center[2] * rng.uniform(0.6, 0.95 if in_front else 1.3)
+    spread = 0.5 * target.solid.radius + 0.5 * solid.radius if in_front else 0.16
+    where = target.center + rng.normal(0, 1, 3) * [spread, spread, 0]
+    return _hang(solid, rotation, where * (z / where[2]))
+
+
+def _draw_rest(solid: Solid, rng: np.random.Generator, upright: float) -> np.ndarray:
+    """Draw how a solid lies: as its mesh stands, or any rest (rare ones more often than chance), at
+    any heading.
+    """
+    if rng.random() < upright:
+        down = -solid.rests[:, 2, :]  # the object's direction that each rest turns down
+        near = int((down @ np.array([0, 0, -1.0])).argmax())
+        rest = solid.rests[near]
+    else:
+        weights = np.sqrt(solid.rest_weights)
+        rest = solid.rests[int(rng.choice(len(weights), p=weights / weights.sum()))]
+    return Rotation.from_euler("z", rng.uniform(0, 360), degrees=True).as_matrix() @ rest
+
+
+def _stand(
+    solid: Solid, rest: np.ndarray, spot: np.ndarray, camera_from_spot: np.ndarray
+) -> Placed:
+    """Return a solid in a resting rotation with its center over a spot of the table."""
+    center = rest @ solid.center
+    table_from_object = np.eye(4)
+    table_from_object[:3, :3] = rest
+    table_from_object[:3, 3] = [
+        spot[0] - center[0],
+        spot[1] - center[1],
+        -(solid.hull @ rest.T)[:, 2].min(),
+    ]
+    return Placed(solid, camera_from_spot @ table_from_object)
+
+
+def _hang(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:
+    """Return a solid with its center somewhere in the camera's frame."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, center - rotation @ solid.center
+    return Placed(solid, pose)

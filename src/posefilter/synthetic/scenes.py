@@ -1,0 +1,274 @@
+"""Draw scenes: a target among distractors and look-alikes, on a table or afloat, with something in
+front of it when asked.
+
+A scene set (one folder of the dataset) fixes the surroundings, the distractors to choose from and
+the look-alikes; each of its frames has a camera, a layout and lights of its own.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from posefilter.meshes.store import MeshStore
+from posefilter.rendering.surfaces import Instance, Lights, Plane
+from posefilter.synthetic.lookalikes import make_lookalike
+from posefilter.synthetic.placing import (
+    Placed,
+    Table,
+    View,
+    face,
+    hang_target,
+    place,
+    set_table,
+    stand_target,
+)
+from posefilter.synthetic.settle import settle
+from posefilter.synthetic.solids import Solid, make_solid
+from posefilter.synthetic.textures import random_color, random_texture
+
+# [degrees] highest camera over a table where something has to stand in front
+_OCCLUDED_ELEVATION = 45.0
+# plain, checker, marble, wood, carpet, stripes, label
+_TABLE = (0.3, 0.08, 0.1, 0.22, 0.12, 0.04, 0.14)
+_FLOOR = (0.15, 0.15, 0.1, 0.2, 0.3, 0.05, 0.05)
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """What scenes are like."""
+
+    distractors: tuple[int, int] = (2, 8)  # least and most beside the target
+    occlusion: float = 0.75  # largest share of the target that may be hidden
+    # share of frames in which something is put right in front of the target
+    occluded_share: float = 0.4
+    tabletop_share: float = 0.65
+    lookalike_share: float = 0.25  # chance that a distractor is a look-alike
+    lookalikes: int = 4  # different ones a scene set
+    classes: int = 14  # distractor classes a scene set
+    distance: tuple[float, float] = (0.45, 1.4)  # [m] camera to target
+    elevation_deg: tuple[float, float] = (10.0, 85.0)
+    largest_truncation: float = 0.4  # share of the target's outline that may leave the frame
+    shadow_share: float = 0.7
+    settle: bool = False  # let the objects on a table fall and come to rest (mujoco)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSet:
+    """What the frames of one folder share."""
+
+    target: Solid
+    distractors: tuple[Solid, ...]
+    lookalikes: tuple[Solid, ...]
+    textures: tuple[np.ndarray, np.ndarray, np.ndarray]  # table, floor, wall
+    tiles: tuple[float, float, float]  # [m]
+    table_half_extent: tuple[float, float]
+    table_height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """One frame, ready to render.  The target comes first."""
+
+    placed: tuple[Placed, ...]
+    planes: tuple[Plane, ...]
+    lights: Lights
+    tabletop: bool
+
+    def instances(self) -> list[Instance]:
+        """Return the objects as the renderer takes them."""
+        return [Instance(p.solid.mesh, p.camera_from_object) for p in self.placed]
+
+
+class Library:
+    """The solids of a mesh store, each measured once."""
+
+    def __init__(self, store: MeshStore) -> None:
+        self.store = store
+        self._solids: dict[str, Solid] = {}
+
+    def solid(self, name: str) -> Solid:
+        """Return a mesh as a solid."""
+        if name not in self._solids:
+            self._solids[name] = make_solid(self.store.load(name))
+        return self._solids[name]
+
+
+def draw_set(
+    library: Library, target: str, settings: SceneSettings, rng: np.random.Generator
+) -> SceneSet:
+    """Draw what the frames of one folder share."""
+    others = [name for name in library.store.names() if name != target]
+    chosen = [others[i] for i in rng.permutation(len(others))[: settings.classes]]
+    goal = library.solid(target)
+    distractors = tuple(library.solid(name) for name in chosen)
+    photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
+    names = [f"lookalike_{k:02d}" for k in range(settings.lookalikes)]
+    lookalikes = tuple(make_solid(make_lookalike(goal.mesh, name, photos, rng)) for name in names)
+    table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
+    tiles = (
+        float(rng.uniform(0.2, 1.2)),
+        float(rng.uniform(0.2, 1.5)),
+        float(rng.uniform(0.4, 2.0)),
+    )
+    half = (float(rng.uniform(0.3, 1.2)), float(rng.uniform(0.3, 1.2)))
+    return SceneSet(
+        goal,
+        distractors,
+        lookalikes,
+        (table, floor, wall),
+        tiles,
+        half,
+        float(rng.uniform(0.3, 0.9)),
+    )
+
+
+def draw_layout(
+    scene: SceneSet,
+    settings: SceneSettings,
+    K: np.ndarray,
+    height: int,
+    width: int,
+    rng: np.random.Generator,
+) -> Layout | None:
+    """Draw one frame, or None where this draw does not work out (the caller draws again)."""
+    view = View(K, height, width)
+    occluded = bool(rng.random() < settings.occluded_share)
+    least = 1 - settings.occlusion
+    wanted = (
+        rng.uniform(min(max(0.28, least), 0.6), 0.6)
+        if occluded
+        else rng.uniform(max(0.6, least), 1.0)
+    )
+    tabletop = bool(rng.random() < settings.tabletop_share)
+    # not every corner of a table has room in front of the target
+    for _ in range(8 if occluded else 1):
+        placed, table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
+        enough = len(placed) > settings.distractors[0]
+        if enough and (not occluded or view.visible(placed) < wanted + 0.1):
+            break
+    if not enough:
+        return None
+    up = np.array([0.0, -0.8, -0.6]) if table is None else table.camera_from_top[:3, 2]
+    planes = _surroundings(scene, placed[0], table, rng)
+    return Layout(tuple(placed), planes, _draw_lights(up, settings, rng), tabletop)
+
+
+def _draw_objects(
+    scene: SceneSet,
+    settings: SceneSettings,
+    view: View,
+    tabletop: bool,
+    occluded: bool,
+    wanted: float,
+    rng: np.random.Generator,
+) -> tuple[list[Placed], Table | None]:
+    """Place the target and what stands round it, none where the target leaves the frame.  ->
+    objects, their table if any.
+    """
+    distance = rng.uniform(*settings.distance)
+    table = None
+    if tabletop:
+        low, high = settings.elevation_deg
+        # from above nothing hides what stands behind it
+        elevation = rng.uniform(low, min(high, max(_OCCLUDED_ELEVATION, low)) if occluded else high)
+        target, camera_from_spot = stand_target(scene.target, view, distance, elevation, rng)
+        table = set_table(camera_from_spot, scene.table_half_extent, rng)
+    else:
+        target = hang_target(scene.target, view, distance, rng)
+    if not view.holds(target, settings.largest_truncation):
+        return [], table
+    placed = [target]
+    solids = _draw_solids(scene, settings, rng)
+    if occluded:  # whatever can hide most is tried in front first
+        solids.sort(key=lambda solid: -face(solid))
+    for solid in solids:
+        in_front = occluded and view.visible(placed) > wanted + 0.06
+        one = place(solid, placed, view, table, wanted, in_front, rng)
+        if one is not None:
+            placed.append(one)
+    if settings.settle and table is not None:
+        placed = settle(placed, table, rng)
+        if (
+            not view.holds(placed[0], settings.largest_truncation)
+            or view.visible(placed) < 1 - settings.occlusion
+        ):
+            return [], table
+    return placed, table
+
+
+def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Generator) -> list[Solid]:
+    """Choose a frame's distractors, no class twice."""
+    low, high = settings.distractors
+    count = int(rng.integers(low, high + 1))
+    usual = [scene.distractors[i] for i in rng.permutation(len(scene.distractors))]
+    alike = [scene.lookalikes[i] for i in rng.permutation(len(scene.lookalikes))]
+    out: list[Solid] = []
+    while len(out) < count and (usual or alike):
+        pool = alike if alike and (not usual or rng.random() < settings.lookalike_share) else usual
+        out.append(pool.pop())
+    return out
+
+
+def _surroundings(
+    scene: SceneSet, target: Placed, table: Table | None, rng: np.random.Generator
+) -> tuple[Plane, ...]:
+    """Return table, floor and wall, or the one surface behind floating clutter."""
+    if table is None:
+        back = np.eye(4)
+        back[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.45, 3)).as_matrix()
+        back[2, 3] = target.center[2] + target.solid.radius + rng.uniform(0.1, 1.2)
+        kind = int(rng.integers(3))
+        return (Plane(back, (9.0, 9.0), scene.textures[kind], scene.tiles[kind]),)
+    drop = np.eye(4)
+    drop[2, 3] = -scene.table_height
+    floor = table.camera_from_top @ drop
+    wall_turn = np.eye(4)
+    wall_turn[:3, :3] = Rotation.from_euler(
+        "zx", [rng.uniform(-30, 30), 90], degrees=True
+    ).as_matrix()
+    wall_turn[:3, 3] = wall_turn[:3, 2] * -rng.uniform(0.6, 2.5)
+    return (
+        Plane(table.camera_from_top, table.half_extent, scene.textures[0], scene.tiles[0]),
+        Plane(floor, (9.0, 9.0), scene.textures[1], scene.tiles[1]),
+        Plane(table.camera_from_spot @ wall_turn, (9.0, 9.0), scene.textures[2], scene.tiles[2]),
+    )
+
+
+def _draw_lights(up: np.ndarray, settings: SceneSettings, rng: np.random.Generator) -> Lights:
+    """Draw ambient light and two lamps, the first from above."""
+    first = up * rng.uniform(0.5, 1.2) + rng.normal(0, 0.45, 3)
+    second = np.array([0, 0, -0.6]) + 0.4 * up + rng.normal(0, 0.7, 3)
+    directions = tuple((float(d[0]), float(d[1]), float(d[2])) for d in (first, second))
+    strengths = (float(rng.uniform(0.2, 0.75)), float(rng.uniform(0.05, 0.4)))
+    return Lights(
+        ambient=float(rng.uniform(0.3, 0.65)),
+        directions=directions,
+        strengths=strengths,
+        specular=float(rng.uniform(0, 0.35) * (rng.random() < 0.5)),
+        shininess=float(rng.uniform(5, 40)),
+        shadows=bool(rng.random() < settings.shadow_share),
+        shadow_blur=float(rng.uniform(0.5, 3)),
+        background=tuple(float(c) for c in random_color(rng)),  # type: ignore[arg-type]
+    )
+
+
+def shift_camera(layout: Layout, offset: float) -> Layout:
+    """Return the layout as a second camera sees it that stands `offset` [m] to the right."""
+    move = np.eye(4)
+    move[0, 3] = -offset
+    placed = tuple(Placed(p.solid, move @ p.camera_from_object) for p in layout.placed)
+    planes = tuple(replace(p, camera_from_plane=move @ p.camera_from_plane) for p in layout.planes)
+    return replace(layout, placed=placed, planes=planes)
+
+
+__all__ = [
+    "Layout",
+    "Library",
+    "Placed",
+    "SceneSet",
+    "SceneSettings",
+    "draw_layout",
+    "draw_set",
+    "shift_camera",
+]

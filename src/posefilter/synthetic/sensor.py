@@ -1,0 +1,188 @@
+"""Model what a camera makes of a perfect picture: color as a cheap color camera gives it, depth as
+structured light does.
+
+The depth's defects follow a Kinect-like sensor: disparity in fixed steps (so errors grow with z
+squared), correlated noise, a slowly varying offset, ragged edges, shadows on one side where the
+projector does not reach, holes on dark and shining surfaces, a largest range.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.synthetic.textures import blurred_noise, noise_field
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How far a camera departs from the perfect one."""
+
+    name: str
+    color: bool
+    depth: bool
+
+
+_MODELS = {"ideal": SensorModel("ideal", False, False), "kinect": SensorModel("kinect", True, True)}
+
+
+def sensor_model(name: str) -> SensorModel:
+    """Return a sensor by its name.  Raises UserError for an unknown one."""
+    if name not in _MODELS:
+        raise UserError(f"sensor={name}: unknown; choose from {', '.join(_MODELS)}")
+    return _MODELS[name]
+
+
+def sense(
+    rgb: np.ndarray, depth: np.ndarray, model: SensorModel, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the photograph (H, W, 3) uint8 RGB and the measured depth (H, W) float32 [m], 0 = no
+    reading.
+
+    rgb: (H, W, 3) float32, 1 = white; depth: (H, W) float32 [m], 0 = nothing there.
+    """
+    photo = sense_color(rgb, rng) if model.color else np.clip(rgb, 0, 1)
+    measured = sense_depth(depth, photo, rng) if model.depth else depth
+    return (np.clip(photo, 0, 1) * 255 + 0.5).astype(np.uint8), measured
+
+
+def sense_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the picture as a cheap color camera gives it.
+
+    (H, W, 3) float32 -> (H, W, 3) float32 in [0, 1].
+    """
+    height, width = rgb.shape[:2]
+    balance = np.exp(rng.normal(0, 0.07, 3) + rng.normal(0, 0.22)).astype(np.float32)
+    out = rgb * balance
+    out = _falloff(out, rng)
+    mean = out.mean((0, 1))
+    out = mean + (out - mean) * np.float32(rng.uniform(0.8, 1.35))
+    gray = out.mean(-1, keepdims=True)
+    out = gray + (out - gray) * np.float32(rng.uniform(0.6, 1.4))
+    out = np.clip(out, 0, 1.05) ** np.float32(rng.uniform(0.75, 1.35))
+    out = _blur(out, 0.3 + rng.uniform(0, 1.1) * width / 640)
+    if rng.random() < 0.25:
+        kernel = motion_kernel(rng, int(rng.integers(3, max(4, 9 * width // 640))))
+        out = np.asarray(cv2.filter2D(out, -1, kernel), np.float32)
+    out = out + _color_noise(rng, height, width)
+    if rng.random() < 0.6:
+        out = out + np.float32(rng.uniform(0.3, 1.5)) * (out - _blur(out, rng.uniform(0.8, 1.6)))
+    return np.clip(out, 0, 1)
+
+
+def sense_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the depth as a structured-light camera measures it.
+
+    (H, W) [m], 0 = nothing; photo (H, W, 3) in [0, 1] -> (H, W) float32 [m], 0 = no reading.
+    """
+    height, width = depth.shape
+    out = _ragged(depth, rng)
+    valid = out > 0
+    fine = blurred_noise(rng, height, width, rng.uniform(0.8, 3) * width / 640)
+    slow = cv2.resize(
+        rng.standard_normal((5, 6), dtype=np.float32),
+        (width, height),
+        interpolation=cv2.INTER_CUBIC,
+    )
+    out = out * np.float32(1 + rng.normal(0, 0.0025))
+    out = out + out * out * (
+        fine * np.float32(rng.uniform(0.0004, 0.0022)) + slow * np.float32(0.0012)
+    )
+    if rng.random() < 0.75:  # a Kinect's step is 1/8 px of disparity: some 0.0029 / m
+        step = np.float32(rng.uniform(0.3, 1) * 0.0029)
+        out = 1 / (np.maximum(np.round(1 / np.maximum(out, 0.1) / step), 1) * step)
+    out[~valid] = 0
+    out[_edge_loss(depth, rng)] = 0
+    out[_surface_loss(depth, photo, rng)] = 0
+    if rng.random() < 0.5:
+        out[depth > rng.uniform(1.5, 3.5)] = 0
+    out[out > 6.5] = 0
+    return out
+
+
+def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Smooth a picture over sigma [px]."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32)
+
+
+def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Darken or lighten the picture slowly across its face, as a near lamp or a lens does."""
+    coarse = 1 + rng.uniform(0, 0.25) * rng.uniform(-1, 1, (3, 4)).astype(np.float32)
+    return (
+        rgb
+        * cv2.resize(coarse.astype(np.float32), rgb.shape[1::-1], interpolation=cv2.INTER_CUBIC)[
+            ..., None
+        ]
+    )
+
+
+def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
+    """Return the trace of a moving camera: a line of `length` pixels in a random direction."""
+    line = np.zeros((length, length), np.float32)
+    line[length // 2] = 1
+    turn = cv2.getRotationMatrix2D((length / 2 - 0.5, length / 2 - 0.5), rng.uniform(0, 180), 1)
+    kernel = cv2.warpAffine(line, turn, (length, length))
+    return kernel / max(float(kernel.sum()), 1e-6)
+
+
+def _color_noise(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """Return sensor noise: partly of brightness, partly of color, and that one coarser, as
+    demosaicing leaves it.
+    """
+    bright = rng.standard_normal((height, width, 1), dtype=np.float32) * np.float32(
+        rng.uniform(0.004, 0.04)
+    )
+    coarse = rng.standard_normal((height // 2, width // 2, 3), dtype=np.float32) * np.float32(
+        rng.uniform(0.002, 0.03)
+    )
+    return bright + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+def _ragged(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the depth read through a jittering grid, and shifted by about a pixel against the
+    color.
+    """
+    height, width = depth.shape
+    scale = width / 640
+    grid = np.empty((2, height, width), np.float32)
+    for axis in range(2):
+        jitter = blurred_noise(rng, height, width, 1.5)
+        grid[axis] = jitter * np.float32(rng.uniform(0.2, 1.35) * scale) + np.float32(
+            rng.normal(0, scale)
+        )
+    grid[0] += np.arange(width, dtype=np.float32)
+    grid[1] += np.arange(height, dtype=np.float32)[:, None]
+    return cv2.remap(depth, grid[0], grid[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _edge_loss(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return where depth is lost along jumps: on one side as the projector's shadow, or on both.
+    -> (H, W) bool.
+    """
+    height, width = depth.shape
+    scale = width / 640
+    box = np.ones((3, 3), np.uint8)
+    jump = (cv2.dilate(depth, box) - cv2.erode(depth, box)) > 0.025
+    wide, high = (max(1, round(float(rng.uniform(1, n)) * scale)) for n in (9, 5))
+    kernel = np.zeros((2 * high + 1, 2 * wide + 1), np.uint8)
+    kernel[:, wide if rng.random() < 0.5 else 0 :] = 1
+    band = cv2.dilate(jump.astype(np.uint8), kernel) > 0
+    coarse = rng.standard_normal((height // 8, width // 8), dtype=np.float32)
+    rag = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return band & (rag > rng.uniform(-2, 0.8))
+
+
+def _surface_loss(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return holes in surfaces, likelier where it is very dark or shining.  -> (H, W) bool."""
+    height, width = depth.shape
+    if rng.random() < 0.3:
+        return np.zeros((height, width), bool)
+    blotch = noise_field(rng, 256, (16, 32, 64, 128))
+    blotch = cv2.resize(blotch, (max(width, height),) * 2, interpolation=cv2.INTER_LINEAR)[
+        :height, :width
+    ]
+    bright = photo.mean(-1)
+    bad = blotch + 0.15 * ((bright < 0.1) | (bright > 0.97))
+    share = rng.uniform(0, 1) ** 2 * 0.08
+    return bad > np.quantile(bad[::4, ::4], 1 - share)

@@ -1,0 +1,81 @@
+"""What a sweep writes when its jobs have ended: rows and pictures in the order in which one reads
+them.
+"""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli.sweeps import read_rows, summarize
+from posefilter.metrics.registry import PERCENT
+from posefilter.report.summary import draw_summary
+
+
+def sweep(folder: Path, key: str, words: list[str]) -> Path:
+    """Write a sweep's folder whose jobs ended in another order than they were asked for in."""
+    (folder / "multirun.yaml").write_text(
+        f"hydra:\n  sweeper:\n    params:\n      {key}: {','.join(words)}\n"
+    )
+    for place, word in reversed(list(enumerate(words))):
+        run = folder / f"{key}={word}"
+        run.mkdir()
+        own = {
+            "overrides": [f"{key}={word}"],
+            "particles_on_object": place / 10,
+            "seconds_per_image": 0.1,
+        }
+        (run / "metrics.json").write_text(json.dumps(own))
+    return folder
+
+
+def test_a_ladder_is_read_as_one_climbs_it(tmp_path: Path) -> None:
+    ablations = ["paper", "s1_glimpse", "c1_normalization", "c10_resample", "working"]
+    summarize(sweep(tmp_path, "ablation", ablations))
+    with (tmp_path / "summary.csv").open() as file:
+        assert [row["ablation"] for row in csv.DictReader(file)] == ablations
+    panel = draw_summary(*read_rows(tmp_path)).axes[0]
+    assert [text.get_text() for text in panel.get_yticklabels()] == ablations
+    assert panel.yaxis_inverted(), "from the top"
+    assert panel.lines[0].get_xdata() == pytest.approx([10 * place for place in range(5)])  # [%]
+
+
+def test_numbers_are_read_by_size(tmp_path: Path) -> None:
+    summarize(sweep(tmp_path, "filter.particles", ["1000", "50", "100"]))
+    rows, _ = read_rows(tmp_path)
+    assert [row["filter.particles"] for row in rows] == [50, 100, 1000]
+    assert draw_summary(*read_rows(tmp_path)).axes[0].get_xscale() == "log"
+
+
+def test_an_axis_has_the_tried_values_and_a_share_its_whole_range(tmp_path: Path) -> None:
+    """So that figures of several sweeps can be compared, and a value is read where it was tried."""
+    summarize(sweep(tmp_path, "filter.steps", ["3", "10", "7"]))
+    panel = draw_summary(*read_rows(tmp_path)).axes[0]
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["3", "7", "10"]
+    assert panel.get_ylim() == pytest.approx(PERCENT)
+    assert panel.get_title(loc="left") == "particles on the object [%]"
+
+
+@pytest.mark.parametrize("words", [["1", "2"], ["a", "b"]])
+def test_one_seed_is_no_trend(tmp_path: Path, words: list[str]) -> None:
+    """Nothing is joined, and the title says why; with two seeds the means are."""
+    rows = [
+        {"folder": word, "filter": float(word) if word in "12" else word, "add_auc": 50.0}
+        for word in words
+    ]
+    once = draw_summary(rows, ["filter"])
+    assert "one seed each" in once.get_suptitle()
+    assert [line.get_linestyle() for line in once.axes[0].lines] == ["None"]
+    assert not once.axes[0].patches
+    twice = draw_summary(
+        [*rows, *({**row, "seed": 1, "add_auc": 70.0} for row in rows)], ["filter", "seed"]
+    )
+    assert "one seed" not in twice.get_suptitle()
+    panel = twice.axes[0]
+    means = (
+        [bar.get_width() for bar in panel.patches]
+        if words == ["a", "b"]
+        else panel.lines[0].get_ydata()
+    )
+    assert means == pytest.approx([60.0, 60.0])

@@ -1,0 +1,77 @@
+"""A run may begin with the weights of another object's filter: the weights, and nothing that
+describes the object.
+"""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
+from posefilter.cli.warm_start import warm_start
+from posefilter.errors import UserError
+from posefilter.meshes.store import MeshStore, object_model
+from posefilter.models.base import PoseEstimator
+from posefilter.models.quantization import pack
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def build(folder: Path, name: str, seed: int, *overrides: str) -> PoseEstimator:
+    """Return an untrained method for a builtin object."""
+    torch.manual_seed(seed)
+    small = ["net.width=16", "net.latent_width=8"] if "model=patch_pf" in overrides else []
+    method = build_method(recipe(compose_job("train", CONF, [*overrides, *small], folder)))
+    method.set_object(object_model(MeshStore("builtin").load(name), count=200))
+    return method
+
+
+@pytest.mark.parametrize("model", ["patch_pf", "pose_pf"])
+def test_weights_are_copied_and_the_object_stays(model: str, tmp_path: Path) -> None:
+    old, new = (
+        build(tmp_path, "carton", 0, f"model={model}"),
+        build(tmp_path, "mug", 1, f"model={model}"),
+    )
+    own = {
+        name: value.clone()
+        for name, value in new.named_buffers()
+        if name.endswith(("centers", "reach"))
+    }
+    assert own
+    with torch.no_grad():
+        for name, value in old.named_buffers():
+            if name.endswith("running_mean"):
+                value.fill_(0.25)
+    copied, left = warm_start(new, {"state_dict": old.state_dict()})
+    assert (copied > 20, left) == (True, 0)
+    theirs = dict(old.named_parameters())
+    for name, value in new.named_parameters():
+        assert torch.equal(value, theirs[name]), name
+    for name, value in new.named_buffers():
+        if name in own:
+            assert torch.equal(value, own[name]), name
+        if name.endswith("running_mean"):
+            assert bool((value == 0.25).all()), name
+    assert new.model.name == "mug"
+
+
+def test_exported_weights_are_read_too(tmp_path: Path) -> None:
+    old, new = (
+        build(tmp_path, "carton", 0, "model=pose_pf"),
+        build(tmp_path, "carton", 1, "model=pose_pf"),
+    )
+    warm_start(new, {"state_dict": pack(old.state_dict())})
+    there = old.state_dict()
+    for name, value in new.named_parameters():
+        off = (value.detach() - there[name]).abs().max()
+        assert float(off) <= 0.01 * float(there[name].abs().max()) + 1e-6, name
+
+
+def test_weights_of_another_method_are_refused(tmp_path: Path) -> None:
+    old, new = (
+        build(tmp_path, "carton", 0, "model=pose_pf"),
+        build(tmp_path, "carton", 1, "model=patch_pf"),
+    )
+    with pytest.raises(UserError, match="warm_start: only"):
+        warm_start(new, {"state_dict": old.state_dict()})

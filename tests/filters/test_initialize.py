@@ -1,0 +1,177 @@
+"""First clouds: where they are drawn, and how often."""
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.filters.initialize import (
+    FromDepth,
+    FromProposals,
+    FromRelevance,
+    Informed,
+    UniformPixels,
+    draw_from_depth,
+)
+from posefilter.geometry.camera import intrinsics, project
+from posefilter.geometry.lookup import touches
+from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
+from posefilter.geometry.spaces import PixelSpace, PoseSpace
+from posefilter.protocols import Initialize
+from posefilter.types import Batch
+
+H, W = 20, 30
+SPACE = PoseSpace((0.02, 0.0, -0.03), 0.1)
+CENTER = torch.tensor(SPACE.center)
+
+
+class Pixels:
+    space = PixelSpace()
+
+
+class Poses:
+    space = SPACE
+
+    def propose_poses(self, scene: Tensor, particles: int, generator: Generator) -> Tensor:
+        return make_pose(torch.eye(3), scene + torch.rand(2, particles, 3, generator=generator))
+
+
+class Map:
+    def __init__(self, relevance: Tensor) -> None:
+        self.relevance = relevance
+
+
+def images() -> Batch:
+    depth = torch.zeros(2, 1, H, W)
+    depth[0, 0, 5:10, 3:9] = 0.8
+    depth[1] = 1.0 + torch.arange(W) / 100
+    mask = torch.zeros(2, 1, H, W, dtype=torch.bool)
+    mask[0, 0, 8:10, 20:24] = True
+    K = intrinsics(40.0, 42.0, 14.5, 9.5).expand(2, 3, 3)
+    ids = torch.arange(2)
+    return Batch(
+        torch.zeros(2, 3, H, W),
+        depth,
+        mask,
+        K,
+        torch.eye(4).expand(2, 4, 4),
+        ids,
+        ids,
+        torch.ones(2),
+    )
+
+
+def run(
+    piece: Initialize, method: object, scene: object = None, particles: int = 4000, seed: int = 0
+) -> Tensor:
+    return piece(images(), scene, method, particles, Generator().manual_seed(seed))
+
+
+def test_uniform_pixels_fill_the_frame() -> None:
+    state = run(UniformPixels(), Pixels())
+    assert state.shape == (2, 4000, 2)
+    assert state.min() >= -0.5
+    assert (state.amax((0, 1)) < torch.tensor([W - 0.5, H - 0.5])).all()
+    torch.testing.assert_close(
+        state.mean((0, 1)), torch.tensor([(W - 1) / 2, (H - 1) / 2]), atol=0.3, rtol=0
+    )
+    cells = torch.histogramdd(state[0], [3, 2], range=[-0.5, W - 0.5, -0.5, H - 0.5]).hist
+    assert cells.min() > 0.85 * 4000 / 6
+
+
+def test_poses_start_behind_measured_points() -> None:
+    poses = run(FromDepth((0.2, 0.6)), Poses())
+    assert is_rigid(poses)
+    center = origin_of(poses, CENTER)
+    pixels = project(center, images().intrinsics)
+    # on the rays of whole pixels
+    torch.testing.assert_close(pixels, pixels.round(), atol=1e-3, rtol=0)
+    u, v = pixels[0].round().unbind(-1)
+    assert ((u >= 3) & (u < 9) & (v >= 5) & (v < 10)).all()  # nothing was measured elsewhere
+    surface = center[0] / center[0, :, 2:] * 0.8
+    behind = (center[0] - surface).norm(dim=-1) * (center[0] - surface)[:, 2].sign()
+    assert behind.min() >= 0.02 - 1e-5
+    assert behind.max() <= 0.06 + 1e-5
+    assert float(behind.mean()) == pytest.approx(0.04, abs=0.001)
+    counts = torch.bincount(((v - 5) * 6 + u - 3).long(), minlength=30)
+    assert counts.min() > 80  # 133 on average
+    assert rotation_of(poses).mean((0, 1)).abs().max() < 0.05
+
+
+def test_a_prior_says_where() -> None:
+    batch = images()
+    prior = torch.zeros(2, 1, H, W)
+    prior[:, :, 6, 4] = 1.0
+    poses = draw_from_depth(
+        batch.depth, batch.intrinsics, SPACE, 50, Generator().manual_seed(0), prior
+    )
+    pixels = project(origin_of(poses, CENTER), batch.intrinsics)
+    torch.testing.assert_close(pixels, torch.tensor([4.0, 6.0]).expand(2, 50, 2), atol=1e-3, rtol=0)
+
+
+def test_without_any_depth_poses_start_a_metre_away() -> None:
+    batch = images()
+    none = draw_from_depth(
+        batch.depth * 0, batch.intrinsics, SPACE, 500, Generator().manual_seed(0), behind=(0.0, 0.0)
+    )
+    torch.testing.assert_close(origin_of(none, CENTER)[..., 2], torch.ones(2, 500))
+
+
+def test_relevance_draws_its_cells_and_little_else() -> None:
+    weight = torch.zeros(2, 1, 5, 10)
+    weight[0, 0, 1, 7] = 3.0
+    weight[1, 0, :, 0] = 0.1
+    state = run(FromRelevance(anywhere=0.2), Pixels(), Map(weight))
+    in_cell = (
+        (state[0] >= torch.tensor([20.5, 3.5])) & (state[0] < torch.tensor([23.5, 7.5]))
+    ).all(-1)
+    assert float(in_cell.float().mean()) == pytest.approx(0.8 + 0.2 / 50, abs=0.02)
+    assert float((state[1, :, 0] < 2.5).float().mean()) == pytest.approx(0.8 + 0.2 / 10, abs=0.02)
+    chosen = state[0][in_cell]
+    torch.testing.assert_close(chosen.mean(0), torch.tensor([22.0, 5.5]), atol=0.1, rtol=0)
+    empty = run(FromRelevance(anywhere=0.0), Pixels(), Map(torch.zeros(2, 1, 5, 10)))
+    assert empty.std(1).min() > 4  # no opinion: everywhere
+
+
+def test_proposals_are_the_methods_own() -> None:
+    poses = run(FromProposals(), Poses(), torch.tensor([5.0, 0.0, 0.0]), 7)
+    assert poses.shape == (2, 7, 4, 4)
+    assert (poses[..., 0, 3] >= 5).all()
+
+
+def test_informed_starts_read_the_mask_in_training_only() -> None:
+    piece = Informed(UniformPixels(), share=0.5, around_px=0.0)
+    seen, unseen = run(piece.train(), Pixels())
+    on = touches(images().mask, torch.stack([seen, unseen]))[0]
+    assert on[:2000].all()
+    assert float(on[2000:].float().mean()) < 0.05
+    assert unseen.std(0).min() > 4  # an image whose object is hidden is searched everywhere
+    assert torch.equal(run(piece.eval(), Pixels()), run(UniformPixels(), Pixels()))
+    around = run(Informed(UniformPixels(), 1.0, 3.0).train(), Pixels())[0]
+    assert float(around.std(0)[1]) == pytest.approx((9 + 0.25) ** 0.5, abs=0.3)
+
+
+@pytest.mark.parametrize(
+    ("piece", "method", "words"),
+    [
+        (UniformPixels(), Poses(), "initialize=uniform draws pixels"),
+        (FromRelevance(), Poses(), "initialize=from_relevance draws pixels"),
+        (FromDepth(), Pixels(), "initialize=from_depth draws poses"),
+        (FromRelevance(), Pixels(), "no map of relevance"),
+        (FromProposals(), Pixels(), "proposes no poses"),
+    ],
+)
+def test_what_does_not_fit_is_said(piece: Initialize, method: object, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        run(piece, method)
+
+
+@pytest.mark.parametrize(
+    "piece",
+    [UniformPixels(), FromRelevance(), Informed(UniformPixels())],
+    ids=lambda x: type(x).__name__,
+)
+def test_the_same_generator_draws_the_same(piece: Initialize) -> None:
+    scene = Map(torch.rand(2, 1, 5, 10, generator=Generator().manual_seed(0)))
+    assert torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=4))
+    assert not torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=5))

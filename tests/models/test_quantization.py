@@ -1,0 +1,45 @@
+"""Packed weights are small, come back close, and leave alone what is not a float."""
+
+import torch
+from torch import nn
+
+from posefilter.models.quantization import pack, unpack
+
+
+def net() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(
+        nn.Conv2d(16, 64, 3),
+        nn.BatchNorm2d(64),
+        nn.ReLU(),
+        nn.Conv2d(64, 64, 3),
+        nn.BatchNorm2d(64),
+    ).eval()
+
+
+def size(state: dict[str, torch.Tensor]) -> int:
+    return sum(x.numel() * x.element_size() for x in state.values())
+
+
+def test_weights_come_back_close_and_cost_a_quarter() -> None:
+    before = net()
+    packed = pack(before.state_dict())
+    assert size(packed) < 0.27 * size(before.state_dict())
+    after = net()
+    nn.init.zeros_(after[0].weight)
+    after.load_state_dict(unpack(packed))
+    for a, b in zip(before.parameters(), after.parameters(), strict=True):
+        assert (a - b).norm() < 0.01 * a.norm() + 1e-6
+    x = torch.randn(2, 16, 20, 20)
+    assert (before(x) - after(x)).norm() < 0.02 * before(x).norm()
+
+
+def test_counters_stay_whole_numbers() -> None:
+    state = net().state_dict()
+    assert unpack(pack(state))["1.num_batches_tracked"].dtype == torch.int64
+
+
+def test_a_plain_state_passes_unchanged() -> None:
+    state = net().state_dict()
+    for name, value in unpack(state).items():
+        assert torch.equal(value, state[name])
