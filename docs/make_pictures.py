@@ -31,6 +31,7 @@ from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, draw_row, full_view
+from posefilter.figures.convergence import animate_convergence, encode_webp
 from posefilter.figures.layout import TITLE, draw_text
 from posefilter.figures.overlay import Shape, draw_poses, list_axes
 from posefilter.figures.particles import draw_iterations
@@ -46,6 +47,13 @@ HOME = Path(__file__).parents[1]
 # of the rendered scenes: a seed that no training uses, and a scene a frame
 SEED, FRAMES = 20_000_101, 6
 EXAMPLE = 3  # which of them belief and particles are drawn of
+BRIGHT = 3  # which of them is animated: well lit, and nothing stands before the object
+# the search that is animated: it begins anywhere on the measured surfaces rather than where the
+# network proposes
+SEARCH = {
+    "initialize": {"_target_": "posefilter.filters.initialize.FromDepth", "behind": [0.1, 0.9]},
+    "filter": {"steps": 20, "first_particles": 3000},
+}
 WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
 TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_scenes": "scenes/preview.png",
@@ -124,7 +132,7 @@ def main() -> int:
 
 
 def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path) -> None:
-    """Write predictions.jpg, belief.jpg and particles.jpg."""
+    """Write predictions.jpg, belief.jpg, particles.jpg and convergence.webp."""
     quiet()
     settle(None, 0)
     kept = read_checkpoint(checkpoint)
@@ -153,14 +161,30 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
         draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object),
     )
     write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
+    searching = method_of(kept, SEARCH)
+    sample, _, trace = next(
+        run(searching, kept["recipe"]["settings"]["data"], scenes, name, only=BRIGHT)
+    )
+    model = method.model
+    frames = animate_convergence(
+        sample.rgb, sample.intrinsics, trace, model.center, model.hull, model.hull, between=5
+    )
+    path = out / "convergence.webp"
+    path.write_bytes(encode_webp(list(frames)))
+    print(f"{path} ({path.stat().st_size / 1000:.0f} kB)")
 
 
-def run(method: PoseEstimator, data: dict, scenes: Path, name: str) -> Iterator[Found]:
+def run(
+    method: PoseEstimator, data: dict, scenes: Path, name: str, only: int | None = None
+) -> Iterator[Found]:
     """Yield what the filter makes of each frame of a folder of scenes; the frames are of the size
     that it was trained on.
+
+    only: which of the frames, the last one where there are fewer (None: all).
     """
     reader = open_reader("scenes", scenes, name)
-    for i in range(len(reader.records())):
+    count = len(reader.records())
+    for i in range(count) if only is None else [min(only, count - 1)]:
         sample = reader.read(i)
         width = data.get("image_width") or sample.rgb.shape[1]
         if sample.rgb.shape[1] != width:

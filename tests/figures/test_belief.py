@@ -1,12 +1,14 @@
 """Pictures of beliefs: mass is drawn where the belief is."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 
 from posefilter.figures.belief import (
+    Mark,
     compute_marginals,
     draw_belief,
     draw_rotations,
@@ -14,16 +16,18 @@ from posefilter.figures.belief import (
     scale_radii,
     select_single,
 )
+from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import halve
 from posefilter.figures.layout import WIDTH
 from posefilter.figures.mollweide import (
     color_by_turn,
     draw_blank_map,
+    label_map,
     map_to_sphere,
     project_to_map,
 )
 from posefilter.geometry.pose import make_pose, move_about
-from posefilter.geometry.rotation import exp_so3
+from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.types import Belief, ObjectModel
 
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
@@ -147,15 +151,25 @@ def test_dots_areas_are_the_weights() -> None:
     assert (radii[1] ** 2 - 9) / (radii[2] ** 2 - 9) == pytest.approx(0.5)
 
 
+def draw_empty_map(marked: torch.Tensor) -> np.ndarray:
+    """Return the map without particles, its words where they are when a pose is marked."""
+    longitude, latitude, _ = (x.numpy() for x in map_to_sphere(marked[None, :3, :3], 2))
+    return halve(
+        label_map(draw_blank_map(2 * 588), project_to_map(longitude, latitude, 2 * 588))
+    ).astype(int)
+
+
 def test_pixels_of_the_map_are_colored_where_the_belief_is_and_only_there() -> None:
     belief, a, b = two_modes()
     poses, weights, best = select_single(belief)
-    picture = draw_rotations(poses, weights, best, None, 2, 588).astype(int)
+    picture = draw_rotations(poses, weights, [Mark(best, (214, 33, 156), "square")], 2, 588).astype(
+        int
+    )
     longitude, latitude, tilt = (
         x.numpy() for x in map_to_sphere(torch.stack([a, b])[:, :3, :3], 2)
     )
     places, colors = project_to_map(longitude, latitude, 588), color_by_turn(tilt).astype(int)
-    empty = halve(draw_blank_map(2 * 588)).astype(int)
+    empty = draw_empty_map(best)
     drawn = np.argwhere(np.abs(picture - empty).max(-1) > 100)[:, ::-1]
     near = np.linalg.norm(drawn[:, None] - places[None], axis=-1)
     assert (near.min(1) < 40).all()  # nobody is anywhere else
@@ -169,8 +183,10 @@ def test_the_heavier_mode_covers_more_of_the_map() -> None:
     belief, a, b = two_modes(share=0.02)
     poses, weights, _ = select_single(belief)
     far = looking(2.6, -0.9)  # where the estimate is marked, out of the way
-    picture = draw_rotations(poses, weights, far, None, 2, 588).astype(int)
-    empty = halve(draw_blank_map(2 * 588)).astype(int)
+    picture = draw_rotations(poses, weights, [Mark(far, (214, 33, 156), "square")], 2, 588).astype(
+        int
+    )
+    empty = draw_empty_map(far)
     drawn = np.argwhere(np.abs(picture - empty).max(-1) > 60)[:, ::-1]
     longitude, latitude, _ = (x.numpy() for x in map_to_sphere(torch.stack([a, b])[:, :3, :3], 2))
     heavy, light = (
@@ -214,6 +230,53 @@ def test_what_lies_beyond_a_histogram_is_told() -> None:
     ]
     assert 0.01 <= max(beyond) < 0.02  # the mode, and some of the tails
     assert all(one == pytest.approx(0, abs=0.06) for one in beyond)
+
+
+def test_a_second_pose_is_told_with_its_share() -> None:
+    """How sure the estimate's own mode is, without the other one; how heavy, far and turned the
+    other is.
+    """
+    belief, a, b = two_modes(share=0.3)
+    poses, weights, best = select_single(belief)
+    found = summarize_belief(poses, weights, best, model())
+    assert found.share == pytest.approx(0.7, abs=0.01)
+    assert found.second is not None
+    assert found.second.weight == pytest.approx(0.3, abs=0.01)
+    assert found.shift == pytest.approx(0.004 * math.sqrt(3), rel=0.15)
+    assert found.turn == pytest.approx(0.03 * math.sqrt(3), rel=0.15)
+    assert found.second_turn == pytest.approx(float(angle_between(a[:3, :3], b[:3, :3])), abs=0.15)
+    sure, other = describe_belief(found)
+    assert re.fullmatch(r"sure to ±[67]\.\d+ mm, ±[23]\.\d°", sure)
+    assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)
+
+
+def test_one_pose_is_told_as_one_and_a_lost_estimate_as_lost() -> None:
+    belief, _, b = two_modes(share=0.0)
+    poses, weights, best = select_single(belief)
+    keep = weights > 1e-12
+    found = summarize_belief(poses[keep], weights[keep], best, model())
+    assert found.second is None
+    assert describe_belief(found)[1] == "no second pose above 1 %"
+    away = b.clone()
+    away[2, 3] += 1.0
+    lost = summarize_belief(poses[keep], weights[keep], away, model())
+    assert lost.share == 0
+    assert describe_belief(lost)[0] == "the estimate lies apart from the particles"
+
+
+def test_nothing_is_written_under_a_mark() -> None:
+    """The word for a direction gives way to a mark that stands there, and is there without it."""
+    blank = draw_blank_map(1176)
+    (place,) = project_to_map(np.zeros(1), np.zeros(1), 1176)
+    window = (
+        slice(int(place[1]) - 20, int(place[1]) + 36),
+        slice(int(place[0]) - 20, int(place[0]) + 20),
+    )
+    free, marked = (label_map(blank, taken) for taken in (np.zeros((0, 2)), place[None]))
+    assert (free[window] != blank[window]).any()
+    assert (marked[window] == blank[window]).all()
+    # it is written elsewhere
+    assert ((marked != blank).any(-1)).sum() > 0.8 * ((free != blank).any(-1)).sum()
 
 
 def test_a_batch_of_several_is_refused() -> None:

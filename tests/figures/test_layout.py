@@ -10,6 +10,7 @@ from posefilter.figures.layout import (
     CAPTION,
     DETAIL,
     GAP,
+    LEGEND,
     THUMBNAIL,
     TITLE,
     WIDTH,
@@ -35,7 +36,9 @@ def x_height(size: int, bold: bool = False) -> float:
 def test_letters_are_read_in_a_thumbnail() -> None:
     assert x_height(TITLE) >= READ
     assert x_height(TITLE, bold=True) >= READ
+    assert x_height(LEGEND) >= 0.7 * READ
     assert x_height(CAPTION) >= 0.6 * READ
+    assert TITLE > 1.2 * LEGEND > 1.2 * CAPTION > 1.2 * DETAIL  # what is said first is the largest
     assert DETAIL * 0.54 >= 8  # at the whole size
 
 
@@ -76,7 +79,7 @@ def test_long_writing_goes_on_in_the_next_line_and_loses_nothing() -> None:
 def test_a_legend_shows_each_color_once_and_breaks_where_it_must() -> None:
     few = [("truth", TRUTH), ("estimate", (255, 80, 200))]
     many = [*few, ("where the particles started", (10, 20, 30)), ("y", (60, 190, 70))]
-    line = round(TITLE * 1.25)
+    line = round(LEGEND * 1.25)
     assert len(draw_legend(few)) == line
     assert len(draw_legend(many)) > line
     for _, color in many:

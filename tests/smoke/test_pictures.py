@@ -62,6 +62,8 @@ def test_a_checkpoint_is_pictured(script: ModuleType, tiny_job, tmp_path: Path) 
     assert green[60:, tile:].sum() > 100
     for name in ("belief", "particles"):
         assert np.asarray(Image.open(out / f"{name}.jpg")).std() > 10
+    with Image.open(out / "convergence.webp") as moving:
+        assert moving.n_frames > 20
 
 
 def test_the_tour_is_pictured_as_far_as_it_was_run(

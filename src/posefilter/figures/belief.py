@@ -7,11 +7,13 @@ center is towards it, right and up are the image's.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import Color, View, arrange_grid, draw_dots, halve
 from posefilter.figures.curves import choose_ticks
 from posefilter.figures.layout import (
@@ -27,6 +29,7 @@ from posefilter.figures.mollweide import (
     color_by_turn,
     draw_blank_map,
     draw_turn_scale,
+    label_map,
     map_to_sphere,
     project_to_map,
 )
@@ -39,8 +42,18 @@ from posefilter.types import Belief, ObjectModel
 
 _TRUE: Color = (21, 153, 71)  # darker than on photographs: these are read on white
 _BEST: Color = (214, 33, 156)
+_SECOND: Color = (226, 110, 0)
 _NAMES = "xyz"
+_REACH = {"ring": 44, "square": 20, "diamond": 32}  # [px] of marks, at twice the size
 _AWAY = ("right", "down", "away")  # camera axes
+
+
+class Mark(NamedTuple):
+    """A pose that is pointed at."""
+
+    pose: torch.Tensor  # (4, 4)
+    color: Color
+    shape: str  # of panels.draw_mark
 
 
 def draw_belief(
@@ -62,39 +75,32 @@ def draw_belief(
     true = None if truth is None else torch.as_tensor(np.asarray(truth), dtype=torch.float64)
     axis = find_longest_axis(model) if axis is None else axis
     ess = float(1 / weights.square().sum())
-    title = title or f"Belief\n{model.name}"
+    summary = summarize_belief(poses, weights, best, model)
+    sure, other = describe_belief(summary)
+    marks = [Mark(best, _BEST, "square"), *([] if true is None else [Mark(true, _TRUE, "ring")])]
     entries = [("estimate", _BEST), *([] if true is None else [("truth", _TRUE)])]
+    if summary.second is not None:
+        marks.append(Mark(torch.from_numpy(summary.second.pose).double(), _SECOND, "diamond"))
+        entries.append(("second pose", _SECOND))
     half = tile_width(2)
-    said = np.concatenate(
-        [
-            draw_legend(entries, half),
-            draw_text(f"{len(weights)} particles, {ess:.0f} effective", CAPTION, half),
-            draw_text(
-                "The photograph: where they put the object's center, colored by weight.",
-                DETAIL,
-                half,
-            ),
-            draw_text(
-                f"Map, above: where the object's {_NAMES[axis]} axis points, colored by the turn "
-                f"about it.",
-                DETAIL,
-                half,
-            ),
-            draw_text(
-                "Below: shares of the belief. Shifts are from its mean; turns are from the "
-                "estimate.",
-                DETAIL,
-                half,
-            ),
-        ]
+    words = [
+        f"{len(weights)} particles, {ess:.0f} effective.",
+        f"±: root mean square in the estimate's mode, {summary.share:.0%} of the belief.",
+        f"Map, above: where the object's {_NAMES[axis]} axis points, colored by the turn about it.",
+        "Photograph: where the particles put the object's center, colored by weight.",
+        "Below: shares of the belief. Shifts are from its mean, turns from the estimate.",
+    ]
+    notes = np.concatenate(
+        [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
     )
     return compose_figure(
-        title,
-        draw_text(f"where the object's {_NAMES[axis]} axis points", CAPTION),
-        draw_rotations(poses, weights, best, true, axis, tile_width(1)),
+        title or f"Belief\n{model.name}",
+        draw_text(sure, CAPTION, bold=True),
+        draw_text(other, CAPTION),
+        draw_rotations(poses, weights, marks, axis, tile_width(1)),
         draw_turn_scale(),
         arrange_row(
-            [arrange_grid([draw_centers(poses, weights, best, true, model, rgb, K, half)], 1), said]
+            [arrange_grid([draw_centers(poses, weights, marks, model, rgb, K, half)], 1), notes]
         ),
         draw_weight_scale(),
         *draw_marginals(poses, weights, best, true, model),
@@ -122,12 +128,7 @@ def find_longest_axis(model: ObjectModel) -> int:
 
 
 def draw_rotations(
-    poses: torch.Tensor,
-    weights: torch.Tensor,
-    best: torch.Tensor,
-    true: torch.Tensor | None,
-    axis: int,
-    width: int,
+    poses: torch.Tensor, weights: torch.Tensor, marks: Sequence[Mark], axis: int, width: int
 ) -> np.ndarray:
     """Draw rotations on a Mollweide map: place = where the axis points, color = turn about it, area
     = weight.
@@ -138,13 +139,13 @@ def draw_rotations(
     order = np.argsort(weights.numpy(), kind="stable")
     places = project_to_map(longitude, latitude, fine)[order]
     draw_dots(picture, places, color_by_turn(tilt)[order], scale_radii(weights.numpy())[order])
-    for pose, color, shape, reach in ((true, _TRUE, "ring", 36), (best, _BEST, "square", 24)):
-        if pose is not None:
-            u, v, turn = (x.numpy() for x in map_to_sphere(rotation_of(pose)[None], axis))
-            at = project_to_map(u, v, fine)[0]
-            draw_mark(picture, at, color, shape, reach, 14)
-            draw_mark(picture, at, (*color_by_turn(turn)[0].tolist(),), shape, reach, 4)
-    return halve(picture)
+    taken = []
+    for mark in marks[::-1]:
+        u, v, _ = (x.numpy() for x in map_to_sphere(rotation_of(mark.pose)[None], axis))
+        at = project_to_map(u, v, fine)[0]
+        draw_mark(picture, at, mark.color, mark.shape, _REACH[mark.shape], 7)
+        taken.append(at)
+    return halve(label_map(picture, np.array(taken)))
 
 
 def scale_radii(weights: np.ndarray, least: float = 3.0, most: float = 11.0) -> np.ndarray:
@@ -158,30 +159,29 @@ def scale_radii(weights: np.ndarray, least: float = 3.0, most: float = 11.0) -> 
 def draw_centers(
     poses: torch.Tensor,
     weights: torch.Tensor,
-    best: torch.Tensor,
-    true: torch.Tensor | None,
+    marks: Sequence[Mark],
     model: ObjectModel,
     rgb: np.ndarray,
     K: np.ndarray,
     size: int,
 ) -> np.ndarray:
     """Draw on the photograph where particles put the object's center, cut to the object as the
-    estimate has it.
+    first mark has it.
     """
     camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
     center = model.center.cpu().double()
-    at = lambda pose: project(origin_of(pose, center)[None], camera).numpy()  # noqa: E731
     dots = project(origin_of(poses, center), camera).numpy()
     order = np.argsort(weights.numpy(), kind="stable")
+    best = marks[0].pose
     left, top, right, _ = choose_window(
         dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2]
     )
     view = View(left, top, 2 * size / (right - left), 2 * size, 2 * size)
     picture = fade(view.show(rgb), 0.4)
     draw_dots(picture, view.place(dots[order]), color_by_weight(weights.numpy())[order], 5)
-    if true is not None:
-        draw_mark(picture, view.place(at(true))[0], _TRUE, "ring", 26, 6)
-    draw_mark(picture, view.place(at(best))[0], _BEST, "square", 18, 6)
+    for mark in marks[::-1]:
+        at = project(origin_of(mark.pose, center)[None], camera).numpy()
+        draw_mark(picture, view.place(at)[0], mark.color, mark.shape, 0.75 * _REACH[mark.shape], 5)
     return halve(picture)
 
 
@@ -289,7 +289,7 @@ def draw_marginal(one: Marginal, label: str) -> np.ndarray:
     low, high = float(one.edges[0]), float(one.edges[-1])
     top = 1.1 * max(float(one.mass.max()), 1e-6)
     x, y = (
-        Axis(label, low, high, choose_ticks(low, high, 3)),
+        Axis(label, low, high, choose_ticks(low, high, 3, 3 if max(-low, high) < 100 else 2)),
         Axis("share", 0, top, choose_ticks(0, top, 2)),
     )
     marks = list(zip(one.marks, (_BEST, _TRUE), strict=False))[::-1]

@@ -15,7 +15,8 @@ from posefilter.figures.canvas import INK, PAPER, Color, load_font
 
 WIDTH = 600  # [px] of every figure
 THUMBNAIL = 300  # [px] as wide as TensorBoard's cards show it
-TITLE, CAPTION, DETAIL = 34, 24, 15  # [px] sizes of letters; a small x is 0.55 of it high
+# [px] sizes of letters; a small x is 0.55 of it high
+TITLE, LEGEND, CAPTION, DETAIL = 36, 27, 24, 15
 GAP = 6  # [px] between tiles, and round them
 _LEADING = 1.25  # a line is so much higher than its letters' size
 _SWATCH = 26  # [px] the line of color before a legend's word
@@ -92,7 +93,7 @@ def format_length(length: float) -> str:
 
 
 def draw_legend(
-    entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: int = TITLE
+    entries: Sequence[tuple[str, Color]], width: int = WIDTH, size: int = LEGEND
 ) -> np.ndarray:
     """Return what colors mean, each a stroke of the color before its word, in as many lines as that
     needs.  -> picture.
@@ -116,7 +117,7 @@ def draw_legend(
 
 
 def draw_scale(
-    before: str, ramp: np.ndarray, after: str, width: int = WIDTH, size: int = TITLE
+    before: str, ramp: np.ndarray, after: str, width: int = WIDTH, size: int = LEGEND
 ) -> np.ndarray:
     """Return a scale of colors: what it starts from, the colors (n, 3) uint8, what it ends at.  ->
     picture.

@@ -15,7 +15,11 @@ from posefilter.figures.layout import DETAIL, WIDTH, draw_scale
 
 _TURN = colormaps["hsv"]
 _GRID: Color = (205, 209, 214)
-_WORDS: Color = (120, 126, 136)
+_INK: Color = (96, 102, 112)
+_WORDS = (  # longitude and latitude [degrees], and what is there
+    (-90, 0, "left"), (0, 0, "to the camera"), (90, 0, "right"),
+    (0, -60, "60° down"), (0, -30, "30° down"), (0, 30, "30° up"), (0, 60, "60° up"),
+)  # fmt: skip
 _RIM = 0.01  # of the width, left free beside the map
 # the projection's auxiliary angle, tabled: 2 t + sin 2 t = pi sin(latitude)
 # denser at the poles, where it is steep
@@ -79,14 +83,42 @@ def _draw_blank(width: int) -> np.ndarray:
         ]
     )
     draw_lines(picture, [rim], INK, max(2, width // 400), closed=True, halo=False)
+    return picture
+
+
+def label_map(picture: np.ndarray, taken: np.ndarray, reach: float = 70.0) -> np.ndarray:
+    """Return a map with its directions named: on top of what is drawn there, and away from places
+    that are marked.
+
+    Args:
+        picture: A map of twice its height.
+        taken: Places (M, 2) of marks [px].
+        reach: How near to a mark nothing is written [px].
+    """
+    width = picture.shape[1]
     image = Image.fromarray(picture)
     pen, letters = ImageDraw.Draw(image), load_font(DETAIL * width // WIDTH)
-    for degrees, word in ((-90, "left"), (0, "to the camera"), (90, "right")):
-        (at,) = project_to_map(np.deg2rad([degrees]), np.zeros(1), width)
-        pen.text((at[0], at[1] + 2), word, fill=_WORDS, font=letters, anchor="mt")
-    for degrees, word in ((-60, "60° down"), (-30, "30° down"), (30, "30° up"), (60, "60° up")):
-        (at,) = project_to_map(np.zeros(1), np.deg2rad([degrees]), width)
-        pen.text((at[0], at[1] + 2), word, fill=_WORDS, font=letters, anchor="mt")
+    for longitude, latitude, word in _WORDS:
+        (at,) = project_to_map(np.deg2rad([longitude]), np.deg2rad([latitude]), width)
+        half = letters.getlength(word) / 2
+        # below the line, above it, beside it
+        for anchor, down in (("mt", 3), ("mb", -3), ("lt", 3), ("rt", 3)):
+            middle = at + np.array(
+                [{"m": 0, "l": half + 60, "r": -half - 60}[anchor[0]], 14 if down > 0 else -14]
+            )
+            gap = np.abs(taken.reshape(-1, 2) - middle) - [half, 14]
+            if (gap.max(1) > reach / 2).all():
+                place, where = (middle[0], at[1] + down), "m" + anchor[1]
+                pen.text(
+                    place,
+                    word,
+                    fill=_INK,
+                    font=letters,
+                    anchor=where,
+                    stroke_width=5,
+                    stroke_fill=PAPER,
+                )
+                break
     return np.asarray(image)
 
 

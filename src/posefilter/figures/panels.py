@@ -14,7 +14,7 @@ from matplotlib import colormaps
 from PIL import Image, ImageDraw
 
 from posefilter.figures.canvas import INK, PAPER, Color, draw_dots, draw_lines, load_font
-from posefilter.figures.layout import DETAIL, TITLE, WIDTH, draw_scale
+from posefilter.figures.layout import DETAIL, LEGEND, WIDTH, draw_scale
 
 LEFT, TOP, RIGHT, BOTTOM = 62, 8, 14, 48  # margins [px]
 SURFACE: Color = (110, 114, 120)
@@ -38,7 +38,7 @@ class Mark(NamedTuple):
     x: float
     y: float
     color: Color
-    shape: str = "ring"  # or "square"
+    shape: str = "ring"  # or "square", "diamond"
 
 
 def map_colors(values: np.ndarray, low: float, high: float, name: str = "viridis") -> np.ndarray:
@@ -168,7 +168,7 @@ def add_frame(plot: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
 
 
 def draw_color_scale(
-    before: str, after: str, name: str = "viridis", width: int = WIDTH, size: int = TITLE
+    before: str, after: str, name: str = "viridis", width: int = WIDTH, size: int = LEGEND
 ) -> np.ndarray:
     """Return a scale of a map's colors between what its ends mean."""
     return draw_scale(before, map_colors(np.linspace(0, 1, 256), 0, 1, name), after, width, size)
@@ -196,16 +196,15 @@ def draw_mark(
     reach: float = 0,
     width: int = 2,
 ) -> None:
-    """Draw a ring or a square round a place (2,) [px], in place; reach: how far it goes from there
-    (0: as in panels).
+    """Draw a ring, square or diamond round a place (2,) [px], in place; reach: how far it goes (0:
+    as in panels).
     """
     reach = reach or (_REACH if shape == "ring" else 2 * _REACH / 3)
+    first = np.pi / 4 if shape == "square" else 0.0
     turn = (
-        np.linspace(0, 2 * np.pi, 33)[:-1]
-        if shape == "ring"
-        else np.pi / 4 + np.arange(4) * np.pi / 2
+        np.linspace(0, 2 * np.pi, 33)[:-1] if shape == "ring" else first + np.arange(4) * np.pi / 2
     )
-    length = reach if shape == "ring" else reach * 2**0.5
+    length = reach * 2**0.5 if shape == "square" else reach
     draw_lines(
         picture,
         [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)],

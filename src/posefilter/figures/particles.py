@@ -21,7 +21,7 @@ from posefilter.figures.canvas import (
 from posefilter.figures.layout import (
     CAPTION,
     DETAIL,
-    TITLE,
+    LEGEND,
     WIDTH,
     add_caption,
     compose_figure,
@@ -242,7 +242,7 @@ def choose_by_weight(weights: torch.Tensor, count: int) -> torch.Tensor:
     return torch.searchsorted(weights.cumsum(0), at).clamp(max=len(weights) - 1)
 
 
-def draw_weight_scale(width: int = WIDTH, size: int = TITLE) -> np.ndarray:
+def draw_weight_scale(width: int = WIDTH, size: int = LEGEND) -> np.ndarray:
     """Return a row that explains the colors."""
     ramp = (_WEIGHT(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
     return draw_scale("weight: mean / 10", ramp, "x 10", width, size)

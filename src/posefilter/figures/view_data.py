@@ -77,7 +77,7 @@ def collect_view_data(
     points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
-    estimate, others, left_out = find_hypotheses(
+    estimate, others, left_out, _ = find_hypotheses(
         poses, belief.log_weights[image].detach().cpu(), best, model
     )
     unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
@@ -144,9 +144,18 @@ def color_points(rgb: Tensor, depth: Tensor, K: Tensor) -> tuple[np.ndarray, np.
     ]
 
 
+class Hypotheses(NamedTuple):
+    """What a belief holds for possible."""
+
+    estimate: Hypothesis  # its weight is that of the mode it belongs to
+    others: tuple[Hypothesis, ...]  # the other modes, the heaviest first
+    left_out: float  # share of the weight in modes too light to be shown
+    own: Tensor  # (N,) bool, which particles belong to the estimate's mode
+
+
 def find_hypotheses(
     poses: Tensor, log_weights: Tensor, best: Tensor, model: ObjectModel
-) -> tuple[Hypothesis, tuple[Hypothesis, ...], float]:
+) -> Hypotheses:
     """Return the estimate, the belief's other modes, and the weight in modes too light to be shown.
 
     The estimate stands for the mode of the particle nearest to it, and has that one's weight; where
@@ -162,7 +171,9 @@ def find_hypotheses(
     shown = [i for i in rest if float(modes.weights[i]) >= _LEAST][:_MOST]
     others = tuple(Hypothesis(modes.states[i].numpy(), float(modes.weights[i])) for i in shown)
     estimate = Hypothesis(best.numpy(), 0.0 if own is None else float(modes.weights[own]))
-    return estimate, others, float(sum(modes.weights[i] for i in rest if i not in shown))
+    left_out = float(sum(modes.weights[i] for i in rest if i not in shown))
+    members = torch.zeros(len(poses), dtype=torch.bool) if own is None else modes.member == own
+    return Hypotheses(estimate, others, left_out, members)
 
 
 def make_mesh(shape: Shape, name: str) -> Mesh:

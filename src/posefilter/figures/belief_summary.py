@@ -1,0 +1,74 @@
+"""Say in words how sure a belief is, and which other pose it holds for possible."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from posefilter.figures.layout import format_length
+from posefilter.figures.view_data import Hypothesis, find_hypotheses
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import angle_between
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.metrics.beliefs import spread
+from posefilter.types import ObjectModel
+
+
+class BeliefSummary(NamedTuple):
+    """How sure a belief about one image is.
+
+    Attributes:
+        shift: Root mean square distance of the centers in the estimate's mode from their mean [m].
+        turn: The same of the rotations [rad].
+        share: Weight of the estimate's mode, 0 where the estimate belongs to none.
+        second: The heaviest of the other modes, None where there is none that counts.
+        second_shift: How far its center is from the estimate's [m].
+        second_turn: By how much it is turned from the estimate [rad].
+    """
+
+    shift: float
+    turn: float
+    share: float
+    second: Hypothesis | None
+    second_shift: float
+    second_turn: float
+
+
+def summarize_belief(
+    poses: Tensor, weights: Tensor, best: Tensor, model: ObjectModel
+) -> BeliefSummary:
+    """Return how sure a belief is.
+
+    Args:
+        poses: Particles (N, 4, 4), camera_from_object [m], float64.
+        weights: Their weights (N,), summing to 1.
+        best: The estimate (4, 4).
+        model: The object.
+    """
+    center = model.center.detach().cpu().double()
+    found = find_hypotheses(poses, weights.log(), best, model)
+    space = PoseSpace((*center.tolist(),), model.radius)
+    members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
+    own = torch.where(members, weights, 0.0)
+    shift, turn = spread(poses[None], (own / own.sum()).log()[None], space)
+    second = found.others[0] if found.others else None
+    away = turned = 0.0
+    if second is not None:
+        other = torch.from_numpy(second.pose).to(best)
+        away = float((origin_of(other, center) - origin_of(best, center)).norm())
+        turned = float(angle_between(rotation_of(other), rotation_of(best)))
+    return BeliefSummary(float(shift), float(turn), found.estimate.weight, second, away, turned)
+
+
+def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
+    """Return how sure a belief is, and what it says of a second pose: two sentences."""
+    turn = math.degrees(summary.turn)
+    angle = f"{turn:.2g}" if turn < 10 else f"{turn:.0f}"
+    sure = f"sure to ±{format_length(summary.shift)}, ±{angle}°"
+    if summary.share == 0:
+        sure = "the estimate lies apart from the particles"
+    if summary.second is None:
+        return sure, "no second pose above 1 %"
+    away, turned = format_length(summary.second_shift), math.degrees(summary.second_turn)
+    return sure, f"second pose {100 * summary.second.weight:.0f} %: {away} and {turned:.0f}° off"
