@@ -1,0 +1,224 @@
+"""Run every run behind docs/results/photographs.md: filters of YCB objects, trained on renders,
+tested on photographs.
+
+    python bench/photographs.py --meshes DIR --frames DIR [--list] [--only NAME] [KEY=VALUE ...]
+    python bench/photographs.py --table                      # only rewrites the page's table
+
+DIR of --meshes holds YCB's <class>/google_16k, DIR of --frames YCB-Video. One set of scenes is
+rendered for all objects: each of fourteen is the target of some, and stands in the clutter of
+others, so that one frame teaches several filters. Started again, it goes on: what has its
+metrics.json is not run again. What is typed beyond the options, such as threads=1, is handed to
+every training.
+"""
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HOME = Path(__file__).parents[1]
+PAGE = HOME / "docs" / "results" / "photographs.md"
+MARK, END = "<!-- table: photographs -->", "<!-- end -->"
+CRACKER = "weights/003_cracker_box.ckpt"
+DRILL = "{root}/runs/drill_patch_camera/checkpoints/best.ckpt"
+TARGETS = (
+    "002_master_chef_can",
+    "003_cracker_box",
+    "004_sugar_box",
+    "005_tomato_soup_can",
+    "006_mustard_bottle",
+    "007_tuna_fish_can",
+    "009_gelatin_box",
+    "010_potted_meat_can",
+    "011_banana",
+    "024_bowl",
+    "025_mug",
+    "035_power_drill",
+    "048_hammer",
+    "061_foam_brick",
+)
+CLUTTER = ("021_bleach_cleanser", "052_extra_large_clamp")
+SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
+
+
+class Run(NamedTuple):
+    """A training: its name, its object, its method, the steps, and what else is typed."""
+
+    name: str
+    object: str
+    model: str
+    steps: int
+    words: str = ""
+
+
+def plan() -> list[Run]:
+    """Return all trainings; a warm start follows the run that it starts from."""
+    warm = f"augment=camera_whole warm_start={DRILL}"
+    pose = f"data.limit_val=8 data.limit_test=30 warm_start={CRACKER}"
+    return [
+        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, "augment=camera_whole"),
+        Run("mustard_patch_camera", "006_mustard_bottle", "patch_pf", 1000, warm),
+        Run("mustard_pose_camera", "006_mustard_bottle", "pose_pf", 500, f"augment=camera {pose}"),
+        Run("mustard_pose_strong", "006_mustard_bottle", "pose_pf", 500, f"augment=strong {pose}"),
+        Run("sugar_patch_camera", "004_sugar_box", "patch_pf", 1000, warm),
+        Run("chef_can_patch_camera", "002_master_chef_can", "patch_pf", 1000, warm),
+        Run("gelatin_patch_camera", "009_gelatin_box", "patch_pf", 1000, warm),
+        Run("mug_patch_camera", "025_mug", "patch_pf", 1000, warm),
+        Run("foam_patch_camera", "061_foam_brick", "patch_pf", 1000, warm),
+    ]
+
+
+def render_commands(root: Path, frames: int = 180) -> list[list[str]]:
+    """Return what to run to render the scenes, one command an object."""
+    common = [
+        f"frames={frames}",
+        "frames_per_scene=6",
+        "size=[320,240]",
+        "distractors=[4,10]",
+        f"meshes={root / 'meshes'}",
+    ]
+    return [
+        ["generate.py", f"out={root / 'data' / name}", f"object={name}", *common]
+        for name in TARGETS
+    ]
+
+
+def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
+    """Return what to run to train and test one filter on renders."""
+    data = [
+        "data=fat",
+        f"data.root={root / 'data'}",
+        f"data.meshes={root / 'meshes'}",
+        f"data.object={run.object}",
+        SPLIT,
+    ]
+    interval = max(500, run.steps // 4)
+    budget = [
+        f"trainer.max_steps={run.steps}",
+        f"trainer.val_check_interval={interval}",
+        "data.min_visibility_test=0.3",
+    ]
+    words = run.words.format(root=root).split()
+    validation = [] if "data.limit_val" in run.words else ["data.limit_val=40"]
+    out = f"out={root / 'runs' / run.name}"
+    return ["train.py", f"model={run.model}", out, *data, *budget, *validation, *words, *more]
+
+
+def evaluate_command(run: Run, root: Path, meshes: str, frames: str) -> list[str]:
+    """Return what to run to test one filter on the photographs."""
+    checkpoint = root / "runs" / run.name / "checkpoints" / "best.ckpt"
+    where = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
+    return [
+        "evaluate.py",
+        f"checkpoint={checkpoint}",
+        *where,
+        f"out={root / 'evals' / run.name / 'data'}",
+    ]
+
+
+def link_meshes(root: Path, meshes: Path) -> None:
+    """Make a folder that holds links to the meshes in use: with fewer kinds of clutter, each kind
+    is seen more often.
+    """
+    folder = root / "meshes"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (*TARGETS, *CLUTTER):
+        link = folder / name
+        if not link.is_symlink():
+            link.symlink_to((meshes / name).resolve())
+
+
+def row(run: Run, root: Path) -> list[str] | None:
+    """Return a run's row of the table, or None where it has not been run."""
+    own, photos = (
+        _read(root / kind / "metrics.json")
+        for kind in (f"runs/{run.name}", f"evals/{run.name}/data")
+    )
+    if own is None:
+        return None
+    augment = next(
+        (word.split("=")[1] for word in run.words.split() if word.startswith("augment=")),
+        "the default",
+    )
+    start = "cracker box" if CRACKER in run.words else "drill" if DRILL in run.words else "none"
+    cost = own["training"]["steps"] * own["training"]["cpu_seconds_per_step"] / 60
+    first = [run.object, f"`{run.model}`", augment, start, str(run.steps), f"{cost:.0f}"]
+    return [
+        *first,
+        *_figures(own),
+        *(_figures(photos) if photos and photos["instances"] else ["–"] * 6),
+    ]
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    return json.loads(path.read_text()) if path.is_file() else None
+
+
+def _figures(metrics: dict[str, Any]) -> list[str]:
+    add, add_s, belief = metrics["add"], metrics["add_s"], metrics.get("belief") or {}
+    outscored = belief.get("truth_outscored_by_wrong")
+    wrong = "–" if outscored is None else f"{100 * outscored:.0f}"
+    figures = (add["auc"], add_s["auc"], add["recall_01d"], add["median_mm"])
+    return [str(metrics["instances"]), *(f"{figure:.1f}" for figure in figures), wrong]
+
+
+def write_table(root: Path, page: Path = PAGE) -> None:
+    """Put the runs that are there into the page's table."""
+    names = ["images", "ADD AUC", "ADD-S AUC", "< 0.1 d %", "median mm", "outscored %"]
+    head = ["object", "method", "augment", "warm start", "steps", "CPU min"]
+    head += [f"{name} ({where})" for where in ("renders", "photographs") for name in names]
+    rows = [cells for run in plan() if (cells := row(run, root)) is not None]
+    lines = [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)]
+    text = page.read_text()
+    before, rest = text.split(MARK, 1)
+    page.write_text(before + MARK + "\n" + "\n".join(lines) + "\n" + END + rest.split(END, 1)[1])
+
+
+def main() -> int:
+    """Run the plan; the status is that of the worst command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("more", nargs="*")
+    parser.add_argument("--meshes", type=Path, help="a folder of YCB's meshes")
+    parser.add_argument("--frames", help="a folder of YCB-Video")
+    parser.add_argument("--only", action="append", choices=[run.name for run in plan()])
+    parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
+    parser.add_argument("--table", action="store_true", help="only rewrite the table")
+    parser.add_argument("--root", type=Path, default=Path("outputs/photographs"))
+    options = parser.parse_args()
+    if options.table:
+        write_table(options.root)
+        return 0
+    if not options.meshes or not options.frames:
+        parser.error("--meshes and --frames are needed")
+    link_meshes(options.root, options.meshes)
+    commands = [(words, None) for words in render_commands(options.root)]
+    for run in plan():
+        if options.only and run.name not in options.only:
+            continue
+        commands.append(
+            (train_command(run, options.root, options.more), options.root / "runs" / run.name)
+        )
+        commands.append(
+            (evaluate_command(run, options.root, str(options.meshes), options.frames), None)
+        )
+    worst = 0
+    for words, done in commands:
+        print(f"$ python {shlex.join(words)}", flush=True)
+        if options.list or (done is not None and (done / "metrics.json").is_file()):
+            continue
+        worst = max(
+            worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
+        )
+    if not options.list:
+        write_table(options.root)
+    return worst
+
+
+if __name__ == "__main__":
+    sys.exit(main())

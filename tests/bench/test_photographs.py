@@ -1,0 +1,94 @@
+"""The plan of runs on photographs, its table, and the shifts of color that filters are measured
+under.
+"""
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from posefilter.cli.command import compose_job
+
+HOME = Path(__file__).parents[2]
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, HOME / "bench" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+photographs, color_shift = load("photographs"), load("color_shift")
+
+
+@pytest.mark.parametrize("run", photographs.plan(), ids=lambda run: run.name)
+def test_every_training_composes(run: Any, tmp_path: Path) -> None:
+    words = photographs.train_command(run, Path("somewhere"))
+    job = compose_job("train", HOME / "conf", words[1:], tmp_path)
+    assert job.cfg.data.object == run.object
+    assert job.cfg.trainer.max_steps == run.steps
+    assert job.choices["model"] == run.model
+
+
+def test_a_warm_start_comes_after_the_run_that_it_starts_from() -> None:
+    done = []
+    for run in photographs.plan():
+        if photographs.DRILL in run.words:
+            assert "drill_patch_camera" in done
+        if photographs.CRACKER in run.words:
+            assert (HOME / photographs.CRACKER).is_file()
+        assert run.object in photographs.TARGETS
+        assert run.name not in done
+        done.append(run.name)
+
+
+def metrics(auc: float, instances: int) -> dict[str, Any]:
+    add = {"auc": auc, "recall_01d": 90.0, "recall_2cm": 95.0, "median_mm": 4.25}
+    training = {"steps": 600, "cpu_seconds_per_step": 0.5}
+    belief = {"truth_outscored_by_wrong": 0.25}
+    return {
+        "instances": instances,
+        "add": add,
+        "add_s": {**add, "auc": auc + 1},
+        "belief": belief,
+        "training": training,
+    }
+
+
+def test_the_table_shows_the_runs_that_are_there_and_leaves_the_rest_of_the_page(
+    tmp_path: Path,
+) -> None:
+    run = photographs.plan()[0]
+    page = tmp_path / "page.md"
+    page.write_text(f"Above.\n{photographs.MARK}\nold\n{photographs.END}\nBelow.\n")
+    for folder, values in (
+        (f"runs/{run.name}", metrics(88.0, 60)),
+        (f"evals/{run.name}/data", metrics(77.0, 20)),
+    ):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "metrics.json").write_text(json.dumps(values))
+    photographs.write_table(tmp_path, page)
+    text = page.read_text()
+    assert text.startswith("Above.\n")
+    assert text.endswith("\nBelow.\n")
+    assert "old" not in text
+    rows = [line for line in text.splitlines() if line.startswith(f"| {run.object}")]
+    assert len(rows) == 1
+    cells = [cell.strip() for cell in rows[0].strip("|").split("|")]
+    assert cells[6:12] == ["60", "88.0", "89.0", "90.0", "4.2", "25"]
+    assert cells[12:] == ["20", "77.0", "78.0", "90.0", "4.2", "25"]
+    assert cells[4:6] == [str(run.steps), "5"]
+
+
+def test_the_first_shift_changes_nothing_and_all_others_do() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    for name, (matrix, exponent) in color_shift.shifts().items():
+        same = np.array_equal(color_shift.respond(rgb, matrix, exponent), rgb)
+        assert same == (name == "as it is"), name
