@@ -62,29 +62,29 @@ def metrics(auc: float, instances: int) -> dict[str, Any]:
     }
 
 
-def test_the_table_shows_the_runs_that_are_there_and_leaves_the_rest_of_the_page(
+def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     tmp_path: Path,
 ) -> None:
     run = photographs.plan()[0]
     page = tmp_path / "page.md"
-    page.write_text(f"Above.\n{photographs.MARK}\nold\n{photographs.END}\nBelow.\n")
-    for folder, values in (
-        (f"runs/{run.name}", metrics(88.0, 60)),
-        (f"evals/{run.name}/data", metrics(77.0, 20)),
-    ):
+    marks = [photographs.MARK.format(where) for where in ("renders", "photographs")]
+    page.write_text("Above.\n" + "".join(f"{m}\nold\n{photographs.END}\nBelow.\n" for m in marks))
+    values = {f"runs/{run.name}": metrics(88.0, 60), f"evals/{run.name}/data": metrics(77.0, 20)}
+    for folder, content in values.items():
         (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / "metrics.json").write_text(json.dumps(values))
-    photographs.write_table(tmp_path, page)
+        (tmp_path / folder / "metrics.json").write_text(json.dumps(content))
+    photographs.write_tables(tmp_path, page)
     text = page.read_text()
     assert text.startswith("Above.\n")
-    assert text.endswith("\nBelow.\n")
+    assert text.count("\nBelow.\n") == 2
     assert "old" not in text
     rows = [line for line in text.splitlines() if line.startswith(f"| {run.object}")]
-    assert len(rows) == 1
-    cells = [cell.strip() for cell in rows[0].strip("|").split("|")]
-    assert cells[6:12] == ["60", "88.0", "89.0", "90.0", "4.2", "25"]
-    assert cells[12:] == ["20", "77.0", "78.0", "90.0", "4.2", "25"]
-    assert cells[4:6] == [str(run.steps), "5"]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
+    assert [each[4:6] for each in cells] == [[str(run.steps), "5.0"]] * 2
+    assert cells[0][6:] == ["60", "88.0", "89.0", "90.0", "90.0", "4.2", "25"]
+    assert cells[1][6:] == ["20", "77.0", "78.0", "90.0", "90.0", "4.2", "25"]
+    page_in_docs = photographs.PAGE.read_text()
+    assert all(mark in page_in_docs for mark in marks)
 
 
 def test_the_first_shift_changes_nothing_and_all_others_do() -> None:
