@@ -61,8 +61,8 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_train": "run/figures/validation_overlays.jpg",
     "tour_predict": "prediction/belief.png",
 }
-# the ablations of docs/methods.md's ablation that its picture shows, and what to say of each
-RUNGS = {
+# the ablations of docs/methods.md that its picture shows, and what to say of each
+ABLATIONS = {
     "paper": "The paper's",
     "c5_lesson": "Told the way, and few arrive",
     "c6_place": "No gradient through the place",
@@ -123,7 +123,7 @@ def main() -> int:
     try:
         of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
         of_tour(said.tour, said.out)
-        of_ladder(said.methods / "ablation" / "patch_pf", said.out)
+        of_ablations(said.methods / "ablation" / "patch_pf", said.out)
         of_filters(said.methods, said.out)
     except UserError as error:
         print(f"make_pictures: {error}", file=sys.stderr)
@@ -247,16 +247,14 @@ def of_tour(tour: Path, out: Path) -> None:
         )
 
 
-def of_ladder(ablation: Path, out: Path) -> None:
+def of_ablations(runs: Path, out: Path) -> None:
     """Write trajectories.jpg: where particles go on one image, at the ablations that explain it."""
     tiles = []
-    for ablation, words in RUNGS.items():
-        found = sorted(ablation.glob(f"*ablation={ablation},*/figures/test_trajectories_0.jpg"))
+    for name, words in ABLATIONS.items():
+        found = sorted(runs.glob(f"*ablation={name},*/figures/test_trajectories_0.jpg"))
         if len(found) != 1:
-            print(
-                f"left as it is: trajectories.jpg ({len(found)} runs of ablation={ablation} in "
-                f"{ablation}, not one)"
-            )
+            count = f"{len(found)} runs of ablation={name} in {runs}, not one"
+            print(f"left as it is: trajectories.jpg ({count})")
             return
         picture = np.asarray(Image.open(found[0]).convert("RGB"))
         tiles.append(np.concatenate([draw_text(words, TITLE - 4, bold=True), picture]))

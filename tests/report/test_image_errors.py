@@ -87,7 +87,7 @@ def test_the_run_page_shows_them(run: Path) -> None:
     write_errors(run / FILE, [*make_rows(3, 20), make_row(20, 1234.0), make_row(21, math.inf)])
     page = make_run_page(read_run(run), None, "x")
     text, files = page.render(), page.files()
-    assert "images-with-an-add-below-a-threshold-threshold-mm.png" in files
+    assert "images-with-an-error-below-a-threshold-threshold-mm.png" in files
     assert "add-auc-by-visibility-visible-share.png" in files
     assert text.index("scene/000021") < text.index("scene/000020") < text.index("1.23 m")
     assert ">missed<" in text
@@ -173,7 +173,7 @@ def test_the_comparison_page(pair: tuple[Path, Path]) -> None:
     assert "5 images of run &lt;1&gt; are not in the other test" in text
     assert "Where run &lt;1&gt; is most ahead" in text
     assert "Where other" not in text
-    assert {"images-with-an-add-below-a-threshold-threshold-mm.png"} <= set(page.files())
+    assert {"images-with-an-error-below-a-threshold-threshold-mm.png"} <= set(page.files())
 
 
 def test_what_cannot_be_compared_is_told(pair: tuple[Path, Path], tmp_path: Path) -> None:

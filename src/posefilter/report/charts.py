@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -137,7 +137,10 @@ def draw_line(axes: Axes, line: Line, color: str, joined: bool) -> None:
         axes.fill_between(line.x, line.low, line.high, color=color, alpha=0.16, linewidth=0)
     few = len(line.x) <= 20
     style = ("o-" if few else "-") if joined else "o"
-    axes.plot(line.x, line.y, style, color=color, linewidth=1.7, markersize=4.5, label=line.label)
+    marks: dict[str, Any] = {"markersize": 4.5}
+    if not joined and not few:
+        marks = {"markersize": 3, "alpha": 0.5}
+    axes.plot(line.x, line.y, style, color=color, linewidth=1.7, label=line.label, **marks)
     if line.dots:
         axes.plot(
             *zip(*line.dots, strict=True), "o", color=color, alpha=0.45, markersize=3.5, linewidth=0
@@ -177,8 +180,10 @@ def style_axes(axes: Axes, panel: Panel, theme: Theme) -> None:
         axes.set_xlabel(panel.xlabel, fontsize=8.5, color=theme.ink)
         if panel.log_x:
             axes.set_xscale("log")
+            axes.xaxis.set_major_formatter("{x:g}")
         if panel.log_y:
             axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
         ticks = sorted(set(panel.ticks))
         if 0 < len(ticks) <= MOST_TICKS:
             axes.set_xticks(ticks, [f"{x:g}" for x in ticks])

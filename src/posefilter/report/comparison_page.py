@@ -171,15 +171,15 @@ def make_tiles(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Tile]:
 def list_verdict(pairs: Sequence[Pair], names: tuple[str, str]) -> list[Block]:
     """Return in words which run is better, and how sure that is."""
     verdict = judge(pairs)
-    chance = f"{verdict.chance:.2g}" if verdict.chance >= 1e-4 else "below 0.0001"
+    chance = f"p = {verdict.chance:.2g}" if verdict.chance >= 1e-4 else "p < 0.0001"
     if verdict.chance < 0.05:
         better = names[0] if verdict.a > verdict.b else names[1]
         words: list[Cell] = [
             Text(better, "good"),
-            f"is nearer to the truth in more images than chance would have it (p = {chance}).",
+            f"is nearer to the truth in more images than chance would have it ({chance}).",
         ]
     else:
-        words = [Text("No difference that chance would not explain", "soft"), f"(p = {chance})."]
+        words = [Text("No difference that chance would not explain", "soft"), f"({chance})."]
     finite = [pair.change for pair in pairs if math.isfinite(pair.change)]
     middle = (
         f"The median change of the error from the first to the second is {median(finite):+.2g} mm."

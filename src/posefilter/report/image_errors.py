@@ -98,7 +98,7 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
             )
             by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
     out = (
-        [Panel("Images with an ADD below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
+        [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
         if cdf
         else []
     )

@@ -158,7 +158,7 @@ def show_worst_and_best(images: Mapping[str, list[StoredImage]]) -> list[Block]:
     out: list[Block] = []
     for title, key in (("Worst", "worst"), ("Best", "best"), ("Estimates", "overlays")):
         ordered = sorted(images[key], key=lambda image: not image.name.startswith("test"))
-        shown = show_images(ordered)
+        shown = show_images(ordered, wide=True)
         out += [Heading(title), *shown] if shown else []
     return out
 
