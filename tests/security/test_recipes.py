@@ -15,6 +15,7 @@ from posefilter.cli import run_command
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.command import compose_job, register_resolvers
 from posefilter.cli.evaluate import data_settings
+from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -147,9 +148,15 @@ def filled(node: Any, secret: Path) -> Any:
     return node.replace("{secret}", str(secret)) if isinstance(node, str) else node
 
 
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    return compose_job("evaluate", HOME / "conf", [], tmp_path_factory.mktemp("job"))
+
+
 @pytest.mark.parametrize("what", DATA)
 def test_a_recipe_chooses_no_place(
     what: str,
+    evaluation: Job,
     content: dict[str, Any],
     save: Save,
     secret: Path,
@@ -171,17 +178,18 @@ def test_a_recipe_chooses_no_place(
     content["recipe"]["settings"]["data"] = own | filled(DATA[what], secret)
     path = save(content)
     checkpoint = read_checkpoint(path)
-    job = compose_job("evaluate", HOME / "conf", [f"checkpoint={path}"], work)
+    job = Job(evaluation.cfg, {}, [], work, "evaluate", False)
     with watch, pytest.raises(UserError, match=r"^data\.") as told:
         data_settings(job, checkpoint["recipe"]["settings"], "carton")
     assert "\n" not in str(told.value)
-    assert (
-        run_command(
-            "evaluate", HOME, [f"checkpoint={path}", "console=json", f"out={tmp_path / 'out'}"]
+    if what == "absolute root":  # the command says the same line
+        assert (
+            run_command(
+                "evaluate", HOME, [f"checkpoint={path}", "console=json", f"out={tmp_path / 'out'}"]
+            )
+            == 2
         )
-        == 2
-    )
-    assert capfd.readouterr().err.strip().splitlines()[-1] == f"evaluate: {told.value}"
+        assert capfd.readouterr().err.strip().splitlines()[-1] == f"evaluate: {told.value}"
 
 
 def test_the_users_own_run_and_what_the_user_types_count(

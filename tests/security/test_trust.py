@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from omegaconf import OmegaConf
 
 from posefilter.cli import command, run_command, trust
 from posefilter.cli.instantiate import instantiate, instantiate_recipe, locate
@@ -82,27 +83,17 @@ def test_the_command_line_names_them(
     package: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     for wanted, told in (
-        ("[nowhere_at_all]", "there is no package"),
-        ("[os]", "of your own"),
-        ("7", "must be a list"),
+        (["nowhere_at_all"], "there is no package"),
+        (["os"], "of your own"),
+        (7, "must be a list"),
     ):
-        assert (
-            run_command(
-                "train", HOME, [f"out={tmp_path}", f"plugins={wanted}", "loss=add", "console=json"]
-            )
-            == 2
-        )
-        said = capfd.readouterr().err.strip().splitlines()
-        assert len(said) == 1
-        assert told in said[0]
-    assert (
-        run_command(
-            "train", HOME, [f"out={tmp_path}", "plugins=[my_plugin]", "loss=add", "console=json"]
-        )
-        == 2
-    )
-    assert "loss=add does not fit" in capfd.readouterr().err
+        with pytest.raises(UserError, match=told):
+            command.use_plugins(OmegaConf.create({"plugins": wanted}))
+    report = [f"run={tmp_path}/none", "plugins=[my_plugin]", "console=json"]
+    assert run_command("report", HOME, report) == 2
+    assert len(capfd.readouterr().err.strip().splitlines()) == 1
     assert "my_plugin" in trust.trusted()
+    assert "my_plugin" in sys.modules
 
 
 def test_every_target_of_the_configuration_is_allowed_and_located() -> None:
