@@ -1,9 +1,8 @@
 """Render a dataset: python generate.py out=DIR frames=400 object=carton; see conf/generate.yaml."""
 
 import sys
-from pathlib import Path
 
-from posefilter.cli import run_command
+from posefilter.cli.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(run_command("generate", Path(__file__).parent))
+    sys.exit(run_command("generate"))

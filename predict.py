@@ -3,9 +3,8 @@ intrinsics=....
 """
 
 import sys
-from pathlib import Path
 
-from posefilter.cli import run_command
+from posefilter.cli.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(run_command("predict", Path(__file__).parent))
+    sys.exit(run_command("predict"))

@@ -1,10 +1,8 @@
 """Explain a run or a sweep on one HTML page: python report.py run=RUN, or sweep=DIR."""
 
 import sys
-from pathlib import Path
 
-from posefilter.cli import run_command
-from posefilter.cli.report import spelled
+from posefilter.cli.command import run_command
 
 if __name__ == "__main__":
-    sys.exit(run_command("report", Path(__file__).parent, spelled(sys.argv[1:])))
+    sys.exit(run_command("report"))

@@ -1,5 +1,70 @@
 """posefilter: 6-DoF object pose, and a belief over it, from RGB-D images with learned particle
 filters.
+
+```python
+import posefilter
+
+estimator = posefilter.load("003_cracker_box")
+result = estimator.predict(rgb, depth, intrinsics)
+result.pose, result.score, result.covariance, result.modes, result.belief
+```
+
+Public names are imported when they are first used: `import posefilter` does not import torch.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from posefilter import figures
+    from posefilter.api import build, build_data, compose, load
+    from posefilter.belief import Belief, Mode
+    from posefilter.cli.trust import trust
+    from posefilter.errors import UserError
+    from posefilter.estimator import Estimator, Result
+
+__all__ = [
+    "Belief",
+    "Estimator",
+    "Mode",
+    "Result",
+    "UserError",
+    "__version__",
+    "build",
+    "build_data",
+    "compose",
+    "figures",
+    "load",
+    "trust",
+]
+
+_HOMES = {
+    "Belief": "belief",
+    "Estimator": "estimator",
+    "Mode": "belief",
+    "Result": "estimator",
+    "UserError": "errors",
+    "build": "api",
+    "build_data": "api",
+    "compose": "api",
+    "load": "api",
+    "trust": "cli.trust",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name == "figures":
+        return importlib.import_module("posefilter.figures")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'posefilter' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"posefilter.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, imported or not."""
+    return sorted(__all__)

@@ -9,6 +9,13 @@ from pathlib import Path, PureWindowsPath
 from posefilter.errors import UserError
 
 
+def find_conf() -> Path:
+    """Return the folder of the configuration: inside an installed package, else the clone's."""
+    here = Path(__file__).parent
+    inside = here / "conf"
+    return inside if inside.is_dir() else here.parents[1] / "conf"
+
+
 def is_plain_name(name: str) -> bool:
     """Tell whether a name is one part of a path and nothing else: no separator, no leading dot,
     only what can be printed.

@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, settle_logging
 from posefilter.cli.instantiate import hint
@@ -24,14 +25,16 @@ from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import trust
 from posefilter.errors import UserError
+from posefilter.paths import find_conf
 
+COMMANDS = ("train", "evaluate", "predict", "generate", "check_data", "report", "export")
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
 _MULTIRUN = ("-m", "--multirun")
 
 
-def run_command(name: str, home: Path, arguments: list[str] | None = None) -> int:
+def run_command(name: str, home: Path | None = None, arguments: list[str] | None = None) -> int:
     """Compose `conf/<name>.yaml` with the command line, do the work (or a sweep of it), and return
     the exit status.
 
@@ -40,10 +43,11 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     where it came from.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = spelled(arguments) if name == "report" else arguments
     # Hydra's parser wants it before or after all the rest
     arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)
     trace = "debug=trace" in arguments
-    conf = home / "conf"
+    conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()
     before = sys.argv
@@ -66,30 +70,6 @@ def run_command(name: str, home: Path, arguments: list[str] | None = None) -> in
     finally:
         sys.argv = before
     return 0
-
-
-def bracketed(arguments: list[str]) -> list[str]:
-    """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
-    numbers, not a sweep.
-    """
-    return [
-        re.sub(
-            r"^((?:\w+\.)*(?:intrinsics|camera|size))=([^\[\],]+(?:,[^\[\],]+)+)$", r"\1=[\2]", a
-        )
-        for a in arguments
-    ]
-
-
-def check_choices(arguments: list[str], conf: Path) -> None:
-    """Raise UserError where a group is given a value instead of the name of one of its files: Hydra
-    stumbles over it.
-    """
-    for argument in arguments:
-        group, _, value = argument.partition("=")
-        if value.startswith(("[", "{")) and re.fullmatch(r"\w+", group) and (conf / group).is_dir():
-            options = sorted(file.stem for file in (conf / group).glob("*.yaml"))
-            there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
-            raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
 
 
 def _task(name: str) -> Callable[[DictConfig], Any]:
@@ -172,6 +152,21 @@ def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Jo
     cfg.pop("hydra")
     OmegaConf.set_struct(cfg, True)
     return Job(cfg, choices, list(overrides), folder, name, False)
+
+
+def compose_config(name: str, overrides: list[str]) -> DictConfig:
+    """Compose a command's settings as the command line would, for the library.
+
+    Raises UserError where they name what there is not.
+    """
+    conf = find_conf()
+    if not (conf / f"{name}.yaml").is_file():
+        raise UserError(f"command={name}: there is none; choose {', '.join(COMMANDS)}")
+    try:
+        check_choices(overrides, conf)
+        return compose_job(name, conf, loosen(bracketed(overrides), name), Path()).cfg
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(explain(error, name, conf, overrides)) from error
 
 
 def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:

@@ -1,7 +1,6 @@
 """Explain a run or a sweep on one HTML page."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.global_hydra import GlobalHydra
@@ -21,22 +20,8 @@ from posefilter.report.settings import Change, compare_settings
 from posefilter.report.sweep_page import make_sweep_page
 from posefilter.report.sweeps import find_best_job, read_sweep
 
-FOLDERS = ("run", "runs", "sweep", "out")
 # on the command line -> in the configuration
 KEYS = {"run": "run", "runs": "runs", "sweep": "sweep_folder"}
-
-
-def spelled(arguments: Sequence[str]) -> list[str]:
-    """Return the command line as Hydra reads it: `sweep` is a group of its own, and folders may
-    have `=` and `,` in them.
-    """
-    out = []
-    for argument in arguments:
-        key, found, value = argument.partition("=")
-        if found and key in FOLDERS and value and value[0] not in "'\"" and value != "null":
-            value = "'" + value.replace("'", "\\'") + "'"
-        out.append(f"{'sweep_folder' if key == 'sweep' else key}{found}{value}")
-    return out
 
 
 def report(job: Job) -> None:

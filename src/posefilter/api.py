@@ -1,0 +1,114 @@
+"""The library's verbs: load what is trained, compose a configuration, build what it describes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig
+
+from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
+from posefilter.cli.components import changes
+from posefilter.cli.job import Job
+from posefilter.estimator import Estimator
+from posefilter.models.base import PoseEstimator
+from posefilter.weights import find_weights
+
+if TYPE_CHECKING:
+    from posefilter.data.module import PoseDataModule
+
+
+def load(
+    weights: str | Path | Sequence[str | Path],
+    *,
+    overrides: Sequence[str] = (),
+    device: str | None = None,
+) -> Estimator:
+    """Load one trained filter, or several that run in one call.
+
+    A checkpoint is data: nothing in it can run code.  What a plug-in defines is built only if you
+    trust the plug-in before: `posefilter.trust("my_package")`.
+
+    Args:
+        weights: A checkpoint, a run's folder, or the name of weights that ship with posefilter,
+            such as `003_cracker_box`; or a list of these, one an object.
+        overrides: What to change of the filter, as typed on the command line: such as
+            `filter.particles=1000` or `refine=none`.
+        device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
+
+    Returns:
+        The estimator; see `Estimator.predict`.
+
+    Raises:
+        UserError: A file is missing or holds no checkpoint, or an override does not fit it.
+    """
+    wanted = changes(compose(overrides, "predict")) if overrides else {}
+    several = [weights] if isinstance(weights, str | Path) else list(weights)
+    methods = [method_of(read_checkpoint(find_weights(one)), wanted) for one in several]
+    return Estimator(methods, device)
+
+
+def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig:
+    """Compose the configuration of a command, as the command line would.
+
+    Args:
+        overrides: What would be typed after the command, such as `model=patch_pf` or
+            `filter.particles=100`.
+        command: One of train, evaluate, predict, generate, check_data, report and export.
+
+    Returns:
+        The configuration; `folder` is missing in it, since no run has begun.
+
+    Raises:
+        UserError: An override names what there is not.
+    """
+    from posefilter.cli.command import compose_config  # Hydra: `load` answers without it
+
+    return compose_config(command, [*overrides])
+
+
+def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstimator:
+    """Build the method that a configuration of `train` describes, untrained.
+
+    ```python
+    config = posefilter.compose(["model=pose_pf", "data.generate.frames=200"])
+    data = posefilter.build_data(config)
+    method = posefilter.build(config, data)
+    lightning.Trainer(max_steps=100).fit(method, data)
+    ```
+
+    Args:
+        config: What `compose` returns.
+        data: The data that it is to learn from, which says what its object is; None: call
+            `method.set_object` before it is used.
+
+    Returns:
+        The method, a LightningModule.
+
+    Raises:
+        UserError: A setting does not fit; the message names it.
+    """
+    method = build_method(recipe(Job(config, {}, [], Path(), "train", False)))
+    if data is not None:
+        data.prepare_data()
+        data.setup("fit")
+        method.set_object(data.object_model(0))
+    return method
+
+
+def build_data(config: DictConfig) -> "PoseDataModule":
+    """Build the data module that a configuration describes; nothing is read or rendered yet.
+
+    Args:
+        config: What `compose` returns.
+
+    Raises:
+        UserError: A setting does not fit; the message names it.
+    """
+    from posefilter.cli.instantiate import instantiate
+    from posefilter.data.module import PoseDataModule  # readers and meshes: `load` needs none
+    from posefilter.errors import UserError
+
+    data: Any = instantiate(config.data, "data")
+    if not isinstance(data, PoseDataModule):
+        raise UserError(f"data._target_={config.data.get('_target_')}: is no data module")
+    return data

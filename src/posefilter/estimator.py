@@ -1,0 +1,245 @@
+"""From images to poses in one call: what `posefilter.load` returns."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+
+from posefilter.belief import Belief, Mode
+from posefilter.errors import UserError
+from posefilter.images import Images, check_images, make_batch
+from posefilter.limits import MOST_SIDE
+from posefilter.models.base import PoseEstimator
+from posefilter.plausibility import find_warnings
+from posefilter.types import Batch, ObjectModel, Trace
+from posefilter.types import Belief as BeliefTensors
+
+if TYPE_CHECKING:
+    from posefilter.figures.overlay import Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Where one object is in one image, and how sure that is.
+
+    Attributes:
+        object: The object's name.
+        pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
+            OpenCV's (x right, y down, z ahead), the object's that of its mesh file.
+        score: The estimate's log-likelihood, up to a constant of the method.  It ranks images of
+            one camera under one method; it is no probability, and says nothing of a wrong scale.
+        probability: That the object is there and the pose right.  Always None for now: it is not
+            calibrated yet.
+        belief: Every particle and its weight.
+        warnings: What makes the estimate implausible, in words; empty where nothing does.
+        seconds: The filter's time for this image, its share of a batch.
+        model: The object's center, size, surface points and hull.
+    """
+
+    object: str
+    pose: np.ndarray
+    score: float
+    probability: float | None
+    belief: Belief
+    warnings: tuple[str, ...]
+    seconds: float
+    model: ObjectModel
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`."""
+        return self.belief.covariance
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The belief's modes, the heaviest first; see `Belief.modes`."""
+        return self.belief.modes
+
+    def draw_overlay(
+        self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
+    ) -> np.ndarray:
+        """Draw the object's outline and axes on the image that it was found in.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+            shape: A mesh, for the exact outline; None: the convex hull.
+
+        Returns:
+            The picture (h, w, 3) uint8.
+        """
+        from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
+
+        shape = self.model.hull if shape is None else shape
+        caption = f"{self.object}, score {self.score:.2f}"
+        return draw_overlay(rgb, np.asarray(intrinsics), self.pose, shape, caption=caption)
+
+    def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+        """Draw the belief: rotations on a map, centers on the image, marginals.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+
+        Returns:
+            The picture (h, w, 3) uint8.
+        """
+        from posefilter.figures.belief import draw_belief  # slow to import, needed for pictures
+
+        tensors = BeliefTensors(
+            torch.from_numpy(self.belief.samples),
+            torch.from_numpy(self.belief.weights).log(),
+            torch.from_numpy(self.pose),
+            torch.tensor(self.score),
+        )
+        return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
+
+
+class Run(NamedTuple):
+    """One object's filter on a batch of images."""
+
+    method: PoseEstimator
+    batch: Batch  # at the network's resolution
+    trace: Trace
+    seconds: float  # an image
+
+
+class Estimator:
+    """Trained filters, each for one object, that estimate poses from RGB-D images.
+
+    Made by `posefilter.load`.
+
+    Args:
+        methods: A method an object, with its weights, its recipe and its object.
+        device: Where to compute; None: on the GPU where there is one.
+
+    Raises:
+        UserError: There is no method, or one that detects and estimates no pose.
+    """
+
+    def __init__(
+        self, methods: Sequence[PoseEstimator], device: str | torch.device | None = None
+    ) -> None:
+        if not methods:
+            raise UserError("an estimator needs the weights of one object at least")
+        for method in methods:
+            if not method.tells_pose:
+                raise UserError(f"{type(method).__name__} detects, and estimates no pose")
+        device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        self.methods = tuple(method.to(device).eval() for method in methods)
+        self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The names of the objects, in the order of the results."""
+        return tuple(method.model.name for method in self.methods)
+
+    @property
+    def models(self) -> tuple[ObjectModel, ...]:
+        """What is known of each object: its center, size, surface points and hull."""
+        return tuple(method.model for method in self.methods)
+
+    def predict(self, rgb: Any, depth: Any, intrinsics: Any, *, seed: int = 0) -> Any:
+        """Find each object in an image, or in each of a batch.
+
+        Args:
+            rgb: Color, RGB, as a numpy array or tensor: (H, W, 3) or (3, H, W), uint8 or float in
+                [0, 1]; or a batch of B such images.
+            depth: z-depth (H, W) in meters, as float, aligned with the color; 0 or NaN where
+                unknown; or (B, H, W).
+            intrinsics: Camera matrix (3, 3) [px] of these images; or one each, (B, 3, 3).
+            seed: Decides every random draw of the filter: the same images and seed give the same
+                answer.
+
+        Returns:
+            A `Result` where one image is given and one object was loaded; a list of them, an
+            object each, where several were loaded; for a batch, a list with one of these an image.
+            `predict_batch` returns the same always as a list of lists.
+
+        Raises:
+            UserError: Images or intrinsics are not as they should be.
+        """
+        images, batched = check_images(rgb, depth, intrinsics)
+        found = collect_results(self.run(images, seed))
+        answers = [own if len(self.methods) > 1 else own[0] for own in found]
+        return answers if batched else answers[0]
+
+    def predict_batch(
+        self, rgb: Any, depth: Any, intrinsics: Any, *, seed: int = 0
+    ) -> list[list[Result]]:
+        """Find each object in each image; as `predict`, with the same nesting whatever is given.
+
+        Returns:
+            A list an image, of a `Result` an object.
+        """
+        return collect_results(self.run(check_images(rgb, depth, intrinsics)[0], seed))
+
+    def run(self, images: Images, seed: int = 0) -> list[Run]:
+        """Run each object's filter, and return every step of it: for figures of what it did."""
+        runs = []
+        for method, size in zip(self.methods, self._sizes, strict=True):
+            batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
+            method.seed = seed
+            start = time.perf_counter()
+            with torch.no_grad():
+                trace = method.predict_step(batch, 0)
+            trace.belief.best.cpu()  # waits for a GPU
+            seconds = (time.perf_counter() - start) / len(images.depth)
+            runs.append(Run(method, batch, trace, seconds))
+        return runs
+
+
+def collect_results(runs: Sequence[Run]) -> list[list[Result]]:
+    """Return the results of runs on the same images: a list an image, of a result an object."""
+    return [[make_result(run, i) for run in runs] for i in range(len(runs[0].batch.rgb))]
+
+
+def make_result(run: Run, image: int) -> Result:
+    """Return what a run amounts to for one image of its batch."""
+    model, belief = run.method.model, run.trace.belief
+    weights = belief.log_weights[image].double().cpu().exp().numpy()
+    center = model.center.detach().cpu().double().numpy()
+    pose = belief.best[image].double().cpu().numpy()
+    return Result(
+        object=model.name,
+        pose=pose,
+        score=float(belief.score[image]),
+        probability=None,
+        belief=Belief(
+            belief.poses[image].double().cpu().numpy(),
+            weights / weights.sum(),
+            center,
+            float(model.radius),
+            float(model.diameter),
+            model.name,
+        ),
+        warnings=find_warnings(
+            pose,
+            model,
+            run.batch.depth[image, 0].cpu().numpy(),
+            run.batch.intrinsics[image].double().cpu().numpy(),
+        ),
+        seconds=run.seconds,
+        model=model,
+    )
+
+
+def get_trained_size(settings: dict[str, Any]) -> tuple[int | None, int | None]:
+    """Return the width and height of the images that a method was trained on [px], None where they
+    follow the image's.
+
+    Raises:
+        UserError: A checkpoint's settings name others than images have.
+    """
+    trained = OmegaConf.create(settings).get("data") or {}
+    width, height = trained.get("image_width"), trained.get("image_height")
+    for size in (width, height):
+        if size is not None and not (isinstance(size, int) and 0 < size <= MOST_SIDE):
+            raise UserError(
+                f"checkpoint: was trained on images of {size} pixels, which there are not"
+            )
+    return width, height

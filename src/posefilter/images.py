@@ -1,0 +1,129 @@
+"""Images as a user has them, checked and made into what a method takes."""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from posefilter.data.resize import network_size, resize_depth
+from posefilter.errors import UserError
+from posefilter.geometry.camera import resize_intrinsics
+from posefilter.limits import MOST_SIDE
+from posefilter.types import Batch
+
+_NEAREST, _FARTHEST = 0.05, 30.0  # [m] between which the median depth of an image lies
+
+
+class Images(NamedTuple):
+    """B photographs of one size, on the processor."""
+
+    rgb: np.ndarray  # (B, H, W, 3) uint8, or float32 in [0, 1]
+    depth: np.ndarray  # (B, H, W) float32 z-depth [m], 0 where unknown
+    intrinsics: np.ndarray  # (B, 3, 3) float64 [px]
+
+
+def check_images(rgb: Any, depth: Any, intrinsics: Any) -> tuple[Images, bool]:
+    """Return a user's images in one form, and whether they came as a batch.
+
+    Args:
+        rgb: Color (H, W, 3) or (3, H, W), or a batch of them, RGB: uint8, or float in [0, 1].
+        depth: z-depth (H, W), or (B, H, W), in meters, as float; 0, NaN or infinity where unknown.
+        intrinsics: Camera matrix (3, 3), or (B, 3, 3), [px] of these images.
+
+    Returns:
+        The images, and True where `rgb` has a batch's leading dimension.
+
+    Raises:
+        UserError: A shape, type or value is not as it should be.
+    """
+    color, z, K = (_as_array(value) for value in (rgb, depth, intrinsics))
+    if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
+        raise UserError(f"rgb: has shape {color.shape}; (H, W, 3) is due, or a batch (B, H, W, 3)")
+    if color.shape[-1] != 3:
+        color = np.moveaxis(color, -3, -1)
+    batched = color.ndim == 4
+    color, z = (value if batched else value[None] for value in (color, z))
+    if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
+        z = z[:, 0]
+    if z.shape != color.shape[:3]:
+        raise UserError(f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[:3]}")
+    if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
+        raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
+    return Images(_check_color(color), _check_depth(z), _check_intrinsics(K, len(z))), batched
+
+
+def make_batch(images: Images, image_width: int | None, image_height: int | None) -> Batch:
+    """Return images resized as training images were; what is not known of them is empty.
+
+    Args:
+        images: The images.
+        image_width: Width that the method was trained on [px]; None: it follows from the height.
+        image_height: Its height [px], likewise; both None: images stay as they are.
+    """
+    before = images.depth.shape[1:]
+    height, width = network_size(before[0], before[1], image_width, image_height)
+    rgb, depth, K = list(images.rgb), list(images.depth), torch.from_numpy(images.intrinsics)
+    if (height, width) != before:
+        how = cv2.INTER_AREA if width <= before[1] else cv2.INTER_LINEAR
+        rgb = [cv2.resize(one, (width, height), interpolation=how) for one in rgb]
+        depth = [resize_depth(one, height, width) for one in depth]
+        K = resize_intrinsics(K, width / before[1], height / before[0])
+    color = torch.from_numpy(np.ascontiguousarray(np.stack(rgb).transpose(0, 3, 1, 2)))
+    color = color.float() / 255 if color.dtype == torch.uint8 else color
+    z = torch.from_numpy(np.stack(depth)).float()[:, None]
+    none = torch.zeros(len(z), dtype=torch.int64)
+    return Batch(
+        color,
+        z,
+        torch.zeros_like(z, dtype=torch.bool),
+        K.float(),
+        torch.eye(4).expand(len(z), 4, 4),
+        none,
+        none,
+        torch.full((len(z),), torch.nan),
+    )
+
+
+def _as_array(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+
+
+def _check_color(color: np.ndarray) -> np.ndarray:
+    if color.dtype == np.uint8:
+        return np.ascontiguousarray(color)
+    if color.dtype.kind != "f":
+        raise UserError(f"rgb: is {color.dtype}; uint8 is due, or float in [0, 1]")
+    if not (color.min() >= 0 and color.max() <= 1):
+        raise UserError(
+            f"rgb: floats should lie in [0, 1], not in [{color.min():.3g}, {color.max():.3g}]"
+        )
+    return np.ascontiguousarray(color, dtype=np.float32)
+
+
+def _check_depth(depth: np.ndarray) -> np.ndarray:
+    if depth.dtype.kind != "f":
+        raise UserError(
+            f"depth: is {depth.dtype}; meters are due, as float: divide by the depth image's units "
+            f"in a meter (1000 where it is in millimeters)"
+        )
+    z = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    for number, one in enumerate(z):
+        which = f" of image {number}" if len(z) > 1 else ""
+        if not one.any():
+            raise UserError(f"depth{which}: no pixel has depth")
+        median = float(np.median(one[one > 0]))
+        if not _NEAREST < median < _FARTHEST:
+            raise UserError(f"depth{which}: the median would be {median:.3g} m; is it in meters?")
+    return z
+
+
+def _check_intrinsics(K: np.ndarray, count: int) -> np.ndarray:
+    if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
+        raise UserError(f"intrinsics: has shape {K.shape}; a camera matrix (3, 3) [px] is due")
+    K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)
+    if not np.isfinite(K).all() or not (K[:, 2] == (0, 0, 1)).all():
+        raise UserError("intrinsics: its last row should be 0 0 1 (transposed?)")
+    if not (K[:, [0, 1], [0, 1]] > 0).all():
+        raise UserError("intrinsics: focal lengths must be positive [px]")
+    return K

@@ -1,0 +1,61 @@
+"""Whether an estimate can be right at all: told in words, beside the estimate."""
+
+import numpy as np
+
+from posefilter.types import ObjectModel
+
+_SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be told apart
+_LARGEST = 3.0  # times the image's longer side
+_FEWEST = 0.05  # of the pixels have depth
+_BEYOND = 1.5  # times the depths of training
+
+
+def find_warnings(
+    pose: np.ndarray,
+    model: ObjectModel,
+    depth: np.ndarray,
+    intrinsics: np.ndarray,
+    trained_depth: tuple[float, float] | None = None,
+) -> tuple[str, ...]:
+    """Return what makes an estimate implausible, one sentence each.
+
+    A wrong depth scale moves the answer with it, and its score does not fall: only the object's
+    size tells.
+
+    Args:
+        pose: The estimate (4, 4), camera_from_object [m].
+        model: The object.
+        depth: Measured z-depth (H, W) [m], 0 where unknown, at the network's resolution.
+        intrinsics: Its camera matrix (3, 3) [px].
+        trained_depth: The nearest and farthest that training saw the object's center [m].
+    """
+    height, width = depth.shape
+    x, y, z = (pose[:3, :3] @ model.center.double().numpy() + pose[:3, 3]).tolist()
+    found = []
+    known = float((depth > 0).mean())
+    if known < _FEWEST:
+        found.append(f"only {100 * known:.1f} % of the pixels have depth")
+    if z <= 0:
+        return (*found, "the object would be behind the camera")
+    focal = float(np.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
+    pixels = model.diameter * focal / z
+    scale = "is the depth in the right units (depth_scale)?"
+    if pixels < _SMALLEST:
+        found.append(
+            f"at {z:.2f} m the object would be {pixels:.0f} pixels large, too small to be told "
+            f"apart: {scale}"
+        )
+    elif pixels > _LARGEST * max(height, width):
+        found.append(f"at {z:.2f} m the object would be far larger than the image: {scale}")
+    elif trained_depth is not None and not (
+        trained_depth[0] / _BEYOND <= z <= trained_depth[1] * _BEYOND
+    ):
+        found.append(
+            f"the object would be {z:.2f} m away, but training saw it between "
+            f"{trained_depth[0]:.2f} and {trained_depth[1]:.2f} m: {scale}"
+        )
+    u = intrinsics[0, 0] * x / z + intrinsics[0, 2]
+    v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        found.append("the object's center would be outside of the image: are the intrinsics right?")
+    return tuple(found)

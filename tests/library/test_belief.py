@@ -1,0 +1,177 @@
+"""The moments and modes of a belief are those of the distribution that it was drawn from."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter import Belief, UserError
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.pose_statistics import covariance_about, twist_between
+from posefilter.geometry.rotation import angle_between, exp_so3
+
+CENTER = np.array([0.02, -0.01, 0.1])
+RADIUS, DIAMETER = 0.15, 0.28
+
+
+def some_pose(seed: int = 0) -> torch.Tensor:
+    turn = torch.randn(3, generator=torch.Generator().manual_seed(seed)).double()
+    return make_pose(exp_so3(turn), torch.tensor([0.1, -0.2, 1.0]).double())
+
+
+def spread_about(pose: torch.Tensor, covariance: np.ndarray, count: int) -> np.ndarray:
+    """Draw poses whose twists about a pose are Gaussian."""
+    twists = np.random.default_rng(1).multivariate_normal(np.zeros(6), covariance, count)
+    return move_about(pose, torch.from_numpy(twists), torch.from_numpy(CENTER)).numpy()
+
+
+def belief_of(samples: np.ndarray, weights: np.ndarray | None = None) -> Belief:
+    weights = np.ones(len(samples)) if weights is None else weights
+    return Belief(samples, weights / weights.sum(), CENTER, RADIUS, DIAMETER, "thing")
+
+
+def known_covariance() -> np.ndarray:
+    """A covariance with correlations, of millimeters and degrees."""
+    scale = np.diag([0.004, 0.002, 0.008, 0.02, 0.05, 0.03])
+    mix = np.eye(6)
+    mix[0, 4] = mix[4, 0] = 0.6
+    mix[1, 2] = mix[2, 1] = -0.5
+    return scale @ mix @ scale
+
+
+def test_a_twist_undoes_a_move_and_a_zero_twist_is_no_move() -> None:
+    generator = torch.Generator().manual_seed(2)
+    twist = 2 * torch.rand(50, 6, generator=generator).double() - 1  # turns below pi
+    center, pose = torch.from_numpy(CENTER), some_pose()
+    assert torch.allclose(
+        twist_between(pose, move_about(pose, twist, center), center), twist, atol=1e-9
+    )
+    assert torch.allclose(twist_between(pose, pose, center), torch.zeros(6).double(), atol=1e-12)
+
+
+def test_a_gaussian_has_its_covariance_in_its_own_order_and_frames() -> None:
+    truth = known_covariance()
+    belief = belief_of(spread_about(some_pose(), truth, 40_000))
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    assert np.abs((belief.covariance - truth) / scale).max() < 0.03
+    assert np.allclose(belief.mean, some_pose().numpy(), atol=1e-3)
+    assert np.allclose(belief.covariance, belief.covariance.T)
+    assert np.linalg.eigvalsh(belief.covariance).min() > 0
+
+
+def test_one_shift_and_one_turn_stand_where_the_documentation_says() -> None:
+    """Two particles 2 cm apart along the camera's y; then two turned about the object's z."""
+    apart = np.repeat(some_pose().numpy()[None], 2, 0)
+    apart[1, 1, 3] += 0.02
+    expected = np.zeros((6, 6))
+    expected[1, 1] = 0.01**2
+    assert np.allclose(belief_of(apart).covariance, expected, atol=1e-12)
+    turned = move_about(
+        some_pose().expand(2, 4, 4),
+        torch.tensor([[0, 0, 0, 0, 0, 0.1], [0, 0, 0, 0, 0, -0.1]]).double(),
+        torch.from_numpy(CENTER),
+    ).numpy()
+    expected = np.zeros((6, 6))
+    expected[5, 5] = 0.1**2
+    assert np.allclose(belief_of(turned).covariance, expected, atol=1e-12)
+
+
+def test_covariance_turns_with_the_camera_and_not_with_the_object() -> None:
+    """A camera turned by Q turns the shifts alone: turns are in the object's own axes."""
+    samples = spread_about(some_pose(), known_covariance(), 500)
+    Q = exp_so3(torch.tensor([0.3, -0.5, 0.9]).double())
+    turned = (make_pose(Q, torch.zeros(3).double()) @ torch.from_numpy(samples)).numpy()
+    both = torch.block_diag(Q, torch.eye(3).double()).numpy()
+    expected = both @ belief_of(samples).covariance @ both.T
+    assert np.allclose(belief_of(turned).covariance, expected, atol=1e-12)
+
+
+def test_order_of_particles_and_splitting_one_change_nothing() -> None:
+    samples = spread_about(some_pose(), known_covariance(), 300)
+    weights = np.random.default_rng(3).random(300)
+    belief, order = belief_of(samples, weights), np.random.default_rng(4).permutation(300)
+    shuffled = belief_of(samples[order], weights[order])
+    split = belief_of(
+        np.concatenate([samples, samples[:1]]),
+        np.concatenate([[weights[0] / 2], weights[1:], [weights[0] / 2]]),
+    )
+    for other in (shuffled, split):
+        assert np.allclose(other.mean, belief.mean)
+        assert np.allclose(other.covariance, belief.covariance)
+        assert [m.mass for m in other.modes] == pytest.approx([m.mass for m in belief.modes])
+    assert shuffled.entropy == pytest.approx(belief.entropy)
+    assert shuffled.effective_samples == pytest.approx(belief.effective_samples)
+
+
+def test_two_clusters_are_two_modes_with_their_masses_and_their_own_spread() -> None:
+    upside_down = some_pose() @ make_pose(
+        exp_so3(torch.tensor([np.pi, 0, 0]).double()), torch.zeros(3).double()
+    )
+    truth = known_covariance() / 4
+    samples = np.concatenate(
+        [spread_about(some_pose(), truth, 600), spread_about(upside_down, truth, 200)]
+    )
+    weights = np.concatenate([np.full(600, 0.3 / 600), np.full(200, 0.7 / 200)])
+    modes = belief_of(samples, weights).modes
+    first, second = modes[:2]
+    assert (first.mass, second.mass) == pytest.approx((0.7, 0.3), abs=0.02)
+    assert sum(mode.mass for mode in modes) == pytest.approx(1)
+    assert angle_between(torch.from_numpy(first.pose[:3, :3]), upside_down[:3, :3]) < np.deg2rad(5)
+    scale = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
+    assert np.abs((first.covariance - truth) / scale).max() < 0.35
+    assert np.sqrt(belief_of(samples, weights).covariance[3:, 3:].trace()) > 1  # of both together
+
+
+def test_weight_that_shifts_moves_the_mean() -> None:
+    poses = np.repeat(some_pose().numpy()[None], 2, 0)
+    poses[1, 0, 3] += 0.1
+    for share in (0.0, 0.25, 1.0):
+        belief = belief_of(poses, np.array([1 - share, share]))
+        assert belief.mean[0, 3] - poses[0, 0, 3] == pytest.approx(0.1 * share)
+        assert belief.covariance[0, 0] == pytest.approx(share * (1 - share) * 0.01)
+
+
+def test_entropy_and_effective_samples_know_their_ends() -> None:
+    poses = np.repeat(some_pose().numpy()[None], 8, 0)
+    alike, sure = belief_of(poses), belief_of(poses, np.eye(8)[0])
+    assert (alike.entropy, alike.effective_samples) == pytest.approx((np.log(8), 8))
+    assert (sure.entropy, sure.effective_samples) == pytest.approx((0, 1))
+
+
+def test_covariance_about_another_pose_holds_its_offset() -> None:
+    samples = torch.from_numpy(spread_about(some_pose(), known_covariance(), 50))
+    weights, center = torch.full((50,), 1 / 50).double(), torch.from_numpy(CENTER)
+    aside = some_pose()
+    aside[0, 3] -= 1.0
+    spread = covariance_about(some_pose(), samples, weights, center)
+    assert covariance_about(aside, samples, weights, center)[0, 0] > 0.9
+    assert spread[0, 0] < 1e-3
+
+
+def test_what_is_saved_is_read_back(tmp_path: Path) -> None:
+    weights = np.random.default_rng(5).random(40)
+    belief = belief_of(spread_about(some_pose(), known_covariance(), 40), weights)
+    belief.save(tmp_path / "belief.npz")
+    again = Belief.load(tmp_path / "belief.npz")
+    assert (again.object, again.radius, again.diameter) == ("thing", RADIUS, DIAMETER)
+    assert np.allclose(again.samples, belief.samples, atol=1e-6)
+    assert np.allclose(again.weights, belief.weights, atol=1e-7)
+    assert np.allclose(again.covariance, belief.covariance, atol=1e-7)
+
+
+def test_what_is_no_belief_is_refused_in_one_line(tmp_path: Path) -> None:
+    good = np.repeat(some_pose().numpy()[None], 3, 0)
+    (tmp_path / "text.npz").write_text("no archive")
+    np.savez(tmp_path / "other.npz", poses=good)
+    np.savez(tmp_path / "pickle.npz", poses=np.array([object()], dtype=object), weights=np.ones(1))
+    for name in ("none", "text", "other", "pickle"):
+        with pytest.raises(UserError, match=name) as caught:
+            Belief.load(tmp_path / f"{name}.npz")
+        assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="rigid"):
+        belief_of(2 * good)
+    with pytest.raises(UserError, match="sum to 1"):
+        Belief(good, np.ones(3), CENTER, RADIUS, DIAMETER)
+    with pytest.raises(UserError, match=r"\(N, 4, 4\)"):
+        Belief(good, np.ones(2) / 2, CENTER, RADIUS, DIAMETER)

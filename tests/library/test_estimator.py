@@ -1,0 +1,196 @@
+"""The library answers as the command does, on the weights and scenes that ship."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import posefilter
+from posefilter.cli.command import run_command
+from posefilter.images import check_images
+
+HOME = Path(__file__).parents[2]
+SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
+NAME = "003_cracker_box"
+FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "refine=none"]
+
+
+def read_scene(number: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return color (H, W, 3) uint8, depth (H, W) [m] and K (3, 3) of a scene that ships."""
+    stem = sorted(SCENE.glob("*.left.jpg"))[number].name.removesuffix(".left.jpg")
+    rgb = cv2.imread(str(SCENE / f"{stem}.left.jpg"))[..., ::-1]
+    depth = cv2.imread(str(SCENE / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED) / 10000
+    (camera,) = json.loads((SCENE / "_camera_settings.json").read_text())["camera_settings"][:1]
+    own = camera["intrinsic_settings"]
+    K = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
+    return rgb, depth, K
+
+
+@pytest.fixture(scope="module")
+def estimator() -> posefilter.Estimator:
+    """Return the filter that ships, as it ships."""
+    return posefilter.load(NAME, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def small() -> posefilter.Estimator:
+    """Return it with few particles, for what does not depend on its being right."""
+    return posefilter.load(NAME, overrides=FEW, device="cpu")
+
+
+def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_path: Path) -> None:
+    rgb, depth, K = read_scene()
+    result = estimator.predict(rgb, depth, K)
+    stem = SCENE / sorted(SCENE.glob("*.left.jpg"))[0].name.removesuffix(".left.jpg")
+    numbers = f"{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}"
+    typed = [
+        f"checkpoint={NAME}",
+        f"rgb={stem}.left.jpg",
+        f"depth={stem}.left.depth.png",
+        f"intrinsics={numbers}",
+        "depth_scale=10000",
+        f"out={tmp_path}",
+        "console=json",
+    ]
+    assert run_command("predict", arguments=typed) == 0
+    told = json.loads((tmp_path / "pose.json").read_text())
+    assert told["camera_from_object"] == result.pose.tolist()
+    assert told["score"] == result.score
+    assert told["object"] == result.object == NAME
+    assert told["probability"] is result.probability is None
+    assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
+    assert np.allclose(told["belief"]["covariance"], result.covariance)
+    assert told["warnings"] == [] == list(result.warnings)
+    again = posefilter.Belief.load(tmp_path / "belief.npz")
+    assert np.allclose(again.samples, result.belief.samples, atol=1e-6)
+    assert sum(mode["mass"] for mode in told["belief"]["modes"]) == pytest.approx(1)
+
+
+def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    result = estimator.predict(rgb, depth, K)
+    notes = json.loads(sorted(SCENE.glob("*.left.json"))[0].read_text())
+    truth = np.array(notes["objects"][0]["cuboid_centroid"]) / 100
+    found = result.pose[:3, :3] @ result.belief.center + result.pose[:3, 3]
+    assert np.linalg.norm(found - truth) < 0.02
+    assert np.sqrt(np.diag(result.covariance))[:3].max() < 0.02
+    assert result.modes[0].mass > 0.9
+
+
+def test_a_wrong_depth_scale_is_told(estimator: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    (warning,) = estimator.predict(rgb, 10 * depth, K).warnings
+    assert "depth_scale" in warning
+
+
+def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    arrays = small.predict(rgb, depth, K)
+    tensors = small.predict(
+        torch.from_numpy(rgb.copy()).permute(2, 0, 1),
+        torch.from_numpy(depth).float()[None][0],
+        torch.from_numpy(K),
+    )
+    floats = small.predict(rgb.astype(np.float32) / 255, np.where(depth > 0, depth, np.nan), K)
+    assert np.array_equal(arrays.pose, tensors.pose)
+    assert np.allclose(arrays.pose, floats.pose, atol=1e-3)
+    assert not np.array_equal(arrays.pose, small.predict(rgb, depth, K, seed=1).pose)
+    assert np.array_equal(arrays.pose, small.predict(rgb, depth, K, seed=0).pose)
+
+
+def test_batches_and_several_objects_nest(small: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    both = posefilter.Estimator([*small.methods, *small.methods], "cpu")
+    one = small.predict(rgb, depth, K)
+    pair = both.predict(rgb, depth, K)
+    batch = small.predict(np.stack([rgb, rgb]), np.stack([depth, depth]), K)
+    grid = both.predict(np.stack([rgb, rgb]), np.stack([depth, depth]), np.stack([K, K]))
+    assert both.objects == (NAME, NAME)
+    assert np.array_equal(pair[0].pose, one.pose)
+    assert np.array_equal(pair[1].pose, one.pose)
+    assert [type(each) for each in batch] == [posefilter.Result, posefilter.Result]
+    assert [[type(each) for each in row] for row in grid] == 2 * [2 * [posefilter.Result]]
+    assert len(small.predict_batch(rgb, depth, K)[0]) == 1
+
+
+def test_pictures(small: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    result = small.predict(rgb, depth, K)
+    drawn = result.draw_overlay(rgb, K)
+    assert drawn.dtype == np.uint8
+    assert drawn.shape[1] >= rgb.shape[1]
+    assert len(np.unique(result.draw_belief(rgb, K).reshape(-1, 3), axis=0)) > 100
+    assert posefilter.figures.draw_overlay is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"depth": np.ones((4, 5))}, "depth: has shape"),
+        ({"depth": np.full((240, 320), 700, np.uint16)}, "1000 where it is in millimeters"),
+        ({"depth": np.full((240, 320), 700.0)}, "is it in meters"),
+        ({"depth": np.zeros((240, 320))}, "no pixel has depth"),
+        ({"rgb": np.ones((240, 320))}, "rgb: has shape"),
+        ({"rgb": np.full((240, 320, 3), 255.0)}, "rgb: floats should lie in"),
+        ({"rgb": np.ones((240, 320, 3), np.int64)}, "uint8 is due"),
+        ({"intrinsics": np.ones(4)}, "camera matrix"),
+        ({"intrinsics": np.array([[300.0, 0, 0], [0, 300, 0], [160, 120, 1]])}, "transposed"),
+        ({"intrinsics": np.diag([300.0, 0, 1])}, "focal lengths"),
+    ],
+)
+def test_wrong_images_are_refused_in_one_line(change: dict[str, np.ndarray], told: str) -> None:
+    right = dict(zip(("rgb", "depth", "intrinsics"), read_scene(), strict=True))
+    with pytest.raises(posefilter.UserError, match=told) as caught:
+        check_images(**(right | change))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:
+    for what, told in (
+        (tmp_path / "none.ckpt", "no such file, and no weights of that name"),
+        ("004_suger_box", "003_cracker_box"),
+        ([], "one object at least"),
+    ):
+        with pytest.raises(posefilter.UserError, match=told):
+            posefilter.load(what)
+    with pytest.raises(posefilter.UserError, match="did you mean 'particles'"):
+        posefilter.load(NAME, overrides=["filter.particle=3"])
+    with pytest.raises(posefilter.UserError, match="there is no such choice"):
+        posefilter.load(NAME, overrides=["refine=nothing"])
+
+
+def test_a_configuration_is_composed_and_built() -> None:
+    config = posefilter.compose(["model=patch_pf", "filter.particles=7", "console=json"])
+    method = posefilter.build(config)
+    assert type(method).__name__ == "PatchPF"
+    assert method.filter.particles == 7
+    data = posefilter.build_data(config)
+    assert type(data).__name__ == "PoseDataModule"
+    with pytest.raises(posefilter.UserError, match=r"did you mean 'filter\.particles'"):
+        posefilter.compose(["filter.particels=7"])
+    with pytest.raises(posefilter.UserError, match="choose train"):
+        posefilter.compose(command="trian")
+
+
+def test_import_takes_neither_torch_nor_hydra_and_every_public_name_is_there() -> None:
+    program = (
+        "import sys, posefilter; "
+        "heavy = {'torch', 'numpy', 'hydra', 'omegaconf', 'lightning', 'cv2'} & set(sys.modules); "
+        "assert not heavy, heavy; "
+        "missing = [n for n in dir(posefilter) if not hasattr(posefilter, n)]; "
+        "assert not missing and dir(posefilter), missing"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=HOME)
+
+
+def test_every_public_name_is_documented() -> None:
+    for name in posefilter.__all__:
+        thing = getattr(posefilter, name)
+        assert isinstance(thing, str) or len(thing.__doc__ or "") > 40, name
+    for name in ("load", "compose", "build"):
+        assert "Raises:" in getattr(posefilter, name).__doc__
