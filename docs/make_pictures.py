@@ -119,12 +119,12 @@ def main() -> int:
         "--methods", type=Path, default=Path("outputs/methods"), help="where bench/methods.py wrote"
     )
     parser.add_argument("--out", type=Path, default=HOME / "docs" / "pictures")
-    said = parser.parse_args()
+    options = parser.parse_args()
     try:
-        of_checkpoint(said.checkpoint, said.scenes, said.meshes, said.out)
-        of_tour(said.tour, said.out)
-        of_ablations(said.methods / "ablation" / "patch_pf", said.out)
-        of_filters(said.methods, said.out)
+        of_checkpoint(options.checkpoint, options.scenes, options.meshes, options.out)
+        of_tour(options.tour, options.out)
+        of_ablations(options.methods / "ablation" / "patch_pf", options.out)
+        of_filters(options.methods, options.out)
     except UserError as error:
         print(f"make_pictures: {error}", file=sys.stderr)
         return 2

@@ -5,6 +5,7 @@ short animation.
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 
@@ -15,6 +16,7 @@ from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
 from posefilter.figures.curves import draw_shares
 from posefilter.figures.trajectories import draw_trajectories
+from posefilter.metrics.registry import find_metric
 from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
@@ -65,7 +67,7 @@ class Diagnostics(Callback):
             )
         if self.budget.allows():
             with self.budget.spend():
-                title = f"Signs of failure\nafter {trainer.global_step} steps of training"
+                title = f"Diagnostics\nstep {trainer.global_step}"
                 post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
 
     def on_test_batch_end(
@@ -88,7 +90,7 @@ class Diagnostics(Callback):
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" in scores and trainer.is_global_zero:
             found = cast(SignsOfFailure, scores["signs"]).compute()
-            figure = draw_diagnostics(found, "Signs of failure\nof the test")
+            figure = draw_diagnostics(found, "Diagnostics\nof the test")
             post_image(trainer, "diagnostics", figure, self.folder, "test")
 
     def draw(self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch) -> None:
@@ -116,9 +118,20 @@ def has_pixel_particles(outputs: Any) -> bool:
     return isinstance(outputs, Trace) and outputs.particles[-1].state.shape[2:] == (2,)
 
 
-def draw_diagnostics(found: dict[str, Any], title: str) -> Any:
-    """Draw the shares of particles on the object, off the frame, at an edge and in a corner against
-    the step.
+def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:
+    """Draw where the particles are against the step.
+
+    Args:
+        found: What `SignsOfFailure` computed.
+        title: Of the figure.
+
+    Returns:
+        A figure (H, 600, 3) uint8: shares of particles on the object, off the frame, at an edge and
+        in a corner; below it the numbers that are one for all steps.
     """
-    foot = ", ".join(f"{name.replace('_', ' ')} {found[name]:.2f}" for name in NUMBERS)
-    return draw_shares({name: (found[name], color) for name, color in LISTS.items()}, title, foot)
+    numbers = [(find_metric(f"signs/{name}"), found[name]) for name in NUMBERS]
+    foot = ", ".join(f"{info.short} {info.describe(value)}" for info, value in numbers)
+    lines = {
+        find_metric(f"signs/{name}").label: (found[name], color) for name, color in LISTS.items()
+    }
+    return draw_shares(lines, title, foot)

@@ -157,12 +157,12 @@ def points(o: Occasion) -> Drawn:
 
 def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
-    said = predict_proposals(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
-    if said is None:
+    found = predict_proposals(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
+    if found is None:
         return None
     title = o.title("Proposals")
     return draw_proposals(
-        said, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
+        found, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
     )
 
 

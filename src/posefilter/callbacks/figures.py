@@ -129,7 +129,7 @@ class Figures(Callback):
         with self.budget.spend(), evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
             shape, scene = find_shape(trainer, method), method.encode(batch)
-            when = f"after {trainer.global_step} steps of training"
+            when = f"step {trainer.global_step}"
             occasion = Occasion(method, shape, self._selection.kept, one, trace, batch, scene, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)

@@ -70,7 +70,7 @@ class FilterHealth(Callback):
                 picture = draw_health(
                     curves,
                     self._images,
-                    f"Filter health\nafter {trainer.global_step} steps of training",
+                    f"Filter health\nstep {trainer.global_step}",
                 )
                 post_image(trainer, "health", picture, self.folder)
 

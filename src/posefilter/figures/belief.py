@@ -293,9 +293,9 @@ def draw_marginal(one: Marginal, label: str) -> np.ndarray:
         Axis("share", 0, top, choose_ticks(0, top, 2)),
     )
     marks = list(zip(one.marks, (_BEST, _TRUE), strict=False))[::-1]
-    said = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
+    note = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
     return add_caption(
-        draw_histogram_panel(one.mass, one.edges, marks, x, y, tile_width(3), 160), said, DETAIL
+        draw_histogram_panel(one.mass, one.edges, marks, x, y, tile_width(3), 160), note, DETAIL
     )
 
 

@@ -99,11 +99,11 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
         ("beats truth", _ABOVE),
         *((f"turn {name}" if name == "x" else name, c) for name, c in list_axes()),
     ]
-    said = "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along the object's axes"
+    note = "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along the object's axes"
     parts = [
         draw_text("at noise levels of", CAPTION),
         *(arrange_grid(row, len(row)) for row in rows),
-        draw_text(said, DETAIL),
+        draw_text(note, DETAIL),
     ]
     return compose_figure(title, *parts, draw_legend(entries))
 

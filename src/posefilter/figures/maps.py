@@ -44,7 +44,7 @@ class Proposals(NamedTuple):
 
 
 def draw_proposals(
-    said: Proposals,
+    proposals: Proposals,
     rgb: np.ndarray,
     K: np.ndarray,
     truth: np.ndarray,
@@ -57,33 +57,39 @@ def draw_proposals(
     """
     view = full_view(rgb.shape[0], rgb.shape[1], tile_width(2))
     edge = outline_object(truth, shape, view.camera(K), view.height, view.width)
-    chance = draw_heat_map(rgb, said.chance, view)
+    chance = draw_heat_map(rgb, proposals.chance, view)
     draw_lines(chance, edge, TRUTH, 2, closed=True)
     drawn = view.finer(2).show(rgb)
-    draw_many_axes(drawn, view.finer(2).place(said.axes), 0.8)
+    draw_many_axes(drawn, view.finer(2).place(proposals.axes), 0.8)
     draw_dots(
         drawn,
-        view.finer(2).place(said.axes[:, 0]),
-        np.tile(np.array([_PROPOSED]), (len(said.axes), 1)),
+        view.finer(2).place(proposals.axes[:, 0]),
+        np.tile(np.array([_PROPOSED]), (len(proposals.axes), 1)),
         5,
     )
     drawn = halve(drawn)
     draw_lines(drawn, edge, TRUTH, 2, closed=True)
     mean = (
-        f"{1000 * said.error:.0f} mm off on average"
-        if np.isfinite(said.error)
+        f"{1000 * proposals.error:.0f} mm off on average"
+        if np.isfinite(proposals.error)
         else "of the object's own frame"
     )
     tiles = [
         add_caption(add_caption(chance, "that a cell shows the object", DETAIL), "chance"),
-        add_caption(add_caption(drawn, "from these maps", DETAIL), f"{len(said.axes)} poses drawn"),
         add_caption(
-            add_caption(draw_point_map(said.coordinates, said.chance, view), mean, DETAIL),
+            add_caption(drawn, "from these maps", DETAIL), f"{len(proposals.axes)} poses drawn"
+        ),
+        add_caption(
+            add_caption(
+                draw_point_map(proposals.coordinates, proposals.chance, view), mean, DETAIL
+            ),
             "points, predicted",
         ),
         add_caption(
             add_caption(
-                draw_point_map(said.true, said.on.astype(float), view), "by depth and pose", DETAIL
+                draw_point_map(proposals.true, proposals.on.astype(float), view),
+                "by depth and pose",
+                DETAIL,
             ),
             "points, true",
         ),
@@ -145,7 +151,7 @@ def draw_relevance(
         draw_lines(
             picture, [half.place(line) for line in trace_outline(mask)], TRUTH, 2, closed=True
         )
-        tiles.append(add_caption(picture, f"the {name} cloud"))
+        tiles.append(add_caption(picture, f"the {name} iteration"))
     foot = [
         draw_legend([("rim of the mask", TRUTH)]),
         draw_color_scale("relevance: 0", "1", "magma"),

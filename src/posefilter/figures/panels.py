@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 from posefilter.figures.canvas import INK, PAPER, Color, draw_dots, draw_lines, load_font
 from posefilter.figures.layout import DETAIL, LEGEND, WIDTH, draw_scale
 
-LEFT, TOP, RIGHT, BOTTOM = 62, 8, 14, 48  # margins [px]
+LEFT, TOP, RIGHT, BOTTOM = 74, 8, 14, 48  # margins [px]
 SURFACE: Color = (110, 114, 120)
 _GRID: Color = (225, 228, 232)
 _MASS: Color = (122, 153, 196)

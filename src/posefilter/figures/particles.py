@@ -155,10 +155,10 @@ def draw_iterations(
                 normalize_weights(particles, image).numpy(),
             )
             off = measure_off_frame(state, height, wide)
-            said = describe_effective(trace, image, number) + (
+            note = describe_effective(trace, image, number) + (
                 f", {off:.0%} off the frame" if off else ""
             )
-            tile = add_caption(draw_particles_on(below, state, weights, frame), said, DETAIL)
+            tile = add_caption(draw_particles_on(below, state, weights, frame), note, DETAIL)
             tiles.append(
                 add_caption(tile, f"step {number}: {describe_noise(trace, image, number, 'px')}")
             )

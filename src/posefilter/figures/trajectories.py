@@ -52,9 +52,9 @@ def draw_trajectories(
         draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
         draw_dots(picture, chosen[0], np.tile(np.array([START]), (chosen.shape[1], 1)), 2)
         draw_dots(picture, chosen[-1], np.tile(np.array([color]), (chosen.shape[1], 1)), 3.5)
-    said = f"{len(states)} steps: {on.mean():.0%} end on the object"
+    note = f"{len(states)} steps: {on.mean():.0%} end on the object"
     return compose_figure(
-        title, draw_text(said, CAPTION), picture, draw_legend([("start", START), *_ENDS])
+        title, draw_text(note, CAPTION), picture, draw_legend([("start", START), *_ENDS])
     )
 
 
@@ -109,9 +109,9 @@ def draw_glimpses(
             cell[5:-5, 5:-5] = enlarge(patches[t, i], size - 10)
             cells.append(cell)
         rows.append(arrange_row(cells))
-    said = draw_text(f"what each saw: {k} x {k} samples", CAPTION)
+    note = draw_text(f"what each saw: {k} x {k} samples", CAPTION)
     return compose_figure(
-        title, picture, draw_legend([("start", START), *_ENDS]), said, np.concatenate(rows)
+        title, picture, draw_legend([("start", START), *_ENDS]), note, np.concatenate(rows)
     )
 
 

@@ -52,7 +52,7 @@ def read_run(folder: Path) -> Run:
     )
     runtime = (hydra.get("hydra") or {}).get("runtime") or {}
     choices = {str(k): str(v) for k, v in (runtime.get("choices") or {}).items() if v is not None}
-    said = (hydra.get("hydra") or {}).get("overrides") or {}
+    overrides = (hydra.get("hydra") or {}).get("overrides") or {}
     curves, logged = read_events(folder)
     files = read_images(folder / "figures")
     return Run(
@@ -61,7 +61,7 @@ def read_run(folder: Path) -> Run:
         metrics_train=read_json(folder / "metrics_train.json"),
         config=config,
         choices=choices,
-        overrides=[str(o) for o in said.get("task") or metrics.get("overrides") or []],
+        overrides=[str(o) for o in overrides.get("task") or metrics.get("overrides") or []],
         data=read_json(folder / "data.json"),
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],

@@ -99,13 +99,13 @@ def read_sweep(folder: Path) -> Sweep:
 def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
     metrics = [read_json(path / "metrics.json") for path in found]
-    said = [
+    settings = [
         dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o)
         for own in metrics
     ]
-    keys = dict.fromkeys(key for pairs in said for key in pairs)
+    keys = dict.fromkeys(key for pairs in settings for key in pairs)
     axes = [
-        key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in said}) > 1
+        key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in settings}) > 1
     ]
     jobs = [
         Job(
@@ -113,7 +113,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
             flatten(own),
             str(path.relative_to(folder)),
         )
-        for path, own, pairs in zip(found, metrics, said, strict=True)
+        for path, own, pairs in zip(found, metrics, settings, strict=True)
     ]
     return axes, jobs
 
