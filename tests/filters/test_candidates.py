@@ -5,7 +5,12 @@ frame.
 import torch
 from tests.models.toy import scenes, square
 
-from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth, jiggle
+from posefilter.filters.candidates import (
+    PersistentParticles,
+    perturb,
+    sample_around_truth,
+    sample_from_depth,
+)
 from posefilter.filters.propagate import half_turns
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
@@ -21,7 +26,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_candidates_hold_the_truth_and_every_kind() -> None:
     batch = scenes(3)
-    poses = around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator())
+    poses = sample_around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator())
     assert poses.shape == (3, 1 + 4 * 8 + 4, 4, 4)
     torch.testing.assert_close(poses[:, 0], batch.camera_from_object)
     distance = SPACE.distance(poses, batch.camera_from_object[:, None])
@@ -45,7 +50,7 @@ def test_half_turns_are_half_turns_about_the_center() -> None:
 
 def test_jiggle_has_the_size_it_is_told() -> None:
     poses = torch.eye(4).expand(1, 20_000, 4, 4)
-    moved = jiggle(poses, torch.full((1, 20_000), 0.02), SPACE, generator())
+    moved = perturb(poses, torch.full((1, 20_000), 0.02), SPACE, generator())
     assert abs(moved[0, :, 0, 3].std().item() - 0.02) < 5e-4
     turn = angle_between(moved[..., :3, :3], poses[..., :3, :3])
     assert abs(turn.square().mean().sqrt().item() - 3**0.5 * 0.02 / MODEL.radius) < 5e-3
@@ -54,7 +59,7 @@ def test_jiggle_has_the_size_it_is_told() -> None:
 def test_persistent_particles_follow_their_frame_under_another_camera() -> None:
     batch = scenes(2)._replace(frame_id=torch.tensor([7, 9]))
     kept = PersistentParticles(particles=5, levels=3, sharpest=0.01, step=0.0)
-    fresh = from_depth(batch, SPACE, 5, generator())
+    fresh = sample_from_depth(batch, SPACE, 5, generator())
     poses, sigma = kept.recall(batch, fresh, 0.1)
     torch.testing.assert_close(poses, fresh)
     torch.testing.assert_close(sigma, torch.tensor([0.1, 0.1]))
@@ -63,7 +68,7 @@ def test_persistent_particles_follow_their_frame_under_another_camera() -> None:
     kept.advance(batch, poses, scores, sigma, torch.tensor([True, False]), SPACE, generator(1))
     roll = make_pose(exp_so3(torch.tensor([0.0, 0.0, 0.5])), torch.zeros(3))
     rolled = batch._replace(camera_from_object=roll @ batch.camera_from_object)
-    fresh = from_depth(rolled, SPACE, 5, generator(2))
+    fresh = sample_from_depth(rolled, SPACE, 5, generator(2))
     again, sigma = kept.recall(rolled, fresh, 0.1)
     torch.testing.assert_close(sigma, torch.tensor([0.1**0.5 * 0.01**0.5, 0.1]))
     torch.testing.assert_close(again[0], (roll @ poses[0, 2]).expand(5, 4, 4), atol=1e-5, rtol=0)
@@ -75,6 +80,6 @@ def test_after_the_last_level_particles_start_anew() -> None:
     kept = PersistentParticles(particles=4, levels=2, sharpest=0.01)
     used = torch.tensor([True])
     for expected in (0.1, 0.01, 0.1):
-        poses, sigma = kept.recall(batch, from_depth(batch, SPACE, 4, generator()), 0.1)
+        poses, sigma = kept.recall(batch, sample_from_depth(batch, SPACE, 4, generator()), 0.1)
         torch.testing.assert_close(sigma, torch.tensor([expected]))
         kept.advance(batch, poses, torch.zeros(1, 4), sigma, used, SPACE, generator())

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from posefilter.errors import UserError
-from posefilter.filters.guided import Guided, look_up
+from posefilter.filters.guided import Guided, gather_relevance
 from posefilter.filters.resample import Systematic
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.types import Particles
@@ -25,7 +25,7 @@ def cloud_of(N: int, seed: int) -> Particles:
 def test_look_up_reads_the_cell_under_the_particle() -> None:
     relevance = torch.arange(6.0).view(1, 1, 2, 3)
     state = torch.tensor([[[-0.5, -0.5], [9.4, 9.4], [9.6, 9.4], [29.0, 19.0], [500.0, -70.0]]])
-    assert look_up(relevance, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
+    assert gather_relevance(relevance, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
 
 
 def test_guided_resampling_keeps_the_weighted_mean_and_sends_children_to_the_relevant() -> None:

@@ -58,9 +58,14 @@ def build(
     resample: Resample | None = None, particles: int = 50, **changes: object
 ) -> ParticleFilter:
     pieces = {
-        "initialize": start, "schedule": Constant(0.5), "reweight": Sequential(), "resample": resample or Systematic(),
-        "propagate": Chain([LearnedDisplacement(), Gaussian(0.4)]), "estimate": Mean(), "refine": NoRefine(),
-    }  # fmt: skip
+        "initialize": start,
+        "schedule": Constant(0.5),
+        "reweight": Sequential(),
+        "resample": resample or Systematic(),
+        "propagate": Chain([LearnedDisplacement(), Gaussian(0.4)]),
+        "estimate": Mean(),
+        "refine": NoRefine(),
+    }
     return ParticleFilter(particles, 4, **(pieces | changes))
 
 
@@ -124,7 +129,7 @@ def test_every_step_is_what_its_words_say() -> None:
     before = [[0.0] * 50 for _ in GOALS]
     for t, particles in enumerate(trace.particles):
         if t:
-            places = Systematic().places(3, 50, g, torch.device("cpu"))
+            places = Systematic().uniforms(3, 50, g, torch.device("cpu"))
             for b in range(3):
                 q = [0.5 * math.exp(w) + 0.5 / 50 for w in log_w[b]]
                 ancestors = []

@@ -1,4 +1,4 @@
-"""Refinement: the careful second look, the mean shift and the climb, on a score whose top is known."""
+"""Refinement: rescoring, mean shift and gradient ascent on a score of known maximum."""
 
 import math
 

@@ -10,14 +10,14 @@ from posefilter.errors import UserError
 from posefilter.filters.loop import inherit, make_particles
 from posefilter.filters.resample import (
     BelowESS,
-    Fair,
+    InverseCDF,
     Multinomial,
     NoResampling,
     Soft,
     Stratified,
     Systematic,
-    draw,
-    effective_size,
+    effective_sample_size,
+    inverse_cdf,
 )
 from posefilter.filters.transport import Ensemble, OptimalTransport, sinkhorn
 from posefilter.geometry.pose import is_rigid, make_pose
@@ -73,13 +73,13 @@ def test_weights_are_kept_in_expectation(resampler: Resample, count: int) -> Non
 
 
 def test_the_law_catches_a_resampler_that_ignores_weights() -> None:
-    class Blind(Fair):
+    class Blind(InverseCDF):
         def __call__(self, particles: Particles, *rest: object) -> Resampled:
             return super().__call__(
                 particles._replace(log_weights=torch.zeros_like(particles.log_weights)), *rest
             )
 
-        def places(
+        def uniforms(
             self, rows: int, count: int, generator: Generator, device: torch.device
         ) -> Tensor:
             return torch.rand(rows, count, generator=generator)
@@ -101,13 +101,13 @@ def test_the_same_generator_gives_the_same_children(resampler: Resample) -> None
 @pytest.mark.parametrize(
     "scheme", [Systematic(), Stratified(), Multinomial()], ids=lambda x: type(x).__name__
 )
-def test_places_are_looked_up_as_a_loop_would(scheme: Fair) -> None:
+def test_places_are_looked_up_as_a_loop_would(scheme: InverseCDF) -> None:
     particles = cloud_of(3, 20)
     resampled = scheme(particles, 30, SPACE, Generator().manual_seed(2))
-    places = scheme.places(3, 30, Generator().manual_seed(2), torch.device("cpu"))
+    uniforms = scheme.uniforms(3, 30, Generator().manual_seed(2), torch.device("cpu"))
     for row in range(3):
         for n in range(30):
-            left, parent = float(places[row, n]), 0
+            left, parent = float(uniforms[row, n]), 0
             while left >= (w := float(particles.log_weights[row, parent].double().exp())):
                 left, parent = left - w, parent + 1
             assert resampled.ancestors[row, n] == parent
@@ -122,15 +122,15 @@ def test_systematic_rounds_each_share_up_or_down() -> None:
 
 def test_a_particle_of_no_weight_has_no_children() -> None:
     log_w = torch.tensor([[-math.inf, 0.0, -math.inf, -math.inf]])
-    for places in (torch.zeros(1, 3), torch.full((1, 3), 1 - 2**-24), torch.rand(1, 3)):
-        assert (draw(log_w, places) == 1).all()
+    for uniforms in (torch.zeros(1, 3), torch.full((1, 3), 1 - 2**-24), torch.rand(1, 3)):
+        assert (inverse_cdf(log_w, uniforms) == 1).all()
 
 
 def test_effective_size_at_both_ends() -> None:
     alike = torch.full((1, 50), -math.log(50))
     single = torch.log(torch.tensor([[1.0] + [0.0] * 49]))
     halves = torch.log(torch.tensor([[0.5, 0.5] + [0.0] * 48]))
-    sizes = torch.cat([effective_size(x) for x in (alike, single, halves)])
+    sizes = torch.cat([effective_sample_size(x) for x in (alike, single, halves)])
     torch.testing.assert_close(sizes, torch.tensor([50.0, 1.0, 2.0]))
 
 
@@ -144,8 +144,8 @@ def test_below_ess_decides_for_each_image() -> None:
         assert torch.equal(resampled.ancestors[0], torch.arange(20))
         assert torch.equal(resampled.log_weights[0], particles.log_weights[0])
         assert torch.equal(inherit(particles.state, resampled, SPACE)[0], particles.state[0])
-        assert effective_size(resampled.log_weights)[1] > 19
-        assert effective_size(particles.log_weights)[1] < 10
+        assert effective_sample_size(resampled.log_weights)[1] > 19
+        assert effective_sample_size(particles.log_weights)[1] < 10
 
 
 def test_never_keeps_all_and_refuses_another_size() -> None:

@@ -8,7 +8,7 @@ from tests.models.toy import scenes, square
 from torch.nn.functional import pad
 
 from posefilter.errors import UserError
-from posefilter.filters.candidates import jiggle
+from posefilter.filters.candidates import perturb
 from posefilter.filters.estimate import Argmax
 from posefilter.filters.initialize import FromDepth, FromProposals
 from posefilter.filters.loop import ParticleFilter
@@ -114,7 +114,7 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
     batch = scenes(32, seed=40_000)
     g = torch.Generator().manual_seed(0)
     truth = batch.camera_from_object
-    start = jiggle(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
+    start = perturb(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
     belief = Belief(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
     with torch.no_grad():
         scene = trained.encode(batch)

@@ -1,4 +1,4 @@
-"""The pose that most particles' own surface points agree on."""
+"""The pose that explains most particles' own surface points, by hypothesis and verification."""
 
 import torch
 from torch import Generator, Tensor
@@ -10,9 +10,11 @@ from posefilter.protocols import HasSurfacePoints, Method, Scene
 from posefilter.types import Belief, ParticleOutput, Particles
 
 
-def surface_points_of(method: Method) -> HasSurfacePoints:
-    """Return the method as one whose particles stand on measured points; raise UserError if they do
-    not.
+def require_surface_points(method: Method) -> HasSurfacePoints:
+    """Return the method as one whose particles stand on measured points.
+
+    Raises:
+        UserError: The method's particles stand on no measured point.
     """
     if not isinstance(method, HasSurfacePoints):
         raise UserError(
@@ -23,17 +25,24 @@ def surface_points_of(method: Method) -> HasSurfacePoints:
 
 
 class Agreement:
-    """Bet on the pose that the particles' own points agree on, weighted by their likelihoods.
+    """Estimate the pose that most particles' surface points agree on, weighted by likelihood.
 
-    A particle says which object point its own measured point is: by its pose, or by its likeliest
-    `options` fragments where it tells fragments. Hypotheses are the likeliest particles' own poses,
-    and as many votes: a few particles' points at a time. Each is scored by how many particles it
-    explains, and the best is refitted to all of them (Kabsch, reweighted by how well each fits,
-    with a falling scale). The belief is the votes, each weighted by the share that it explains to
-    the power of `counts`: as many particles count as independent.
+    Each particle predicts which object point its own measured point is: by its pose, or by its
+    `options` most probable fragments where the method predicts fragments. The hypotheses are the
+    poses of the particles of highest likelihood, and as many rigid fits to a few particles' points
+    (RANSAC, Fischler and Bolles 1981). A hypothesis is scored by the weight of its inliers. The
+    best one is refitted to all particles by iteratively reweighted least squares: Kabsch's fit
+    (1976) with Geman-McClure weights and a falling scale.
 
-    scale_m: how far a particle's point may lie off [m]; hypotheses: of each kind; rounds: of the
-    refit.
+    The belief is the set of fitted poses, each weighted by its share of inliers to the power of
+    `counts`.
+
+    Args:
+        scale_m: Scale of the residuals of inliers [m].
+        hypotheses: Number of hypotheses of each kind.
+        rounds: Iterations of the refit.
+        options: Fragments considered for each particle.
+        counts: How many particles count as independent observations.
     """
 
     def __init__(
@@ -63,60 +72,71 @@ class Agreement:
         method: Method,
         generator: Generator,
     ) -> Belief:
-        """Return the belief whose `best` is the agreed pose, its score the share that agrees x the
-        best likelihood.
+        """Return the belief at the agreed pose.
+
+        Its score is the share of the weight that agrees, times the highest likelihood.
         """
-        sees = surface_points_of(method)
-        center, radius = sees.model.center.to(particles.state), sees.model.radius
-        point, known = sees.surface_points(scene, particles.state)
-        share, place = self._options(output, point, center, radius)
+        provider = require_surface_points(method)
+        center, radius = provider.model.center.to(particles.state), provider.model.radius
+        point, known = provider.surface_points(scene, particles.state)
+        share, place = self._object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known
         votes = draw_votes(point, weight, share, place, center, radius, self.hypotheses, generator)
         weight = weight + 1e-9  # where none is known, all are
-        start = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
-        likeliest = output.pose.detach().gather(1, start[..., None, None].expand(-1, -1, 4, 4))
-        guess = torch.cat([votes, likeliest], dim=1)
-        thing = center + radius * place
-        fits = (
-            share[:, None] * self._fit(guess, thing[:, None], point[:, None], 2 * self.scale_m)
-        ).sum(-1)
-        explained = (weight[:, None] * fits).sum(-1)
-        best = guess.gather(1, explained.argmax(1)[:, None, None, None].expand(-1, -1, 4, 4))[:, 0]
+        top = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
+        top_poses = output.pose.detach().gather(1, top[..., None, None].expand(-1, -1, 4, 4))
+        hypotheses = torch.cat([votes, top_poses], dim=1)
+        object_point = center + radius * place
+        fit = self._inliers(hypotheses, object_point[:, None], point[:, None], 2 * self.scale_m)
+        support = (weight[:, None] * (share[:, None] * fit).sum(-1)).sum(-1)
+        best = hypotheses[torch.arange(len(support), device=support.device), support.argmax(1)]
         for i in range(self.rounds):
             scale = self.scale_m * 2 ** (2 - 2 * i / max(self.rounds - 1, 1))
-            fit, option = (share * self._fit(best, thing, point, scale)).max(-1)
-            chosen = thing.gather(2, option[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+            fit, option = (share * self._inliers(best, object_point, point, scale)).max(-1)
+            chosen = object_point.gather(2, option[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
             best = fit_rigid(chosen, point, weight * fit)
-        # within two scales
-        near = (share * (self._fit(best, thing, point, self.scale_m) > 0.04)).sum(-1)
-        agreed = (weight * near).sum(1) / weight.sum(1)
-        log_weights = torch.log_softmax(
-            self.counts * explained[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
+        # a weight of 0.04 is a residual of two scales
+        agreeing = (share * (self._inliers(best, object_point, point, self.scale_m) > 0.04)).sum(-1)
+        score = (
+            (weight * agreeing).sum(1) / weight.sum(1) * output.log_likelihood.exp().max(1).values
         )
-        return Belief(votes, log_weights, best, agreed * output.log_likelihood.exp().max(1).values)
+        log_weights = torch.log_softmax(
+            self.counts * support[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
+        )
+        return Belief(votes, log_weights, best, score)
 
-    def _options(
+    def _object_points(
         self, output: ParticleOutput, point: Tensor, center: Tensor, radius: float
     ) -> tuple[Tensor, Tensor]:
-        """Return what each particle's own point may be.  -> shares (B, N, k), places over the
-        radius (B, N, k, 3).
+        """Return the candidate object points of each particle's own point.
+
+        Returns:
+            Probabilities (B, N, k), and positions (B, N, k, 3) from the object's center, in radii.
         """
-        said = output.fragments
-        if said is None:
-            thing = transform(invert(output.pose.detach()), point[:, :, None])
-            return torch.ones_like(thing[..., 0]), (thing - center) / radius
-        log_share, fragment = said.log_share.detach().topk(
-            min(self.options, said.log_share.shape[-1]), dim=-1
+        fragments = output.fragments
+        if fragments is None:
+            object_point = transform(invert(output.pose.detach()), point[:, :, None])
+            return torch.ones_like(object_point[..., 0]), (object_point - center) / radius
+        log_share, fragment = fragments.log_share.detach().topk(
+            min(self.options, fragments.log_share.shape[-1]), dim=-1
         )
-        return log_share.exp(), said.place.detach().gather(
+        return log_share.exp(), fragments.place.detach().gather(
             2, fragment[..., None].expand(-1, -1, -1, 3)
         )
 
     @staticmethod
-    def _fit(pose: Tensor, thing: Tensor, point: Tensor, scale: float) -> Tensor:
-        """How well poses explain what particles say, in (0, 1].
+    def _inliers(pose: Tensor, object_point: Tensor, point: Tensor, scale: float) -> Tensor:
+        """Return the Geman-McClure weight of each correspondence under each pose.
 
-        (*, 4, 4), (*, N, k, 3), (*, N, 3) [m] -> (*, N, k).
+        Args:
+            pose: (*, 4, 4) camera_from_object [m].
+            object_point: (*, N, k, 3) in the object's frame [m].
+            point: (*, N, 3) measured, in the camera [m].
+            scale: Scale of the residuals [m].
+
+        Returns:
+            Weights (*, N, k) in (0, 1].
         """
-        there = transform(pose, thing.flatten(-3, -2)).unflatten(-2, thing.shape[-3:-1])
-        return 1 / (1 + (there - point[..., None, :]).square().sum(-1) / scale**2).square()
+        points = transform(pose, object_point.flatten(-3, -2))
+        offset = points.unflatten(-2, object_point.shape[-3:-1]) - point[..., None, :]
+        return 1 / (1 + offset.square().sum(-1) / scale**2).square()

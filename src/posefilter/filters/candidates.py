@@ -1,10 +1,9 @@
-"""Candidate poses that a likelihood learns from by contrast, and the persistent particles that find
-its faults.
+"""Candidate poses for contrastive training of a likelihood, and persistent particles.
 
-A likelihood trained on the truth and its neighbors alone scores absurd poses high, since it never
-saw them. So candidates come from everywhere, and some from the likelihood's own filter: particles
-that live on from visit to visit of a frame, advancing one step of an annealed filter each time
-(persistent chains, Tieleman 2008).
+A likelihood that is trained only near the truth gives high scores to distant wrong poses.
+Candidates therefore also come from measured points anywhere in the image, and from the filter
+itself: persistent particles advance by one step of an annealed filter each time their frame is
+visited (persistent chains, Tieleman 2008).
 """
 
 import math
@@ -22,19 +21,27 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import Batch, ObjectModel
 
 
-def from_depth(
+def sample_from_depth(
     batch: Batch, space: PoseSpace, count: int, generator: Generator, prior: Tensor | None = None
 ) -> Tensor:
     """Draw poses at measured points of a batch; see `draw_from_depth`.  -> (B, count, 4, 4)."""
     return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
 
 
-def jiggle(
+def perturb(
     poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0
 ) -> Tensor:
-    """Perturb poses by Gaussian moves of size sigma.
+    """Perturb poses by Gaussian noise in the space's tangent.
 
-    (B, N, 4, 4), (B, N) [m] -> (B, N, 4, 4); `turn` scales the turns.
+    Args:
+        poses: (B, N, 4, 4) camera_from_object.
+        sigma: (B, N) noise level [m].
+        space: The space of the poses.
+        generator: Source of randomness.
+        turn: Factor on the rotations' noise.
+
+    Returns:
+        Perturbed poses (B, N, 4, 4).
     """
     scale = space.noise_scale(sigma)
     scale = torch.cat([scale[..., :3], scale[..., 3:] * turn], dim=-1)
@@ -43,7 +50,7 @@ def jiggle(
     )
 
 
-def around_truth(
+def sample_around_truth(
     batch: Batch,
     model: ObjectModel,
     space: PoseSpace,
@@ -51,11 +58,22 @@ def around_truth(
     sigma: Sequence[float],
     generator: Generator,
 ) -> Tensor:
-    """Draw the candidates that need the truth: it itself first, then `each` of every kind.  -> (B,
-    1 + 4.5 each, 4, 4).
+    """Draw the candidates that need the truth.
 
-    Kinds: perturbed at every scale; from depth on the object; from depth anywhere; right place with
-    a random rotation (half as many); half turns, slightly perturbed.
+    The truth itself comes first. Then follow, `each` of them unless stated otherwise: perturbations
+    of the truth at every scale; poses from depth on the object; poses from depth anywhere; random
+    rotations near the true center (`each // 2`); slightly perturbed half turns.
+
+    Args:
+        batch: Images with their true poses.
+        model: The object.
+        space: The space of the poses.
+        each: Candidates of a kind.
+        sigma: Lowest and highest noise level [m]; levels are drawn log-uniformly.
+        generator: Source of randomness.
+
+    Returns:
+        Poses (B, 1 + 4 each + each // 2, 4, 4), camera_from_object.
     """
     B = len(batch.rgb)
     device = batch.rgb.device
@@ -63,27 +81,36 @@ def around_truth(
     center = model.center.to(device)
     low, high = math.log(sigma[0]), math.log(sigma[1])
     size = torch.exp(torch.empty(B, each, device=device).uniform_(low, high, generator=generator))
-    same = truth.expand(B, each, 4, 4)
-    near = jiggle(same, size * 0.6, space, generator)
-    on = from_depth(batch, space, each, generator, batch.mask.float() + 0.02)
-    anywhere = from_depth(batch, space, each, generator)
-    few = each // 2
-    placed = jiggle(truth.expand(B, few, 4, 4), size[:, :few] * 0.5, space, generator, turn=0.0)
-    turned = pose_about(
-        random_rotation(B, few, generator=generator, device=device),
-        origin_of(placed, center),
+    copies = truth.expand(B, each, 4, 4)
+    nearby = perturb(copies, size * 0.6, space, generator)
+    on_object = sample_from_depth(batch, space, each, generator, batch.mask.float() + 0.02)
+    anywhere = sample_from_depth(batch, space, each, generator)
+    half = each // 2
+    shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator, turn=0.0)
+    rotated = pose_about(
+        random_rotation(B, half, generator=generator, device=device),
+        origin_of(shifted, center),
         center,
     )
-    flipped = jiggle(half_turns(same, space, generator), size * 0.3, space, generator)
-    return torch.cat([truth, near, on, anywhere, turned, flipped], dim=1)
+    flipped = perturb(half_turns(copies, space, generator), size * 0.3, space, generator)
+    return torch.cat([truth, nearby, on_object, anywhere, rotated, flipped], dim=1)
 
 
 class PersistentParticles(nn.Module):
-    """A few particles a training frame, kept between visits; a frame's noise level falls to
-    `sharpest` with each of them.
+    """A few particles for each training frame, kept between visits of the frame.
 
-    They are stored relative to the truth (object_from_hypothesis), so that a sample whose camera
-    was rolled or zoomed by augmentation finds them where they were.
+    The frame's noise level falls geometrically to `sharpest` with each visit; then the frame starts
+    anew. Particles are stored relative to the truth (object_from_hypothesis), so that they stay
+    valid where augmentation rolls or zooms the camera.
+
+    Args:
+        particles: Particles of a frame.
+        levels: Noise levels, two or more.
+        sharpest: Lowest noise level [m].
+        step: Standard deviation of a perturbation, over the noise level.
+
+    Raises:
+        UserError: `particles` is below 1, or `levels` below 2.
     """
 
     def __init__(
@@ -100,16 +127,23 @@ class PersistentParticles(nn.Module):
         self._level: dict[int, int] = {}
 
     def recall(self, batch: Batch, fresh: Tensor, start: float) -> tuple[Tensor, Tensor]:
-        """Return each frame's particles (B, M, 4, 4) and noise level (B,) [m]; new frames take the
-        fresh ones, at start.
+        """Return each frame's particles and noise level.
+
+        Args:
+            batch: Images; `frame_id` says which frames.
+            fresh: (B, M, 4, 4) particles for frames that have none yet.
+            start: Highest noise level [m].
+
+        Returns:
+            Particles (B, M, 4, 4) camera_from_object, and noise levels (B,) [m].
         """
         rows = []
         for row, frame in enumerate(batch.frame_id.tolist()):
-            kept = self._poses.get(frame)
+            stored = self._poses.get(frame)
             rows.append(
                 fresh[row]
-                if kept is None
-                else batch.camera_from_object[row] @ kept.to(fresh.device)
+                if stored is None
+                else batch.camera_from_object[row] @ stored.to(fresh.device)
             )
         level = torch.tensor(
             [self._level.get(frame, 0) for frame in batch.frame_id.tolist()], device=fresh.device
@@ -117,8 +151,10 @@ class PersistentParticles(nn.Module):
         return torch.stack(rows), start * (self.sharpest / start) ** (level / (self.levels - 1))
 
     def state(self) -> dict[str, Tensor]:
-        """Return what a run needs to go on: frames (F,), their levels (F,) and particles (F, M, 4,
-        4).
+        """Return what a resumed run needs.
+
+        Returns:
+            "frames" (F,), "levels" (F,) and "poses" (F, M, 4, 4); empty where nothing is stored.
         """
         if not self._poses:
             return {}
@@ -131,7 +167,7 @@ class PersistentParticles(nn.Module):
         }
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Go on from what `state` returned."""
+        """Restore what `state` returned."""
         self._poses, self._level = {}, {}
         if state:
             frames = state["frames"].tolist()
@@ -149,15 +185,23 @@ class PersistentParticles(nn.Module):
         space: PoseSpace,
         generator: Generator,
     ) -> None:
-        """Take one filter step where `used` (B,): resample by the scores at sigma, perturb, lower
-        the noise level.
+        """Advance by one filter step: resample by the scores, perturb, lower the noise level.
+
+        Args:
+            batch: Images whose frames' particles advance.
+            poses: (B, C, 4, 4) candidates, camera_from_object.
+            scores: (B, C) unnormalized log weights.
+            sigma: (B,) noise level of the scores [m].
+            used: (B,) bool; other frames stay as they are.
+            space: The space of the poses.
+            generator: Source of randomness.
         """
         ancestors = torch.multinomial(
             torch.softmax(scores, dim=1), self.particles, replacement=True, generator=generator
         )
         resampled = poses.gather(1, ancestors[..., None, None].expand(-1, -1, 4, 4))
         size = (self.step * sigma)[:, None].expand(-1, self.particles)
-        relative = invert(batch.camera_from_object)[:, None] @ jiggle(
+        relative = invert(batch.camera_from_object)[:, None] @ perturb(
             resampled, size, space, generator
         )
         for row, frame in enumerate(batch.frame_id.tolist()):

@@ -1,6 +1,6 @@
-"""Betting on one pose of the last cloud.
+"""Point estimates: one pose from the last weighted particles.
 
-The belief itself is always the whole cloud with its weights.
+The belief always holds all particles with their weights.
 """
 
 import torch
@@ -11,15 +11,18 @@ from posefilter.protocols import Method, Scene, Space
 from posefilter.types import Belief, ParticleOutput, Particles
 
 
-def picked(particles: Particles, output: ParticleOutput, index: Tensor, score: Tensor) -> Belief:
-    """Return the belief that bets on one particle an image.  index, score (B,)."""
+def select_particle(
+    particles: Particles, output: ParticleOutput, index: Tensor, score: Tensor
+) -> Belief:
+    """Return the belief whose estimate is one particle of each image.  index, score (B,)."""
     rows = torch.arange(len(index), device=index.device)
     return Belief(output.pose, particles.log_weights, output.pose[rows, index], score)
 
 
 class Argmax:
-    """The pose of the particle with the highest likelihood (the paper, section 5); its
-    log-likelihood is the score.
+    """The pose of the particle of highest likelihood (the paper, section 5).
+
+    The score is its log-likelihood.
     """
 
     def __call__(
@@ -32,14 +35,15 @@ class Argmax:
     ) -> Belief:
         """Return the belief."""
         score, index = output.log_likelihood.max(1)
-        return picked(particles, output, index, score)
+        return select_particle(particles, output, index, score)
 
 
 class Mean:
     """The weighted mean of the poses; the score is the weighted mean of the log-likelihoods.
 
-    Poses are averaged about the object's center where the space knows it, else about the frame's
-    origin. Between two far-off modes the mean is a pose that nobody voted for: see DensestMode.
+    Poses are averaged about the object's center where the space knows it, else about the origin of
+    the object's frame. Between two distant modes the mean is a pose of low probability: see
+    DensestMode.
     """
 
     def __call__(
@@ -50,31 +54,38 @@ class Mean:
         method: Method,
         generator: Generator,
     ) -> Belief:
-        """Return the belief, differentiable in weights and poses."""
+        """Return the belief; differentiable in weights and poses."""
         space = (
             method.space if isinstance(method.space, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
         )
         weights = particles.log_weights.exp()
-        likely = torch.where(
+        weighted = torch.where(
             weights > 0, weights * output.log_likelihood, torch.zeros_like(weights)
         )
         return Belief(
-            output.pose, particles.log_weights, space.mean(output.pose, weights), likely.sum(1)
+            output.pose, particles.log_weights, space.mean(output.pose, weights), weighted.sum(1)
         )
 
 
 def kernel_mass(
     state: Tensor, log_weights: Tensor, space: Space, bandwidth: float, chunk: int = 1 << 22
 ) -> Tensor:
-    """Return the log of the Gaussian-weighted mass round each particle, at most 0.  (B, N, *S), (B,
-    N) -> (B, N).
+    """Return the log of the kernel-weighted mass around each particle: a kernel density estimate.
 
-    chunk: distances held at once.
+    Args:
+        state: (B, N, *S) particles.
+        log_weights: (B, N), normalized.
+        space: The space of the particles.
+        bandwidth: Of the Gaussian kernel, in the space's unit ([m] or [px]).
+        chunk: Distances held in memory at once.
+
+    Returns:
+        Log masses (B, N), at most 0.
     """
     rows = max(1, chunk // log_weights.numel())
     parts = []
-    for some in state.split(rows, dim=1):
-        distance = space.distance(some[:, :, None], state[:, None])
+    for block in state.split(rows, dim=1):
+        distance = space.distance(block[:, :, None], state[:, None])
         parts.append(
             torch.logsumexp(log_weights[:, None] - 0.5 * (distance / bandwidth).square(), dim=2)
         )
@@ -82,10 +93,11 @@ def kernel_mass(
 
 
 class DensestMode:
-    """The pose of the particle round which most of the weight lies; the log of that share of it is
-    the score.
+    """The pose of the particle of highest kernel density; the score is the log of its kernel mass.
 
-    bandwidth: of the Gaussian kernel over the particles' states, in the space's unit ([m] or [px]).
+    Args:
+        bandwidth: Of the Gaussian kernel over the particles' states, in the space's unit ([m] or
+            [px]).
     """
 
     def __init__(self, bandwidth: float) -> None:
@@ -104,15 +116,18 @@ class DensestMode:
             particles.state.detach(), particles.log_weights.detach(), method.space, self.bandwidth
         )
         score, index = mass.max(1)
-        return picked(particles, output, index, score)
+        return select_particle(particles, output, index, score)
 
 
 class DensestPose:
-    """The pose on which most of the weight agrees, whatever the particles are: pixels can vote for
-    one pose from afar.
+    """The particle's pose of highest kernel density among poses, for particles of any space.
 
-    bandwidth: of the Gaussian kernel [m]; radius: a turn counts as the shift that it gives at this
-    distance [m].
+    Particles that are pixels can predict one pose from distant positions; this estimate compares
+    the predicted poses, not the pixels.
+
+    Args:
+        bandwidth: Of the Gaussian kernel [m].
+        radius: Distance at which a rotation counts as the shift that it causes [m].
     """
 
     def __init__(self, bandwidth: float, radius: float = 0.1) -> None:
@@ -131,4 +146,4 @@ class DensestPose:
             output.pose.detach(), particles.log_weights.detach(), self.space, self.bandwidth
         )
         score, index = mass.max(1)
-        return picked(particles, output, index, score)
+        return select_particle(particles, output, index, score)

@@ -1,6 +1,4 @@
-"""Resampling guided by a predicted map of where in the image to look (the paper, section 6, idea
-4).
-"""
+"""Resampling guided by a predicted relevance map (the paper, section 6, idea 4)."""
 
 import torch
 from torch import Generator, Tensor
@@ -10,33 +8,44 @@ from posefilter.protocols import HasRelevance, Resample, Scene, Space
 from posefilter.types import Batch, Particles, Resampled
 
 
-def look_up(relevance: Tensor, state: Tensor, height: int, width: int) -> Tensor:
-    """Return the relevance of the cell each particle stands in; of the nearest, off the frame.
+def gather_relevance(relevance: Tensor, state: Tensor, height: int, width: int) -> Tensor:
+    """Return the relevance of the cell that each particle lies in; off the frame, of the nearest.
 
-    (B, 1, h, w), (B, N, 2) [px] in a frame of height x width -> (B, N).
+    Args:
+        relevance: (B, 1, h, w) map over the image.
+        state: (B, N, 2) particles [px].
+        height: The image's height [px].
+        width: The image's width [px].
+
+    Returns:
+        Relevance (B, N).
     """
     h, w = relevance.shape[-2:]
-    share = (state.detach() + 0.5) / state.new_tensor([width, height])
-    cell = (share * state.new_tensor([w, h])).floor().nan_to_num(0.0)
+    fraction = (state.detach() + 0.5) / state.new_tensor([width, height])
+    cell = (fraction * state.new_tensor([w, h])).floor().nan_to_num(0.0)
     column, row = cell[..., 0].clamp(0, w - 1).long(), cell[..., 1].clamp(0, h - 1).long()
     return relevance.flatten(1).gather(1, row * w + column)
 
 
-def bound(resample: Resample, scene: Scene, batch: Batch) -> Resample:
-    """Return the resampler for these images, where it is of a kind that looks at them; else as it
-    is.
-    """
+def bind_to_scene(resample: Resample, scene: Scene, batch: Batch) -> Resample:
+    """Return the resampler bound to these images if it is Guided, else the resampler itself."""
     return resample.bind(scene, *batch.rgb.shape[-2:]) if isinstance(resample, Guided) else resample
 
 
 class Guided:
-    """Draw parents by weight x relevance, and let children start with weights x 1 / relevance, so
-    that the belief stays.
+    """Draw ancestors by weight x relevance, and correct the weights by 1 / relevance.
 
-    The first stage of an auxiliary particle filter (Pitt and Shephard 1999): more children where it
-    will pay, each counting for less, where weights are handed down (reweight=tempered, sequential).
-    reweight=annealed forgets them: then this only searches where relevance is high. floor:
-    relevance below it counts as it, since no child can make up for a parent never drawn.
+    The first stage of an auxiliary particle filter (Pitt and Shephard 1999). The weighted
+    distribution is unchanged: relevant regions get more children, each of less weight. This holds
+    where weights are carried on (reweight=tempered, sequential); reweight=annealed discards them,
+    so there it only concentrates the search.
+
+    Args:
+        resampler: The scheme that draws the ancestors.
+        floor: Lower bound of the relevance, in (0, 1]; it bounds the correction.
+
+    Raises:
+        UserError: `floor` is out of range.
     """
 
     def __init__(self, resampler: Resample, floor: float = 0.05) -> None:
@@ -46,7 +55,16 @@ class Guided:
         self.floor = floor
 
     def bind(self, scene: Scene, height: int, width: int) -> Resample:
-        """Return the resampler for these images."""
+        """Return the resampler for one scene.
+
+        Args:
+            scene: The encoded images, with a relevance map.
+            height: The images' height [px].
+            width: The images' width [px].
+
+        Raises:
+            UserError: The scene has no relevance map.
+        """
         if not isinstance(scene, HasRelevance):
             raise UserError(
                 "resample=guided: the method makes no map of relevance; choose a context that "
@@ -57,9 +75,8 @@ class Guided:
         def resample(
             particles: Particles, count: int, space: Space, generator: Generator
         ) -> Resampled:
-            preference = (
-                look_up(relevance, particles.state, height, width).clamp_min(self.floor).log()
-            )
+            values = gather_relevance(relevance, particles.state, height, width)
+            preference = values.clamp_min(self.floor).log()
             return self.draw(particles, preference, count, space, generator)
 
         return resample
@@ -73,20 +90,20 @@ class Guided:
         generator: Generator,
     ) -> Resampled:
         """Return children drawn by weight x exp(preference).  preference (B, M)."""
-        preferred = torch.log_softmax(particles.log_weights + preference, dim=1)
+        log_weights = torch.log_softmax(particles.log_weights + preference, dim=1)
         resampled = self.resampler(
-            particles._replace(log_weights=preferred), count, space, generator
+            particles._replace(log_weights=log_weights), count, space, generator
         )
         if resampled.shares is not None:
             raise UserError(
-                "resample=guided needs a resampler whose children have one parent "
+                "resample=guided needs a resampler whose children have one ancestor "
                 "each; choose systematic"
             )
-        undone = resampled.log_weights - preference.gather(1, resampled.ancestors)
-        return resampled._replace(log_weights=torch.log_softmax(undone, dim=1))
+        log_weights = resampled.log_weights - preference.gather(1, resampled.ancestors)
+        return resampled._replace(log_weights=torch.log_softmax(log_weights, dim=1))
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Refuse: without a scene there is no relevance."""
+        """Raise UserError: the relevance is known only after `bind`."""
         raise UserError("resample=guided must be bound to a scene before it draws")

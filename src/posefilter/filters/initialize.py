@@ -1,4 +1,4 @@
-"""Drawing the first cloud."""
+"""Initial distributions: states of the first particles."""
 
 import torch
 from torch import Generator, Tensor, nn
@@ -13,12 +13,12 @@ from posefilter.types import Batch
 
 
 def draw_cells(weight: Tensor, count: int, generator: Generator) -> Tensor:
-    """Draw cells of a map by weight, with replacement.
+    """Draw cells of a map with probability proportional to weight, with replacement.
 
     (B, h, w) >= 0 -> (B, count, 2) int64 as (column, row).
     """
-    pick = torch.multinomial(weight.flatten(1), count, replacement=True, generator=generator)
-    return torch.stack([pick % weight.shape[2], pick // weight.shape[2]], dim=-1)
+    index = torch.multinomial(weight.flatten(1), count, replacement=True, generator=generator)
+    return torch.stack([index % weight.shape[2], index // weight.shape[2]], dim=-1)
 
 
 def draw_from_depth(
@@ -30,13 +30,22 @@ def draw_from_depth(
     prior: Tensor | None = None,
     behind: tuple[float, float] = (0.1, 0.9),
 ) -> Tensor:
-    """Draw poses at measured points: uniform rotations, the center pushed along the ray behind the
-    surface.
+    """Draw poses at measured points: uniform rotations, centers on the ray behind the surface.
 
-    depth (B, 1, H, W) [m]; K (B, 3, 3) [px]; prior (B, 1, H, W) >= 0, how likely the object is at
-    each pixel (uniform if None); behind: by how many radii, uniformly -> (B, count, 4, 4) [m]. An
-    image in which nothing was measured, or nothing where the prior allows it, counts as 1 m away
-    everywhere: the start must be somewhere.
+    An image without a measured point, or with none where the prior is positive, counts as 1 m deep
+    everywhere.
+
+    Args:
+        depth: (B, 1, H, W) z-depth [m], 0 where unknown.
+        K: (B, 3, 3) camera matrices [px].
+        space: Gives the object's center and radius.
+        count: Poses of an image.
+        generator: Source of randomness.
+        prior: (B, 1, H, W) >= 0, weight of each pixel; uniform if None.
+        behind: Range of the center's distance behind the surface, in radii; drawn uniformly.
+
+    Returns:
+        Poses (B, count, 4, 4), camera_from_object [m].
     """
     weight = (depth[:, 0] > 0).to(depth.dtype)
     if prior is not None:
@@ -46,17 +55,19 @@ def draw_from_depth(
     cell = draw_cells(
         torch.where(empty[:, None, None], torch.ones_like(weight), weight), count, generator
     )
-    at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
+    depth_at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
     ray = rays(cell.to(depth.dtype), K)
-    push = torch.empty_like(at).uniform_(*behind, generator=generator) * space.radius
-    center = ray * at + ray / ray.norm(dim=-1, keepdim=True) * push
+    push = torch.empty_like(depth_at).uniform_(*behind, generator=generator) * space.radius
+    center = ray * depth_at + ray / ray.norm(dim=-1, keepdim=True) * push
     R = random_rotation(*center.shape[:2], generator=generator, device=depth.device)
     return pose_about(R, center, depth.new_tensor(space.center))
 
 
-def pose_space(method: Method, choice: str) -> PoseSpace:
-    """Return the method's space if its particles are poses; raise UserError, naming the choice, if
-    not.
+def require_pose_space(method: Method, choice: str) -> PoseSpace:
+    """Return the method's space.
+
+    Raises:
+        UserError: The method's particles are not poses; the message names the choice.
     """
     if not isinstance(method.space, PoseSpace):
         raise UserError(
@@ -66,7 +77,7 @@ def pose_space(method: Method, choice: str) -> PoseSpace:
     return method.space
 
 
-def must_be_pixels(method: Method, choice: str) -> None:
+def require_pixel_space(method: Method, choice: str) -> None:
     """Raise UserError, naming the choice, if the method's particles are poses."""
     if isinstance(method.space, PoseSpace):
         raise UserError(
@@ -76,13 +87,13 @@ def must_be_pixels(method: Method, choice: str) -> None:
 
 
 class UniformPixels:
-    """Pixels uniformly over the image."""
+    """Pixels drawn uniformly over the image."""
 
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
-        """Return (B, N, 2) [px], from the frame's outer edge to its outer edge."""
-        must_be_pixels(method, "uniform")
+        """Return (B, N, 2) [px], over the whole area of the image's pixels."""
+        require_pixel_space(method, "uniform")
         B, _, H, W = batch.rgb.shape
         share = torch.rand(B, particles, 2, generator=generator, device=batch.rgb.device)
         return share * share.new_tensor([W, H]) - 0.5
@@ -91,7 +102,8 @@ class UniformPixels:
 class FromDepth:
     """Poses at measured points of the image, with uniform rotations.
 
-    behind: how many radii the object's center lies behind the surface, drawn uniformly.
+    Args:
+        behind: Range of the center's distance behind the surface, in radii; drawn uniformly.
     """
 
     def __init__(self, behind: tuple[float, float] = (0.1, 0.9)) -> None:
@@ -101,16 +113,17 @@ class FromDepth:
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
-        space = pose_space(method, "from_depth")
+        space = require_pose_space(method, "from_depth")
         return draw_from_depth(
             batch.depth, batch.intrinsics, space, particles, generator, behind=self.behind
         )
 
 
 class FromRelevance:
-    """Pixels where the scene's own map says that it matters (the paper, section 6, idea 4).
+    """Pixels drawn from the scene's relevance map (the paper, section 6, idea 4).
 
-    anywhere: the share of the draws that ignores the map, so that no place is out of reach.
+    Args:
+        anywhere: Share of the uniform distribution mixed in, so that every pixel can be drawn.
     """
 
     def __init__(self, anywhere: float = 0.1) -> None:
@@ -119,8 +132,8 @@ class FromRelevance:
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
-        """Return (B, N, 2) [px], uniform within the drawn cells."""
-        must_be_pixels(method, "from_relevance")
+        """Return (B, N, 2) [px], uniform within each drawn cell."""
+        require_pixel_space(method, "from_relevance")
         if not isinstance(scene, HasRelevance):
             raise UserError(
                 f"initialize=from_relevance: {type(method).__name__} makes no map of "
@@ -153,11 +166,15 @@ class FromProposals:
 
 
 class Informed(nn.Module):
-    """In training, start a share of the pixels on or around the object (the paper, section 4.3);
-    else as `otherwise` does.
+    """In training, draw a share of the pixels around the object (the paper, section 4.3).
 
-    The mask is the truth, so it is read in training mode only: in evaluation every particle starts
-    as `otherwise` says. around_px: standard deviation by which they miss the mask's pixels.
+    The mask is ground truth, so it is used in training mode only. In evaluation mode all particles
+    come from `otherwise`.
+
+    Args:
+        otherwise: Draws all other particles.
+        share: Share of the particles drawn around the object.
+        around_px: Standard deviation of their distance from the mask's pixels [px].
     """
 
     def __init__(self, otherwise: Initialize, share: float = 0.5, around_px: float = 10.0) -> None:
@@ -172,13 +189,13 @@ class Informed(nn.Module):
         count = round(self.share * particles)
         if not self.training or count == 0:
             return state
-        must_be_pixels(method, "informed")
+        require_pixel_space(method, "informed")
         mask = batch.mask[:, 0].to(state.dtype)
-        seen = (mask > 0).flatten(1).any(1)[:, None, None]
-        near = draw_cells(torch.where(seen, mask, torch.ones_like(mask)), count, generator).to(
+        visible = (mask > 0).flatten(1).any(1)[:, None, None]
+        near = draw_cells(torch.where(visible, mask, torch.ones_like(mask)), count, generator).to(
             state.dtype
         )
         near = near + self.around_px * torch.randn(
             near.shape, generator=generator, device=state.device
         )
-        return torch.cat([torch.where(seen, near, state[:, :count]), state[:, count:]], dim=1)
+        return torch.cat([torch.where(visible, near, state[:, :count]), state[:, count:]], dim=1)

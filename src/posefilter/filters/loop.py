@@ -1,12 +1,28 @@
-"""The particle filter that every method shares.  Read this page, then protocols.py: the rest of the
-project is pieces.
+"""The particle filter that every method shares.
 
-scene = method.encode(batch)                              once an image
-cloud = initialize(...)                                    a first guess, all weights equal
-repeat:  reading = method.measure(scene, cloud, step)         what does each particle see?
-         cloud   = reweight(...)                            believe those that see the object
-         children = resample(...), cloud = propagate(...)    more of those, moved a little
-belief = refine(estimate(...))                             the last word
+The algorithm is the bootstrap filter of Gordon, Salmond and Smith (1993), in the general form of
+Doucet and Johansen (2009, section 4) and Chopin and Papaspiliopoulos (2020, chapter 10):
+
+    scene = encode(image)
+    x[1], w[1] = initialize(N), 1 / N
+    for t = 1 ... T:
+        if t > 1:
+            a = resample(w, N)                       ancestors
+            x[t] = propagate(x[t - 1][a])
+        g = measure(scene, x[t])                     log-likelihood, displacement, pose, latent
+        w[t] = normalize(reweight(w, g))
+    belief = refine(estimate(x[T], w[T]))
+
+Each verb is one component that is passed in; posefilter/protocols.py defines them all. Here t is an
+iteration over one image, or the next image of a sequence. The log of the weights' sum before they
+are normalized is the step's log evidence; with sequential weights their total estimates log p(y).
+
+References:
+    Gordon, Salmond, Smith: Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
+        IEE Proceedings F 140 (1993).
+    Doucet, Johansen: A tutorial on particle filtering and smoothing: fifteen years later. Handbook
+        of Nonlinear Filtering (2009).
+    Chopin, Papaspiliopoulos: An Introduction to Sequential Monte Carlo. Springer (2020).
 """
 
 import math
@@ -15,7 +31,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.guided import bound
+from posefilter.filters.guided import bind_to_scene
 from posefilter.protocols import (
     Estimate,
     Initialize,
@@ -31,14 +47,25 @@ from posefilter.types import Batch, ParticleOutput, Particles, Resampled, Step, 
 
 
 class ParticleFilter(nn.Module):
-    """Weighted particles, read, reweighed, resampled and moved for a number of steps.
+    """A particle filter: measure, reweight, resample and propagate weighted particles.
 
-    Keeps no tensor between calls, and draws all that is random from the generator it is given.
-    Differentiable from the belief back to the likelihood and the displacement, as far as the chosen
-    pieces allow it.
+    It keeps no tensor between calls, and all randomness comes from the generator of the call. The
+    belief is differentiable in likelihoods and displacements as far as the chosen components are.
 
-    particles: in every cloud, but for the first where `first_particles` says otherwise: a wide
-    search is only needed once. steps: how many clouds are read.
+    Args:
+        particles: Number of particles, N.
+        steps: Number of measurements, T.
+        initialize: Draws the first states.
+        schedule: Gives each step's noise level.
+        reweight: Turns likelihoods into weights.
+        resample: Draws ancestors.
+        propagate: Moves the resampled states.
+        estimate: Chooses one pose of the last particles.
+        refine: Improves the estimate.
+        first_particles: Number of particles at the first step; `particles` if None.
+
+    Raises:
+        UserError: A number is below 1.
     """
 
     def __init__(
@@ -67,17 +94,29 @@ class ParticleFilter(nn.Module):
         self.estimate, self.refine = estimate, refine
 
     def forward(self, batch: Batch, method: Method, generator: Generator) -> Trace:
-        """Run the filter over B images at once; none of them sees another."""
+        """Run the filter on B images at once, each independent of the others.
+
+        Args:
+            batch: The images.
+            method: Encodes images and measures particles.
+            generator: Source of all randomness.
+
+        Returns:
+            Particles and outputs of every step, the log evidence (B, T), and the belief.
+
+        Raises:
+            FloatingPointError: All weights of an image are zero, or not numbers.
+        """
         scene = method.encode(batch)
         state = self.initialize(batch, scene, method, self.first_particles, generator)
         particles = make_particles(state, method.latent_width)
         inherited = torch.zeros_like(particles.log_weights)
-        timetable = self.timetable(state)
-        resample = bound(self.resample, scene, batch)
+        steps = self.make_steps(state)
+        resample = bind_to_scene(self.resample, scene, batch)
         history: list[Particles] = []
         outputs: list[ParticleOutput] = []
         evidence: list[Tensor] = []
-        for step in timetable:
+        for step in steps:
             if outputs:
                 resampled = resample(particles, self.particles, method.space, generator)
                 state = inherit(particles.state, resampled, method.space)
@@ -88,19 +127,19 @@ class ParticleFilter(nn.Module):
                 particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
             output = method.measure(scene, particles, step, generator)
             log_weights = self.reweight(particles.log_weights, output.log_likelihood, inherited)
-            total = log_weights.logsumexp(1)
-            particles = particles._replace(log_weights=log_weights - total[:, None])
+            increment = log_weights.logsumexp(1)
+            particles = particles._replace(log_weights=log_weights - increment[:, None])
             history.append(particles)
             outputs.append(output)
-            evidence.append(total)
+            evidence.append(increment)
         log_evidence = torch.stack(evidence, dim=1)
-        check_alive(log_evidence)
+        check_finite(log_evidence)
         belief = self.estimate(history[-1], outputs[-1], scene, method, generator)
         belief = self.refine(belief, scene, method, generator)
-        return Trace(tuple(history), tuple(outputs), timetable, belief, log_evidence)
+        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence)
 
-    def timetable(self, like: Tensor) -> tuple[Step, ...]:
-        """Return what each step is told of where it stands; `like` gives device and precision."""
+    def make_steps(self, like: Tensor) -> tuple[Step, ...]:
+        """Return the steps with their noise levels, in the dtype and on the device of `like`."""
         levels = self.schedule(self.steps)
         return tuple(
             Step(number, self.steps, like.new_tensor(sigma)) for number, sigma in enumerate(levels)
@@ -108,7 +147,7 @@ class ParticleFilter(nn.Module):
 
 
 def make_particles(state: Tensor, latent_width: int) -> Particles:
-    """Give each particle an equal weight and an empty latent.  (B, N, *S) -> Particles."""
+    """Return particles of equal weight with a latent of zeros.  (B, N, *S) -> Particles."""
     B, N = state.shape[:2]
     latent = state.new_zeros(B, N, latent_width)
     log_weights = state.new_full((B, N), -math.log(N))
@@ -116,10 +155,10 @@ def make_particles(state: Tensor, latent_width: int) -> Particles:
 
 
 def inherit(values: Tensor, resampled: Resampled, space: Space | None = None) -> Tensor:
-    """Hand parents' values down to their children.  (B, M, *V) -> (B, N, *V).
+    """Return the values of each child's ancestor.  (B, M, *V) -> (B, N, *V).
 
-    Where children are mixes, values are averaged by their shares: as `space` averages states, or
-    plainly if it is None.
+    Where children are mixtures of particles (`resampled.shares`), their values are weighted means:
+    those of `space` for states, arithmetic ones if it is None.
     """
     if resampled.shares is None:
         index = resampled.ancestors[(...,) + (None,) * (values.dim() - 2)]
@@ -129,16 +168,13 @@ def inherit(values: Tensor, resampled: Resampled, space: Space | None = None) ->
     return resampled.shares @ values
 
 
-def check_alive(log_evidence: Tensor) -> None:
-    """Raise FloatingPointError if at some step an image's weights were all zero, or not numbers.
-
-    (B, T).
-    """
-    dead = ~log_evidence.isfinite()
-    if bool(dead.any()):
-        image, step = dead.nonzero()[0].tolist()
+def check_finite(log_evidence: Tensor) -> None:
+    """Raise FloatingPointError where the log evidence (B, T) is not finite."""
+    failed = ~log_evidence.isfinite()
+    if bool(failed.any()):
+        image, step = failed.nonzero()[0].tolist()
         raise FloatingPointError(
-            f"the particle filter died at step {step} (image {image} of the batch): the log "
+            f"the particle filter failed at step {step} (image {image} of the batch): the log "
             f"weights sum to "
             f"{log_evidence[image, step].item()}, so the likelihood is not finite or zero "
             f"everywhere"

@@ -1,4 +1,4 @@
-"""The modes of a belief: the poses round which its weight gathers, and how much of it each has."""
+"""The modes of a belief: the poses around which its weight concentrates."""
 
 from typing import NamedTuple
 
@@ -10,28 +10,37 @@ from posefilter.protocols import Space
 
 
 class Modes(NamedTuple):
-    """The modes of one cloud, the heaviest first; every particle belongs to one."""
+    """The modes of one set of particles, by falling weight; every particle belongs to one."""
 
-    states: Tensor  # (M, *S) the densest particle of each
-    weights: Tensor  # (M,) of the particles that belong to it; they sum to 1
+    states: Tensor  # (M, *S) the particle of highest density of each
+    weights: Tensor  # (M,) total weight of its particles; sums to 1
     member: Tensor  # (N,) int64, which mode each particle belongs to
 
 
 def find_modes(
     state: Tensor, log_weights: Tensor, space: Space, bandwidth: float, reach: float = 3.0
 ) -> Modes:
-    """Split a weighted cloud into its modes by quick shift (Vedaldi & Soatto 2008).
+    """Cluster weighted particles by quick shift (Vedaldi and Soatto 2008).
 
-    Every particle follows the nearest one in denser surroundings, if there is one within `reach`
-    bandwidths; those that follow nobody are the modes. So a mode is always a particle, never a mean
-    that nobody voted for, and no number of modes is asked for. (N, *S), (N,); bandwidth: of the
-    Gaussian kernel, in the space's unit.
+    Each particle follows the nearest particle of higher kernel density within `reach` bandwidths.
+    Particles that follow none are the modes, so a mode is always a particle. The number of modes
+    need not be known.
+
+    Args:
+        state: (N, *S) particles.
+        log_weights: (N,), normalized here.
+        space: The space of the particles.
+        bandwidth: Of the Gaussian kernel, in the space's unit.
+        reach: Largest distance to a leader, in bandwidths.
+
+    Returns:
+        The modes, by falling weight.
     """
     weights = torch.softmax(log_weights.double(), 0)
     density = kernel_mass(state[None], weights.log()[None], space, bandwidth)[0]
     order = torch.argsort(density, descending=True, stable=True)
-    leader = _leaders(state[order], space, reach * bandwidth)
-    # leaders have leaders: jump to the end of the chain
+    leader = _find_leaders(state[order], space, reach * bandwidth)
+    # pointer jumping: follow each chain to its root
     while not torch.equal(leader, leader[leader]):
         leader = leader[leader]
     root, member = leader.unique(return_inverse=True)
@@ -44,15 +53,16 @@ def find_modes(
     return Modes(state[order][root[rank]], mass[rank], back)
 
 
-def _leaders(state: Tensor, space: Space, far: float, chunk: int = 1 << 20) -> Tensor:
-    """Return whom each particle, the densest first, follows: itself, where none before it is within
-    `far`.  -> (N,).
+def _find_leaders(state: Tensor, space: Space, reach: float, chunk: int = 1 << 20) -> Tensor:
+    """Return the index of the particle that each one follows, itself if there is none.  -> (N,).
+
+    Particles are sorted by falling density, so only earlier ones are candidates.
     """
-    number = torch.arange(len(state), device=state.device)
+    index = torch.arange(len(state), device=state.device)
     parts = []
-    for some in number.split(max(1, chunk // len(state))):
-        distance = space.distance(state[some][:, None], state[None])
-        distance = distance.masked_fill(number[None] >= some[:, None], torch.inf)
-        least, nearest = distance.min(1)
-        parts.append(torch.where(least <= far, nearest, some))
+    for block in index.split(max(1, chunk // len(state))):
+        distance = space.distance(state[block][:, None], state[None])
+        distance = distance.masked_fill(index[None] >= block[:, None], torch.inf)
+        shortest, nearest = distance.min(1)
+        parts.append(torch.where(shortest <= reach, nearest, block))
     return torch.cat(parts)

@@ -1,4 +1,4 @@
-"""Moving the children of a resampling.
+"""Transition kernels: moving the resampled particles.
 
 `state` (B, N, *S), `displacement` (B, N, D) -> moved states (B, N, *S).
 """
@@ -15,18 +15,22 @@ from posefilter.types import Step
 
 
 class Identity:
-    """Leave every particle where it is."""
+    """Leave every particle at its state."""
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
-        """Return the states as they are."""
+        """Return the states unchanged."""
         return state
 
 
 class Gaussian:
-    """Diffuse by `factor` x the step's noise level; the space says what that is in each of its
-    axes.
+    """Gaussian random walk with standard deviation `factor` x the step's noise level.
+
+    The space defines the standard deviation along each tangent axis.
+
+    Args:
+        factor: Standard deviation over the noise level.
     """
 
     def __init__(self, factor: float = 0.4) -> None:
@@ -45,7 +49,7 @@ class Gaussian:
 
 
 class LearnedDisplacement:
-    """Go where the method's network says."""
+    """Move each particle by the displacement that the method's network predicts."""
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
@@ -55,8 +59,12 @@ class LearnedDisplacement:
 
 
 class HalfTurns:
-    """Turn a share of the poses by pi about a random axis of the object through its center, so that
-    flips are found.
+    """Rotate a share of the poses by pi about a random axis of the object through its center.
+
+    A move between the modes of nearly symmetric objects.
+
+    Args:
+        share: Probability that a particle is rotated.
     """
 
     def __init__(self, share: float = 0.1) -> None:
@@ -65,14 +73,17 @@ class HalfTurns:
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
-        """Return the states, some turned."""
+        """Return the states, some rotated."""
         return half_turns(state, space, generator, self.share)
 
 
 def half_turns(poses: Tensor, space: Space, generator: Generator, share: float = 1.0) -> Tensor:
-    """Turn a share of poses by pi about a random object axis through its center.
+    """Rotate a share of poses by pi about a random object axis through the object's center.
 
     (B, N, 4, 4) -> (B, N, 4, 4).
+
+    Raises:
+        UserError: The particles are not poses.
     """
     if space.dimensions != 6:
         raise UserError(
@@ -81,13 +92,13 @@ def half_turns(poses: Tensor, space: Space, generator: Generator, share: float =
         )
     B, N = poses.shape[:2]
     axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
-    chosen = torch.rand(B, N, generator=generator, device=poses.device) < share
-    turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * chosen[..., None]
+    flip = torch.rand(B, N, generator=generator, device=poses.device) < share
+    turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * flip[..., None]
     return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
 class Chain:
-    """Apply several proposals one after the other."""
+    """Apply several kernels one after the other."""
 
     def __init__(self, pieces: Iterable[Propagate]) -> None:
         self.pieces = list(pieces)
@@ -95,7 +106,7 @@ class Chain:
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
-        """Return the states that the last piece leaves."""
+        """Return the states that the last kernel leaves."""
         for piece in self.pieces:
             state = piece(state, displacement, step, space, generator)
         return state

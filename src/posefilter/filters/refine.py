@@ -1,6 +1,4 @@
-"""Polishing an estimate: scoring the best few particles with more care, then a mean shift, or a
-climb of the gradient.
-"""
+"""Refinement of the estimate: rescoring particles, mean shift, gradient ascent."""
 
 from collections.abc import Iterable
 
@@ -13,12 +11,12 @@ from posefilter.types import Belief
 
 
 class NoRefine:
-    """Leave the estimate as it is."""
+    """Leave the estimate unchanged."""
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return the belief."""
+        """Return the belief unchanged."""
         return belief
 
 
@@ -31,13 +29,13 @@ class Chain:
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return what the last piece makes of it."""
+        """Return the belief after the last refinement."""
         for piece in self.pieces:
             belief = piece(belief, scene, method, generator)
         return belief
 
 
-def scorer(method: Method) -> ScoresPoses:
+def require_scorer(method: Method) -> ScoresPoses:
     """Return the method as one that scores poses; raise UserError if it cannot."""
     if not isinstance(method, ScoresPoses):
         raise UserError(
@@ -46,15 +44,15 @@ def scorer(method: Method) -> ScoresPoses:
     return method
 
 
-def candidates(belief: Belief, count: int) -> Tensor:
-    """Return the estimate, and the `count` particles of most weight.  -> (B, 1 + count, 4, 4)."""
+def top_poses(belief: Belief, count: int) -> Tensor:
+    """Return the estimate and the `count` particles of highest weight.  -> (B, 1 + count, 4, 4)."""
     top = belief.log_weights.topk(min(count, belief.log_weights.shape[1]), dim=1).indices
     rows = torch.arange(len(top), device=top.device)[:, None]
     return torch.cat([belief.best[:, None], belief.poses[rows, top]], dim=1)
 
 
-def bet_on_highest(belief: Belief, poses: Tensor, scores: Tensor) -> Belief:
-    """Return the belief with the highest-scored pose as its estimate.  (B, C, 4, 4), (B, C)."""
+def select_best(belief: Belief, poses: Tensor, scores: Tensor) -> Belief:
+    """Return the belief with the pose of highest score as its estimate.  (B, C, 4, 4), (B, C)."""
     score, index = scores.max(1)
     return belief._replace(
         best=poses[torch.arange(len(index), device=index.device), index], score=score
@@ -62,8 +60,12 @@ def bet_on_highest(belief: Belief, poses: Tensor, scores: Tensor) -> Belief:
 
 
 class Rescore:
-    """Score the estimate and the `top` heaviest particles at `sigma` with many pixels, and bet on
-    the best of them.
+    """Score the estimate and the heaviest particles again with more pixels, and select the best.
+
+    Args:
+        top: Particles to score.
+        pixels: Image points for each score.
+        sigma: Noise level of the likelihood [m].
     """
 
     def __init__(self, top: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
@@ -72,23 +74,30 @@ class Rescore:
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return the belief with a better-founded estimate."""
-        poses = candidates(belief, self.top)
+        """Return the belief with the pose of highest score as its estimate."""
+        scorer, poses = require_scorer(method), top_poses(belief, self.top)
         with torch.no_grad():
-            scores = scorer(method).score_poses(scene, poses, self.sigma, generator, self.pixels)
-        return bet_on_highest(belief, poses, scores)
+            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+        return select_best(belief, poses, scores)
 
 
 class MeanShift:
-    """Go to the mean of the poses around the estimate, weighed by their likelihood, in rounds
-    (Comaniciu and Meer 2002).
+    """Shift the estimate to the likelihood-weighted mean around it (Comaniciu and Meer 2002).
 
-    A learned likelihood is flat and bumpy at its top, where a climb stops at a bump; the mean over
-    a neighborhood does not, and it is the estimate of least squared error.
+    A learned likelihood is flat and noisy at its maximum, where gradient ascent stops at a local
+    maximum. The mean over a neighborhood does not, and it has the least expected squared error.
+    Perturbations come in antithetic pairs, so a constant likelihood leaves the estimate in place.
 
-    pairs: poses drawn to either side of the estimate; start, end: their spread [m on the object's
-    surface] in the first and the last round, geometric between; sigma: noise level of the
-    likelihood [m]; pixels: drawn anew each round.
+    Args:
+        rounds: Number of shifts.
+        pairs: Antithetic pairs of perturbations in a round.
+        start: Standard deviation in the first round [m on the object's surface].
+        end: Standard deviation in the last round; geometric between.
+        sigma: Noise level of the likelihood [m].
+        pixels: Image points for each score, drawn anew in each round.
+
+    Raises:
+        UserError: A number is out of range.
     """
 
     def __init__(
@@ -112,36 +121,35 @@ class MeanShift:
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return the belief with the estimate shifted."""
-        judge, best = scorer(method), belief.best
-        for round_ in range(self.rounds):
-            spread = self.start * (self.end / self.start) ** (round_ / max(self.rounds - 1, 1))
+        """Return the belief with the estimate shifted; without gradient."""
+        scorer, best = require_scorer(method), belief.best
+        for index in range(self.rounds):
+            spread = self.start * (self.end / self.start) ** (index / max(self.rounds - 1, 1))
             scale = method.space.noise_scale(best.new_tensor(spread))
-            draw = torch.randn(
-                len(best),
-                self.pairs,
-                method.space.dimensions,
-                generator=generator,
-                device=best.device,
-                dtype=best.dtype,
-            )
-            # pairs: an even likelihood then moves the estimate nowhere
-            moves = torch.cat([draw, -draw], dim=1) * scale
+            shape = (len(best), self.pairs, method.space.dimensions)
+            noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)
+            moves = torch.cat([noise, -noise], dim=1) * scale
             poses = method.space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
-            weights = judge.score_poses(scene, poses, self.sigma, generator, self.pixels).softmax(1)
-            best = method.space.move(best, (weights[..., None] * moves).sum(1))
-        score = judge.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
+            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            best = method.space.move(best, (scores.softmax(1)[..., None] * moves).sum(1))
+        score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
         return belief._replace(best=best, score=score)
 
 
 class Gradient:
-    """Climb the score by Adam on the pose's tangent, from the estimate and the heaviest other
-    particles.
+    """Maximize the score by Adam (Kingma and Ba 2015) on the pose's tangent.
 
-    starts: poses that climb side by side; lr: the first steps' length on the object's surface [m],
-    falling linearly to 0; sigma: noise level of the score climbed [m]; pixels: drawn anew at each
-    step; final_pixels: for the last comparison, at `final_sigma`, in which the unrefined estimate
-    takes part, so that it is only left for something that scores higher.
+    It starts from the estimate and the heaviest particles. The unrefined estimate takes part in the
+    last comparison, so it is replaced only by a pose of higher score.
+
+    Args:
+        steps: Number of gradient steps.
+        lr: Length of the first steps on the object's surface [m]; falls linearly to 0.
+        sigma: Noise level of the score that is maximized [m].
+        pixels: Image points for each score, drawn anew at each step.
+        starts: Poses to start from.
+        final_pixels: Image points for the last comparison.
+        final_sigma: Noise level of the last comparison [m].
     """
 
     def __init__(
@@ -160,23 +168,29 @@ class Gradient:
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return the belief with a refined estimate, without gradient."""
-        judge = scorer(method)
+        """Return the belief with a refined estimate; without gradient.
+
+        Raises:
+            UserError: Gradients are disabled by inference mode, or the method scores no poses.
+        """
+        scorer = require_scorer(method)
         if torch.is_inference_mode_enabled():
             raise UserError(
-                "refine: climbing the score needs gradients; set trainer.inference_mode=false"
+                "refine: gradient ascent needs gradients; set trainer.inference_mode=false"
             )
-        start = candidates(belief, self.starts - 1).detach()
-        found = self.climb(start, scene, method, judge, generator)
-        poses = torch.cat([start[:, :1], found], dim=1)
+        start = top_poses(belief, self.starts - 1).detach()
+        refined = self.climb(start, scene, method, scorer, generator)
+        poses = torch.cat([start[:, :1], refined], dim=1)
         with torch.no_grad():
-            scores = judge.score_poses(scene, poses, self.final_sigma, generator, self.final_pixels)
-        return bet_on_highest(belief, poses, scores)
+            scores = scorer.score_poses(
+                scene, poses, self.final_sigma, generator, self.final_pixels
+            )
+        return select_best(belief, poses, scores)
 
     def climb(
-        self, start: Tensor, scene: Scene, method: Method, judge: ScoresPoses, generator: Generator
+        self, start: Tensor, scene: Scene, method: Method, scorer: ScoresPoses, generator: Generator
     ) -> Tensor:
-        """Return where each pose climbs to.  (B, C, 4, 4) -> (B, C, 4, 4)."""
+        """Return the poses after gradient ascent.  (B, C, 4, 4) -> (B, C, 4, 4)."""
         # a turn counts as the shift at the radius
         unit = method.space.noise_scale(start.new_tensor(self.lr)) / self.lr
         with torch.enable_grad():
@@ -187,7 +201,7 @@ class Gradient:
             for step in range(self.steps):
                 adam.param_groups[0]["lr"] = self.lr * (1 - step / self.steps)
                 poses = method.space.move(start, x * unit)
-                score = judge.score_poses(scene, poses, self.sigma, generator, self.pixels)
+                score = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
                 # of x alone: the network's own gradients stay untouched
                 (x.grad,) = torch.autograd.grad(-score.sum(), x)
                 adam.step()

@@ -1,6 +1,7 @@
-"""Drawing children from a weighted cloud.
+"""Resampling schemes: drawing ancestors from weighted particles.
 
-Each keeps the weighted mean: exactly or in expectation (tests/laws).
+Each scheme keeps weighted means, exactly or in expectation (tests/laws). For a comparison see Douc,
+Cappe and Moulines (2005), and Chopin and Papaspiliopoulos (2020, chapter 9).
 """
 
 import math
@@ -13,93 +14,95 @@ from posefilter.protocols import Resample, Space
 from posefilter.types import Particles, Resampled
 
 
-def effective_size(log_weights: Tensor) -> Tensor:
-    """Return the effective sample size 1 / sum w^2, from 1 (one particle has it all) to N (all
-    alike).  (B, N) -> (B,).
+def effective_sample_size(log_weights: Tensor) -> Tensor:
+    """Return the effective sample size 1 / sum w^2 (Kong, Liu and Wong 1994).
+
+    It is 1 where one particle has all the weight, N where weights are equal.  (B, N) -> (B,).
     """
     return torch.exp(-torch.logsumexp(2 * log_weights, dim=1))
 
 
-def draw(log_weights: Tensor, places: Tensor) -> Tensor:
-    """Look up whose share of the weight each place falls into.
+def inverse_cdf(log_weights: Tensor, uniforms: Tensor) -> Tensor:
+    """Return the ancestors at given values of the weights' cumulative distribution.
 
-    (B, M) normalized, (B, N) in [0, 1) -> (B, N) int64.
+    (B, M) normalized log weights, (B, N) in [0, 1) -> (B, N) int64.
     """
     sums = log_weights.detach().double().exp().cumsum(1)
-    places = places.double() * sums[:, -1:]
-    found = torch.searchsorted(sums, places.clamp_max(sums[:, -1:] * (1 - 1e-15)), right=True)
+    uniforms = uniforms.double() * sums[:, -1:]
+    found = torch.searchsorted(sums, uniforms.clamp_max(sums[:, -1:] * (1 - 1e-15)), right=True)
     return found.clamp_max(log_weights.shape[1] - 1)
 
 
-class Fair:
-    """Base of the classic schemes: a child's parent is drawn by weight, and all children start
-    alike.
+class InverseCDF:
+    """Base of unbiased schemes: ancestors are the inverse CDF at N points of the unit interval.
 
-    Without gradient to the weights: which parent is drawn is a choice, not a function.
+    Children have equal weights. There is no gradient in the weights, since the choice of an
+    ancestor is discrete.
     """
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
         """Return children of equal weight."""
-        places = self.places(
-            len(particles.log_weights), count, generator, particles.log_weights.device
-        )
-        ancestors = draw(particles.log_weights, places)
-        return Resampled(
-            ancestors, particles.log_weights.new_full(ancestors.shape, -math.log(count))
-        )
+        log_w = particles.log_weights
+        uniforms = self.uniforms(len(log_w), count, generator, log_w.device)
+        ancestors = inverse_cdf(log_w, uniforms)
+        return Resampled(ancestors, log_w.new_full(ancestors.shape, -math.log(count)))
 
-    def places(
+    def uniforms(
         self, rows: int, particles: int, generator: Generator, device: torch.device
     ) -> Tensor:
-        """Return where on the unit interval to look, (rows, particles)."""
+        """Return points of the unit interval, (rows, particles)."""
         raise NotImplementedError
 
 
-class Multinomial(Fair):
-    """Independent draws: the textbook's bootstrap filter (Gordon et al. 1993), with the largest
-    variance.
-    """
+class Multinomial(InverseCDF):
+    """Independent draws, as in the bootstrap filter (Gordon et al. 1993); the largest variance."""
 
-    def places(
+    def uniforms(
         self, rows: int, particles: int, generator: Generator, device: torch.device
     ) -> Tensor:
-        """Return independent uniform places."""
+        """Return independent uniforms."""
         return torch.rand(rows, particles, generator=generator, device=device)
 
 
-class Stratified(Fair):
-    """One uniform draw in each N-th of the unit interval (Kitagawa 1996)."""
+class Stratified(InverseCDF):
+    """One uniform in each of N equal strata (Kitagawa 1996)."""
 
-    def places(
+    def uniforms(
         self, rows: int, particles: int, generator: Generator, device: torch.device
     ) -> Tensor:
-        """Return one uniform place in each stratum."""
+        """Return one uniform of each stratum."""
         u = torch.rand(rows, particles, generator=generator, device=device)
         return (torch.arange(particles, device=device) + u) / particles
 
 
-class Systematic(Fair):
-    """A comb with one random offset (Carpenter et al. 1999): a particle of weight w has floor(N w)
-    or ceil(N w) children.
+class Systematic(InverseCDF):
+    """One uniform offset for all strata (Carpenter, Clifford and Fearnhead 1999).
+
+    A particle of weight w has floor(N w) or ceil(N w) children.
     """
 
-    def places(
+    def uniforms(
         self, rows: int, particles: int, generator: Generator, device: torch.device
     ) -> Tensor:
-        """Return a comb with an offset an image."""
+        """Return evenly spaced points with one random offset for each image."""
         u = torch.rand(rows, 1, generator=generator, device=device)
         return (torch.arange(particles, device=device) + u) / particles
 
 
 class Soft:
-    """Draw from a mixture of the weights (share alpha) and the uniform, and weigh the children by
-    what that distorts.
+    """Soft resampling: draw from a mixture of the weights and the uniform (Karkus et al. 2018).
 
-    Their weights w / q carry the gradient back to the parents' (Karkus et al. 2018). Here q is held
-    fixed in it: then the gradient of a weighted mean is right in expectation, even at alpha = 1
-    (Scibior and Wood 2021); else it is not. alpha: 1 is fair, 0 ignores weights.
+    With proposal q = alpha w + (1 - alpha) / M, children have the importance weights w / q, which
+    carry gradients to their ancestors' weights. Here q is detached. At alpha = 1 the gradient of a
+    weighted mean is then unbiased (Scibior and Wood 2021); otherwise it need not be.
+
+    Args:
+        alpha: Share of the weights in the mixture; 1 is unbiased resampling, 0 ignores the weights.
+
+    Raises:
+        UserError: `alpha` is out of [0, 1].
     """
 
     def __init__(self, alpha: float = 0.5) -> None:
@@ -111,7 +114,7 @@ class Soft:
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return children whose weights are normalized."""
+        """Return children with normalized importance weights."""
         log_w = particles.log_weights
         mixed = self.alpha * log_w.detach().exp() + (1 - self.alpha) / log_w.shape[1]
         log_q = mixed.clamp_min(torch.finfo(mixed.dtype).tiny).log()
@@ -122,12 +125,16 @@ class Soft:
 
 
 class NoResampling:
-    """Keep every particle and its weight."""
+    """Keep every particle and its weight: sequential importance sampling."""
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return each particle as its own child."""
+        """Return each particle as its own child.
+
+        Raises:
+            UserError: `count` differs from the number of particles.
+        """
         B, M = particles.log_weights.shape
         if count != M:
             raise UserError(
@@ -140,10 +147,14 @@ class NoResampling:
 
 
 class BelowESS:
-    """Resample an image's cloud only where its effective sample size is below a share of its
-    particles; else keep it.
+    """Adaptive resampling: only where the effective sample size is low (Liu and Chen 1995).
 
-    Each image of a batch decides for itself. A cloud whose size must change is always resampled.
+    Each image of a batch is treated independently. If the number of particles changes, all images
+    are new.
+
+    Args:
+        resampler: The scheme that draws the ancestors.
+        threshold: Effective sample size below which to resample, over the number of particles.
     """
 
     def __init__(self, resampler: Resample, threshold: float = 0.5) -> None:
@@ -152,17 +163,19 @@ class BelowESS:
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return children, of which those of rich clouds are their parents with their weights."""
-        drawn = self.resampler(particles, count, space, generator)
+        """Return children; in images above the threshold they are the particles themselves."""
+        new = self.resampler(particles, count, space, generator)
         M = particles.log_weights.shape[1]
         if count != M:
-            return drawn
-        poor = (effective_size(particles.log_weights) < self.threshold * M)[:, None]
+            return new
+        low = (effective_sample_size(particles.log_weights) < self.threshold * M)[:, None]
         kept = NoResampling()(particles, count, space, generator)
-        shares = drawn.shares
+        shares = new.shares
         if shares is not None:
             shares = torch.where(
-                poor[..., None], shares, torch.eye(M, dtype=shares.dtype, device=shares.device)
+                low[..., None],
+                shares,
+                torch.eye(M, dtype=shares.dtype, device=shares.device),
             )
-        ancestors = torch.where(poor, drawn.ancestors, kept.ancestors)
-        return Resampled(ancestors, torch.where(poor, drawn.log_weights, kept.log_weights), shares)
+        ancestors = torch.where(low, new.ancestors, kept.ancestors)
+        return Resampled(ancestors, torch.where(low, new.log_weights, kept.log_weights), shares)

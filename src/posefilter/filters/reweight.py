@@ -1,7 +1,4 @@
-"""How much does what a particle has just read change its weight?
-
-See protocols.Reweigh for the arguments.
-"""
+"""Weight updates from the log-likelihoods of a step; see protocols.Reweight for the arguments."""
 
 import math
 
@@ -9,12 +6,11 @@ from torch import Tensor
 
 
 class Sequential:
-    """Bayes's rule: weights times likelihood.  Each step's reading counts as a new, independent
-    observation.
+    """Bayes' rule: multiply the weights by the likelihood (Gordon et al. 1993).
 
-    Right for a sequence of images. Reading one and the same image T times counts its evidence T
-    times: the belief then is too narrow (by sqrt(T) for a Gaussian), though its mode stays where it
-    was.
+    Each step counts as an independent observation, as in a sequence of images. If all T steps
+    measure one image, its evidence counts T times: the mode is kept, but the belief is too narrow
+    (by sqrt(T) for a Gaussian).
     """
 
     def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
@@ -23,10 +19,11 @@ class Sequential:
 
 
 class Annealed:
-    """Weights from the score at this step's noise level alone, whatever they were before.
+    """Weights from this step's likelihood alone; earlier weights are discarded.
 
-    A search: children crowd where the score was high, and the score counts there again. Where the
-    cloud thins out the weights say how good each particle is, not how much mass it stands for.
+    As in the annealed particle filter (Deutscher, Blake and Reid 2000). It is a search: particles
+    concentrate where the likelihood was high, and the likelihood counts there again. Weights rank
+    particles and are no estimate of posterior mass.
     """
 
     def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
@@ -35,13 +32,12 @@ class Annealed:
 
 
 class TemperedSMC:
-    """Weights times the *change* of the score since the parent was read: the image's evidence
-    counts once in all.
+    """Multiply the weights by the *ratio* of the likelihoods of a particle and of its ancestor.
 
-    An SMC sampler (Del Moral, Doucet and Jasra 2006) whose moves are their own backward kernels.
-    However many steps and levels led there, the last cloud stands for exp(score_T) times the first
-    cloud's density as diffused by the moves alone: flat if it was flat and moves are as likely
-    there as back, and the proposals' own density if it was drawn from them.
+    A sequential Monte Carlo sampler (Del Moral, Doucet and Jasra 2006) in which each move serves as
+    its own backward kernel. The image's evidence counts once, however many steps and noise levels
+    there are: the last particles target exp(score_T) times the initial density as diffused by the
+    moves alone. That density is flat if the initial one is and the moves are symmetric.
     """
 
     def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:

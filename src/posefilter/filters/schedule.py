@@ -1,10 +1,14 @@
-"""The noise level of each step, in the space's unit ([m] for poses, [px] for pixels)."""
+"""Noise level of each step, in the space's unit ([m] for poses, [px] for pixels)."""
 
 from posefilter.errors import UserError
 
 
 class Constant:
-    """The same sigma at every step."""
+    """The same sigma at every step.
+
+    Args:
+        sigma: Noise level.
+    """
 
     def __init__(self, sigma: float) -> None:
         self.sigma = sigma
@@ -15,8 +19,14 @@ class Constant:
 
 
 class Geometric:
-    """Sigma falls (or rises) from `start` at the first step to `stop` at the last by a constant
-    factor.
+    """Sigma changes by a constant factor from the first step to the last.
+
+    Args:
+        start: Noise level at the first step.
+        stop: Noise level at the last step.
+
+    Raises:
+        UserError: A level is not above 0.
     """
 
     def __init__(self, start: float, stop: float) -> None:
@@ -25,7 +35,7 @@ class Geometric:
         self.start, self.stop = start, stop
 
     def __call__(self, steps: int) -> list[float]:
-        """Return `steps` values; a single step is taken at `stop`."""
+        """Return `steps` values; a single step gets `stop`."""
         if steps == 1:
             return [self.stop]
         factor = (self.stop / self.start) ** (1 / (steps - 1))

@@ -1,21 +1,29 @@
-"""Resampling by optimal transport: children stay as near as they can to where particles were."""
+"""Resampling by optimal transport, which moves particles as little as it can (Reich 2013)."""
 
 import math
 
 import torch
 from torch import Generator, Tensor
 
-from posefilter.filters.resample import draw
+from posefilter.filters.resample import inverse_cdf
 from posefilter.protocols import Space
 from posefilter.types import Particles, Resampled
 
 
 def sinkhorn(cost: Tensor, log_a: Tensor, log_b: Tensor, epsilon: float, iterations: int) -> Tensor:
-    """Return the log of the entropy-regularized transport plan between two weightings (Cuturi
-    2013), in the log domain.
+    """Return the log of the entropy-regularized transport plan (Cuturi 2013), in the log domain.
 
-    cost (B, N, M) >= 0, log_a (B, N), log_b (B, M), each normalized -> (B, N, M). Ends on the
-    columns' update, so that they sum to b exactly; the rows sum to a as far as the iterations came.
+    The last update is that of the columns: their sums are exact, those of the rows approximate.
+
+    Args:
+        cost: (B, N, M) >= 0.
+        log_a: (B, N) normalized log weights of the rows.
+        log_b: (B, M) normalized log weights of the columns.
+        epsilon: Regularization, in the unit of the cost.
+        iterations: Number of updates of rows and columns.
+
+    Returns:
+        Log plan (B, N, M).
     """
     kernel = -cost / epsilon
     g = torch.zeros_like(log_b)
@@ -27,12 +35,15 @@ def sinkhorn(cost: Tensor, log_a: Tensor, log_b: Tensor, epsilon: float, iterati
 
 
 class OptimalTransport:
-    """Draw each child's parent from its row of the entropy-regularized plan that carries the
-    weights to equal ones.
+    """Draw each child's ancestor from its row of the plan that carries the weights to equal ones.
 
-    Children's places are an even selection of the particles, so a parent is mostly itself or a
-    neighbor: this coupling keeps the randomness small, where multinomial draws shuffle. epsilon:
-    regularization, over the mean squared distance.
+    Children's targets are an even selection of the particles, so an ancestor is mostly the particle
+    itself or a neighbor. The plan is the coupling of Reich (2013), regularized by its entropy
+    (Cuturi 2013).
+
+    Args:
+        epsilon: Regularization, over the mean squared distance.
+        iterations: Iterations of Sinkhorn's algorithm.
     """
 
     def __init__(self, epsilon: float = 0.05, iterations: int = 50) -> None:
@@ -44,44 +55,42 @@ class OptimalTransport:
         """Return children of (nearly) equal weight."""
         log_plan = self.plan(particles, count, space)
         log_weights = torch.logsumexp(log_plan, dim=2)
-        places = torch.rand(log_weights.shape, generator=generator, device=log_plan.device)
+        u = torch.rand(log_weights.shape, generator=generator, device=log_plan.device)
         rows = (log_plan - log_weights[..., None]).flatten(0, 1)
-        return Resampled(draw(rows, places.flatten()[:, None]).view_as(places), log_weights)
+        return Resampled(inverse_cdf(rows, u.flatten()[:, None]).view_as(u), log_weights)
 
     def plan(self, particles: Particles, count: int, space: Space) -> Tensor:
-        """Return the log plan (B, N, M), differentiable in the weights; its columns sum to them,
-        its rows nearly to 1 / N.
+        """Return the log plan (B, N, M), differentiable in the weights.
 
-        What the rows are off after the last iteration goes into the children's weights, so the mean
-        is kept all the same.
+        Its columns sum to the weights, its rows nearly to 1 / N. The rows' error remains in the
+        children's weights, so means are kept.
         """
-        # the distances are held fixed: they have no slope where a child is its own parent
+        # detached: a distance has no gradient where a child is its own ancestor
         with torch.no_grad():
             M = particles.state.shape[1]
-            chosen = particles.state[
+            targets = particles.state[
                 :, torch.linspace(0, M - 1, count, device=particles.state.device).round().long()
             ]
-            cost = space.distance(chosen[:, :, None], particles.state[:, None]).square()
+            cost = space.distance(targets[:, :, None], particles.state[:, None]).square()
             cost = cost / cost.mean((1, 2), keepdim=True).clamp_min(1e-12)
-        # of no weight at all no potential is finite
+        # the potential of a particle without weight would be infinite
         log_b = torch.log_softmax(particles.log_weights.clamp_min(-80.0), dim=1)
         log_a = torch.full_like(cost[..., 0], -math.log(count))
         return sinkhorn(cost, log_a, log_b, self.epsilon, self.iterations)
 
 
 class Ensemble(OptimalTransport):
-    """Make each child the mean of its row of the plan: no draw at all, so gradients flow (Corenflos
-    et al. 2021).
+    """The ensemble transform: each child is the mean of its row of the plan (Reich 2013).
 
-    The weighted mean is kept exactly (on poses, that of the space); the spread shrinks, with
-    epsilon and since light particles in the tails are merged, so the filter lags a little behind
-    what it follows.
+    With the entropic plan it is differentiable (Corenflos et al. 2021). The weighted mean is exact
+    (on poses, that of the space). The covariance shrinks with epsilon, so the filter lags behind a
+    moving target.
     """
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return children of (nearly) equal weight, as mixes; `parents` are their main ones."""
+        """Return mixtures of (nearly) equal weight; `ancestors` are their largest components."""
         log_plan = self.plan(particles, count, space)
         return Resampled(
             log_plan.argmax(2), torch.logsumexp(log_plan, dim=2), torch.softmax(log_plan, dim=2)

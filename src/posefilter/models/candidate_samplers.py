@@ -10,7 +10,11 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.candidates import PersistentParticles, around_truth, from_depth
+from posefilter.filters.candidates import (
+    PersistentParticles,
+    sample_around_truth,
+    sample_from_depth,
+)
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.nets.paper_likelihood import PaperLikelihood
@@ -93,7 +97,7 @@ class CandidatePoses:
         model = method.model
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
-        groups = [around_truth(batch, model, method.space, self.each, self.sigma, generator)]
+        groups = [sample_around_truth(batch, model, method.space, self.each, self.sigma, generator)]
         proposals = scene.said is not None
         if self.proposed and proposals:
             groups.append(method.propose_poses(scene, self.proposed, generator))
@@ -103,7 +107,7 @@ class CandidatePoses:
             fresh = (
                 method.propose_poses(scene, count, generator)
                 if proposals
-                else from_depth(batch, space, count, generator)
+                else sample_from_depth(batch, space, count, generator)
             )
             states, level = self.persistent.recall(
                 batch, fresh, self.start if proposals else self.sigma[1]
