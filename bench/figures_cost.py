@@ -24,7 +24,7 @@ from posefilter.cli.instantiate import instantiate
 from posefilter.cli.machine import settle
 
 HOME = Path(__file__).parents[1]
-LOOKING = ("layout", "speed", "signs", "health", "figures")
+LOOKING = ("layout", "speed", "diagnostics", "health", "figures")
 
 
 class Clock(Callback):
