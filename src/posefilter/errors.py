@@ -1,6 +1,9 @@
-"""What stands for a user's mistake: the commands print its single line and exit with status 2."""
+"""What stands for a user's mistake: the commands print its single line and exit with status 2; and
+for a user's wish to stop.
+"""
 
 from pathlib import Path
+from signal import Signals
 
 
 class UserError(Exception):
@@ -20,3 +23,15 @@ class BadData(UserError):  # noqa: N818
     def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
         """Survive the way from one process to another."""
         return BadData, (self.path, self.cause, self.detail)
+
+
+class Stopped(BaseException):
+    """The run was told to stop, by Ctrl-C or by another process.
+
+    Args:
+        number: The signal that told it; the command's exit status is 128 more.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"stopped by {Signals(number).name}")
+        self.number = number

@@ -1,13 +1,18 @@
 """A run that was cut short ends as one that was not."""
 
+import json
+import os
+import signal
 from pathlib import Path
 
 import pytest
 import torch
-from lightning import Callback
+from lightning import Callback, Trainer
 
+from posefilter.cli import run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
+from tests.smoke.conftest import HOME, TINY
 
 
 class Killed(BaseException):
@@ -73,3 +78,63 @@ def test_a_killed_run_goes_on_to_the_same_end(
     for key, value in a.get("lesson", {}).items():
         assert torch.equal(value, b["lesson"][key]), key
     assert a["lr_schedulers"][0]["_last_lr"] == b["lr_schedulers"][0]["_last_lr"]
+
+
+class Sender(Lines):
+    """Sends this process a signal after a batch of a step."""
+
+    def __init__(self, hook: str, step: int, number: int) -> None:
+        super().__init__()
+        self.hook, self.step, self.number = hook, step, number
+
+    def on_train_batch_end(self, trainer: Trainer, *_: object) -> None:
+        self.send("training", trainer)
+
+    def on_validation_batch_end(self, trainer: Trainer, *_: object) -> None:
+        self.send("validation", trainer)
+
+    def send(self, hook: str, trainer: Trainer) -> None:
+        if (hook, trainer.global_step) == (self.hook, self.step):
+            os.kill(os.getpid(), self.number)
+
+
+@pytest.mark.parametrize(
+    ("hook", "step", "number"),
+    [
+        ("training", 2, signal.SIGINT),
+        ("training", 4, signal.SIGTERM),
+        ("validation", 3, signal.SIGTERM),
+    ],
+    ids=["within an epoch", "at its end", "within a validation"],
+)
+def test_a_run_that_is_told_to_stop_says_how_to_go_on_and_goes_on_to_the_same_end(
+    hook: str,
+    step: int,
+    number: int,
+    tiny_scenes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=none"]
+    settings += ["trainer.val_check_interval=3", "trainer.max_steps=6", "data.batch_size_test=2"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert run_command("train", HOME, [*settings, f"out={whole}"]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "progress", lambda console: Sender(hook, step, number))
+        before = signal.getsignal(number)
+        assert run_command("train", HOME, [*settings, f"out={cut}"]) == 128 + number
+        assert signal.getsignal(number) == before
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert told == {"event": "stopped", "step": step, "next": f"python train.py resume={cut}"}
+    assert state(cut)["global_step"] == step
+    assert not (cut / "metrics.json").exists()
+
+    again = f"data.root={tiny_scenes}"  # outside of the working folder
+    assert run_command("train", HOME, [f"resume={cut}", again]) == 0
+    a, b = state(whole), state(cut)
+    assert (a["global_step"], a["epoch"]) == (b["global_step"], b["epoch"])
+    assert all(torch.equal(value, b["state_dict"][key]) for key, value in a["state_dict"].items())
+    one, other = (json.loads((run / "metrics.json").read_text()) for run in (whole, cut))
+    assert one["iou"] == other["iou"]
+    assert one["training"]["tested_step"] == other["training"]["tested_step"]

@@ -1,23 +1,46 @@
 """Which checkpoint of a run is tested, and which one it goes on from."""
 
+import math
 import os
+import time
 from pathlib import Path
 from typing import Any
 
-from lightning import Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
+from posefilter.cli.resume import BEFORE, LAST
+from posefilter.cli.stopping import asked_to_stop
 
-class Last(ModelCheckpoint):
-    """Lightning's own; of the files that a checkpoint says it replaces, it believes in those of its
-    own folder alone.
+_NONE_DONE = {"ready": 0, "started": 0, "processed": 0, "completed": 0}
 
-    Lightning deletes them, so that a foreign checkpoint could name any file.
+
+class Best(ModelCheckpoint):
+    """Keep the checkpoint of the best validation; of equal ones the latest, which has learned for
+    longest.
+
+    Lightning's own keeps the first. Where nothing finds the object yet all scores are 0, and a run
+    would be tested on what it had learned by its first validation.
     """
 
+    def check_monitor_top_k(self, trainer: Trainer, current: Tensor | None = None) -> bool:
+        """Tell whether a validation is to be kept."""
+        equal = (
+            current is not None
+            and self.best_model_score is not None
+            and bool(current == self.best_model_score)
+        )
+        return trainer.strategy.reduce_boolean_decision(equal) or super().check_monitor_top_k(
+            trainer, current
+        )
+
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take over what a checkpoint says of the files that were kept."""
+        """Take over what a checkpoint says of the files that were kept, of those in this run's own
+        folder alone.
+
+        Lightning deletes what it replaces, so that a foreign checkpoint could name any file.
+        """
         kept = {
             str(path): score
             for path, score in dict(state_dict.get("best_k_models") or {}).items()
@@ -36,21 +59,80 @@ class Last(ModelCheckpoint):
         return os.path.realpath(Path(path).parent) == os.path.realpath(self.dirpath)
 
 
-class Best(Last):
-    """Keep the checkpoint of the best validation; of equal ones the latest, which has learned for
-    longest.
+class Last(Checkpoint):
+    """Write what a run goes on from: at each validation, every few minutes, and where it is told to
+    stop.
 
-    Lightning's own keeps the first. Where nothing finds the object yet all scores are 0, and a run
-    would be tested on what it had learned by its first validation.
+    The checkpoint before it is kept as last.previous.ckpt, for the day on which the last is broken.
+
+    Args:
+        dirpath: The folder of the run's checkpoints.
+        minutes: Between two checkpoints, about [min]; null: at validations alone.
     """
 
-    def check_monitor_top_k(self, trainer: Trainer, current: Tensor | None = None) -> bool:
-        """Tell whether a validation is to be kept."""
-        equal = (
-            current is not None
-            and self.best_model_score is not None
-            and bool(current == self.best_model_score)
-        )
-        return trainer.strategy.reduce_boolean_decision(equal) or super().check_monitor_top_k(
-            trainer, current
-        )
+    def __init__(self, dirpath: str, minutes: float | None = 3.0) -> None:
+        self.path = Path(dirpath) / LAST
+        self._pause = math.inf if minutes is None else 60 * minutes
+        self._saved_at = 0.0
+        self._whole = False  # whether the file there is one that a run can go on from
+        self._validation_due = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._saved_at = time.monotonic()
+        start = trainer.ckpt_path
+        self._whole = start is not None and Path(start).resolve() == self.path.resolve()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Write it where it is time, unless a validation follows: that looks at the time, too."""
+        loop = trainer.fit_loop
+        assert loop._data_fetcher is not None
+        if self._due(trainer) and not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):
+            self._save(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write it where it is time."""
+        self._save_amid_validation(trainer)
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, *_: Any
+    ) -> None:
+        """Write it where it is time."""
+        self._save_amid_validation(trainer)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write it."""
+        if not trainer.sanity_checking:
+            self._save(trainer)
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Have a run that goes on from amid a validation do the whole of it again: what the
+        validation had collected is not kept.
+        """
+        if self._validation_due:
+            # Lightning's sign for a validation that was cut short: one batch begun, none done
+            begun = {**_NONE_DONE, "ready": 1, "started": 1}
+            progress = checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]
+            progress |= {"total": begun, "current": dict(_NONE_DONE), "is_last_batch": False}
+
+    def _save_amid_validation(self, trainer: Trainer) -> None:
+        # a run that has all its steps would not go on with its validation
+        ended = trainer.global_step == trainer.max_steps
+        if self._due(trainer) and not trainer.sanity_checking and not ended:
+            self._validation_due = True
+            self._save(trainer)
+            self._validation_due = False
+
+    def _due(self, trainer: Trainer) -> bool:
+        return asked_to_stop(trainer) or time.monotonic() - self._saved_at >= self._pause
+
+    def _save(self, trainer: Trainer) -> None:
+        new = self.path.with_name(f"new_{LAST}")
+        trainer.save_checkpoint(new)
+        if trainer.is_global_zero:
+            if self._whole:
+                self.path.replace(self.path.with_name(BEFORE))
+            new.replace(self.path)
+        self._saved_at, self._whole = time.monotonic(), True

@@ -24,7 +24,7 @@ from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import trust
-from posefilter.errors import UserError
+from posefilter.errors import Stopped, UserError
 from posefilter.paths import find_conf
 
 COMMANDS = ("train", "evaluate", "predict", "generate", "check_data", "report", "export")
@@ -61,6 +61,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except Stopped as stopped:
+        return 128 + stopped.number
     except (_Stop, *EXPECTED) as caught:
         error = caught.args[0] if isinstance(caught, _Stop) else caught
         if trace:

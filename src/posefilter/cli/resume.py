@@ -9,6 +9,7 @@ import yaml
 from posefilter.errors import UserError
 from posefilter.paths import check_links, stays_inside
 
+LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
 _DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
 _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 # that a run writes to
@@ -27,16 +28,21 @@ def run_folder(resume: str | Path) -> Path:
     return folder
 
 
-def last_checkpoint(resume: str | Path) -> Path:
-    """Return the checkpoint to go on from.  Raises UserError where there is none."""
+def last_checkpoints(resume: str | Path) -> list[Path]:
+    """Return the checkpoints to go on from: the last one, and the one before to fall back to.
+
+    Raises UserError where there is none.
+    """
     path = Path(resume)
-    path = path if path.suffix == ".ckpt" else path / "checkpoints" / "last.ckpt"
-    if not path.is_file():
+    path = path if path.suffix == ".ckpt" else path / "checkpoints" / LAST
+    found = [path, path.with_name(BEFORE)] if path.name == LAST else [path]
+    there = [one for one in found if one.is_file()]
+    if not there:
         raise UserError(
             f"resume={resume}: no {path}; the run was stopped before its first "
             f"checkpoint: start it anew"
         )
-    return path
+    return there
 
 
 def with_resumed(arguments: list[str]) -> list[str]:
@@ -47,7 +53,7 @@ def with_resumed(arguments: list[str]) -> list[str]:
     if not given or given[-1] in ("", "null"):
         return arguments
     folder = run_folder(given[-1])
-    last_checkpoint(given[-1])
+    last_checkpoints(given[-1])
     check_links(folder)
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
     kept = [o for o in overrides_of(folder) if _key(o) not in named and _key(o) not in _DROPPED]

@@ -17,15 +17,17 @@ from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.checkpoints import build_method, check_loss, method_of, read_checkpoint, recipe
 from posefilter.cli.comparing import HANDS, comparable, differing
 from posefilter.cli.console import JSON, say, typed
+from posefilter.cli.files import WholeCheckpoints
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.results import record, show, write_json
-from posefilter.cli.resume import last_checkpoint
+from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
+from posefilter.cli.stopping import Stop
 from posefilter.cli.warm_start import warm_start
 from posefilter.data.module import PoseDataModule
-from posefilter.errors import UserError
+from posefilter.errors import Stopped, UserError
 from posefilter.models.base import PoseEstimator, score_of
 from posefilter.paths import stays_inside
 
@@ -61,12 +63,13 @@ def train(job: Job) -> float:
         )
     rehearse(method, data)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
-    start = start_from(job)
-    before = int(read_checkpoint(start)["global_step"]) if start else 0
+    start, before = start_from(job)
     began = time.perf_counter(), time.process_time()
-    trainer.fit(method, datamodule=data, ckpt_path=start, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+    try:
+        trainer.fit(method, datamodule=data, ckpt_path=start, weights_only=True)
+    except Stopped:
+        say_stopped(job, trainer.global_step)
+        raise
     best = job.folder / "checkpoints" / "best.ckpt"
     kept = read_checkpoint(best)
     training = cost(trainer.global_step, before, *began) | {"tested_step": int(kept["global_step"])}
@@ -197,7 +200,12 @@ def make_trainer(
             "safe)"
         )
     trainer = instantiate(
-        node, "trainer", callbacks=callbacks, logger=loggers or False, enable_progress_bar=False
+        node,
+        "trainer",
+        callbacks=[*callbacks, Stop()],
+        logger=loggers or False,
+        plugins=WholeCheckpoints(),
+        enable_progress_bar=False,
     )
     assert isinstance(trainer, Trainer)
     return trainer
@@ -210,12 +218,40 @@ def test(trainer: Trainer, data: LightningDataModule, checkpoint: dict[str, Any]
     return method.results()
 
 
-def start_from(job: Job) -> str | None:
-    """Return the checkpoint to go on from: of `resume`, or of a sweep's job that was cut short."""
-    if job.cfg.resume:
-        return str(last_checkpoint(job.cfg.resume))
-    last = job.folder / "checkpoints" / "last.ckpt"
-    return str(last) if job.swept and last.is_file() else None
+def start_from(job: Job) -> tuple[Path | None, int]:
+    """Return the checkpoint to go on from, of `resume` or of a sweep's job that was cut short, and
+    its step; (None, 0) where the training starts anew.
+
+    Where the last checkpoint is broken it is the one before, and the console says so.
+    """
+    begun = job.swept and any((job.folder / "checkpoints" / n).is_file() for n in (LAST, BEFORE))
+    source = job.cfg.resume or (job.folder if begun else None)
+    if source is None:
+        return None, 0
+    last, *before = last_checkpoints(source)
+    try:
+        return last, step_of(last)
+    except UserError as error:
+        if not before:
+            raise
+        say(job.cfg.console, "fallback", f"{error}; going on from {before[0]}", checkpoint=last)
+        return before[0], step_of(before[0])
+
+
+def step_of(checkpoint: Path) -> int:
+    """Return the step at which a checkpoint was written.  Raises UserError where it is broken."""
+    return int(read_checkpoint(checkpoint)["global_step"])
+
+
+def say_stopped(job: Job, step: int) -> None:
+    """Say where a training was stopped, and how to go on."""
+    again = f"the same command with out={job.folder.parent}" if job.swept else ""
+    again = again or typed("train", resume=job.folder)
+    there = (job.folder / "checkpoints" / LAST).is_file()
+    sentence = (
+        f"stopped at step {step}; go on with: {again}" if there else f"stopped at step {step}"
+    )
+    say(job.cfg.console, "stopped", sentence, step=step, next=again)
 
 
 def finished(job: Job) -> dict[str, Any] | None:

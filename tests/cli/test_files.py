@@ -1,0 +1,88 @@
+"""Files are whole or not there, and a run goes on from the checkpoint before where the last is broken."""
+
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from posefilter.cli.best import Last
+from posefilter.cli.files import WholeCheckpoints, open_whole, save_whole
+
+
+class Small(LightningModule):
+    """A module with one weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def training_step(self, batch: Tensor, index: int) -> Tensor:
+        return self.weight.square()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def fit(folder: Path, steps: int, minutes: float | None, start: Path | None = None) -> list[str]:
+    """Train without validations; return the files that are there at the end."""
+    trainer = Trainer(max_steps=steps, callbacks=[Last(str(folder), minutes)], plugins=WholeCheckpoints(), logger=False,
+                      accelerator="cpu", enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
+    trainer.fit(Small(), DataLoader([torch.zeros(1)] * 10), ckpt_path=start, weights_only=True)
+    return sorted(file.name for file in folder.glob("*"))
+
+
+def step(file: Path) -> int:
+    return int(torch.load(file, weights_only=True)["global_step"])
+
+
+def test_a_checkpoint_is_written_by_time_too_and_the_one_before_is_kept(tmp_path: Path) -> None:
+    assert fit(tmp_path / "never", 3, None) == []
+    run = tmp_path / "run"
+    assert fit(run, 3, 0.0) == ["last.ckpt", "last.previous.ckpt"]
+    assert [step(run / name) for name in ("last.ckpt", "last.previous.ckpt")] == [3, 2]
+
+
+def test_a_broken_checkpoint_does_not_take_the_place_of_the_one_before(tmp_path: Path) -> None:
+    fit(tmp_path, 3, 0.0)
+    (tmp_path / "last.ckpt").write_bytes(b"broken")
+    fit(tmp_path, 3, 0.0, start=shutil.copy(tmp_path / "last.previous.ckpt", tmp_path / "it.ckpt"))
+    assert step(tmp_path / "last.ckpt") == 3
+    assert step(tmp_path / "last.previous.ckpt") == 2
+
+
+def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> None:
+    """A process that may write no more than some bytes, as on a full disk."""
+    file = tmp_path / "last.ckpt"
+    save_whole({"weight": torch.ones(3)}, file)
+    script = f"""
+        import resource, signal, torch
+        from pathlib import Path
+        from posefilter.cli.files import save_whole
+        from posefilter.errors import UserError
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+        try:
+            save_whole({{"weight": torch.ones(100_000)}}, Path({str(file)!r}))
+        except UserError as error:
+            print(error)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"{file}: cannot be written (File too large)\n"
+    assert torch.load(file, weights_only=True)["weight"].tolist() == [1, 1, 1]
+    assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
+
+
+def test_a_file_that_was_given_up_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), open_whole(tmp_path / "a") as file:
+        file.write(b"half")
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
