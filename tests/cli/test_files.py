@@ -82,7 +82,11 @@ def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> N
 
 
 def test_a_file_that_was_given_up_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), open_whole(tmp_path / "a") as file:
-        file.write(b"half")
-        raise KeyboardInterrupt
+    def give_up() -> None:
+        with open_whole(tmp_path / "a") as file:
+            file.write(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        give_up()
     assert not list(tmp_path.iterdir())

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from lightning import Callback, Trainer
+from tests.smoke.conftest import HOME, TINY
 
 from posefilter.cli import run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
-from tests.smoke.conftest import HOME, TINY
 
 
 class Killed(BaseException):
