@@ -13,6 +13,10 @@ class UserError(Exception):
     """
 
 
+class ProblemsFound(UserError):  # noqa: N818
+    """A check was done, and something is wrong with what it checked: the commands exit with 1."""
+
+
 class BadData(UserError):  # noqa: N818
     """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
 

@@ -14,12 +14,41 @@ MOST_BYTES = 1 << 29  # of an image's or JSON's file
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """Read a file.  Raises BadData where it is missing, or larger than such a file can be."""
-    if not path.is_file():
-        raise BadData(path, "missing file")
-    if path.stat().st_size > most:
-        raise BadData(path, "file too large", f"{path.stat().st_size:,} bytes, at most {most:,}")
-    return path.read_bytes()
+    """Read a file.
+
+    Args:
+        path: The file.
+        most: Bytes that such a file may have.
+
+    Raises:
+        BadData: The file is missing, larger, or may not be read.
+    """
+    try:
+        if not path.is_file():
+            raise BadData(path, "missing file")
+        size = path.stat().st_size
+        if size > most:
+            raise BadData(path, "file too large", f"{size:,} bytes, at most {most:,}")
+        return path.read_bytes()
+    except OSError as error:
+        raise BadData(path, "cannot be read", error.strerror or type(error).__name__) from error
+
+
+def read_lines(path: Path, most: int = 1 << 22) -> list[str]:
+    """Read a text file's lines that are not empty, without the blanks round them.
+
+    Args:
+        path: The file.
+        most: Bytes that such a file may have.
+
+    Raises:
+        BadData: The file is missing, larger, may not be read, or is not UTF-8.
+    """
+    try:
+        lines = read_bytes(path, most).decode().splitlines()
+    except UnicodeDecodeError as error:
+        raise BadData(path, "not a text in UTF-8", str(error)) from error
+    return [line.strip() for line in lines if line.strip()]
 
 
 def check_picture(path: Path, data: bytes) -> None:

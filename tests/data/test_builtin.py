@@ -129,7 +129,7 @@ def _picture(mesh: Mesh, face: str, height: int = 24, width: int = 24) -> np.nda
     right, up = {"top": ((1, 0, 0), (0, 1, 0)), "bottom": ((1, 0, 0), (0, -1, 0))}.get(
         face, (tuple(np.cross([0, 0, 1], normal)), (0, 0, 1))
     )
-    low, high = mesh.box_head
+    low, high = mesh.bounds
     center, half = (low + high) / 2, (high - low) / 2
     x = (np.arange(width) + 0.5) / width * 2 - 1
     y = 1 - (np.arange(height) + 0.5) / height * 2
@@ -190,7 +190,7 @@ def test_declared_symmetries_hold_for_shape_and_color() -> None:
             assert np.abs(colors[vertex] - colors).mean() < 0.05
     brick = store.load("brick")
     # this one is none
-    quarter = turn_about(np.array([0, 0, 1.0]), np.pi / 2, brick.box_head.mean(0))
+    quarter = turn_about(np.array([0, 0, 1.0]), np.pi / 2, brick.bounds.mean(0))
     turned = brick.vertices @ quarter[:3, :3].T + quarter[:3, 3]
     assert cKDTree(brick.vertices).query(turned)[0].max() > 1e-3
 

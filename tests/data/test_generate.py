@@ -3,12 +3,15 @@ files show it.
 """
 
 import json
+import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
@@ -16,6 +19,7 @@ from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 from posefilter.synthetic import fat_format
 from posefilter.synthetic.generate import camera_matrix, generate
+from posefilter.synthetic.painter import make_renderer
 
 SIZE = (160, 120)
 SETTINGS: dict[str, Any] = {
@@ -257,6 +261,67 @@ def test_a_killed_run_goes_on_and_ends_the_same(alone: Path, tmp_path: Path) -> 
 def test_other_settings_are_refused_by_name(alone: Path) -> None:
     with pytest.raises(UserError, match=r"_generator\.json.*other settings \(seed, sensor\)"):
         generate(alone, 7, **{**SETTINGS, "seed": 6, "sensor": "ideal"})
+
+
+def write_meshes(folder: Path, unit: float = 1.0) -> Path:
+    """Write three boxes in meters, or in another unit; return their folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(3):
+        mesh = trimesh.creation.box(np.array([0.1, 0.12, 0.14 + 0.02 * k]) / unit)
+        mesh.export(folder / f"box{k}.ply")
+    return folder
+
+
+def test_meshes_in_millimeters_take_a_scale_and_a_failed_start_blocks_nothing(
+    tmp_path: Path,
+) -> None:
+    meshes, out = write_meshes(tmp_path / "meshes", 0.001), tmp_path / "out"
+    how = {"meshes": meshes, "object": "box0", "distractors": (0, 1), "progress": False}
+    how |= {"size": (96, 72), "workers": 1}
+    with pytest.raises(UserError, match=r"box0\.ply.* mesh_scale=0\.001"):
+        generate(out, 2, **how)
+    assert not out.exists()  # nothing was written before the meshes were looked at
+    write_meshes(tmp_path / "meshes")
+    # a distractor that the frames take is looked at too, another mesh is not
+    (meshes / "box1.ply").write_bytes(b"ply")
+    with pytest.raises(UserError, match=r"box1\.ply"):
+        generate(out, 2, **how)
+    assert not out.exists()
+    write_meshes(tmp_path / "meshes", 0.001)
+    # as left by a start that failed before its first frame
+    (out / "mixed" / "scene0000_0").mkdir(parents=True)
+    (out / "mixed" / "scene0000_0" / "_object_settings.json").write_text("{}")
+    (out / "_generator.json").write_text(
+        json.dumps({"settings": {"object": "another"}, "frames": 400})
+    )
+    assert generate(out, 2, mesh_scale=0.001, **how).rendered == 2
+    assert json.loads((out / "_generator.json").read_text())["frames"] == 2
+    in_meters = tmp_path / "in_meters"
+    generate(in_meters, 2, **{**how, "meshes": write_meshes(tmp_path / "m")})
+    for name in ("000001.left.seg.png", "000001.left.depth.png"):
+        scaled, plain = (
+            cv2.imread(str(folder / "mixed" / "scene0000_0" / name), cv2.IMREAD_UNCHANGED)
+            for folder in (out, in_meters)
+        )
+        assert (scaled == plain).mean() > 0.99
+
+
+def test_a_record_from_before_meshes_had_a_scale_goes_on(alone: Path, tmp_path: Path) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(alone, out)
+    record = json.loads((out / "_generator.json").read_text())
+    del record["settings"]["mesh_scale"]
+    (out / "_generator.json").write_text(json.dumps(record))
+    assert generate(out, 7, **SETTINGS).rendered == 0
+
+
+def test_the_renderers_names(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="renderer=moderngl: is now called opengl"):
+        make_renderer("moderngl")
+    with pytest.raises(UserError, match="choose from embree, opengl"):
+        make_renderer("raster")
+    offered = (Path(__file__).parents[2] / "conf" / "generate.yaml").read_text()
+    assert re.search(r"^renderer: embree # or opengl", offered, re.MULTILINE)
 
 
 def test_a_strangers_folder_is_left_alone(tmp_path: Path) -> None:

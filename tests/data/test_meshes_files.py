@@ -75,7 +75,7 @@ def test_scale_turns_units_into_metres(pyramid: Path) -> None:
 
 def test_stray_vertices_are_left_out(pyramid: Path) -> None:
     pyramid.write_text(OBJ + "v 50 50 50\n")
-    assert read_mesh(pyramid, "a").box_head[1].max() == pytest.approx(0.2)
+    assert read_mesh(pyramid, "a").bounds[1].max() == pytest.approx(0.2)
 
 
 def test_materials_are_put_into_one_picture(tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_ply_of_bop_reads_its_texture(tmp_path: Path) -> None:
         "0 0 0 0 0.6 0.8 0 0\n10 0 0 0 0.6 0.8 1 0\n0 10 0 0 0.6 0.8 0 1\n3 0 1 2\n"
     )
     mesh = read_mesh(tmp_path / "obj_000001.ply", "obj_000001", scale=0.001)
-    assert mesh.box_head[1].tolist() == pytest.approx([0.01, 0.01, 0])
+    assert mesh.bounds[1].tolist() == pytest.approx([0.01, 0.01, 0])
     assert mesh.corner_uv is not None
     assert mesh.corner_uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
     assert np.array_equal(mesh.texture, picture)

@@ -64,8 +64,11 @@ def test_empty_and_ambiguous_folders_are_named(tmp_path: Path) -> None:
     # one mesh in two formats
     assert np.ptp(MeshStore(tmp_path).load("two").vertices[:, 2]) == pytest.approx(0.11)
     _box(tmp_path / "two" / "b.obj")
-    with pytest.raises(UserError, match="two: 3 meshes"):
-        MeshStore(tmp_path)
+    _box(tmp_path / "other.obj")
+    store = MeshStore(tmp_path)  # only the mesh that is needed is judged
+    assert store.names() == ["other"]
+    assert store.load("other").name == "other"
+    assert "two: 3 meshes" in _fails(store, "two")
 
 
 def test_units_are_not_guessed(tmp_path: Path) -> None:
@@ -73,8 +76,15 @@ def test_units_are_not_guessed(tmp_path: Path) -> None:
     _box(tmp_path / "tiny.obj", (1e-4, 2e-4, 3e-4))
     store = MeshStore(tmp_path)
     assert "millimeters" in _fails(store, "mm")
-    assert "scale=0.001" in _fails(store, "mm")
-    assert "scale=1000" in _fails(store, "tiny")
+    assert "data.mesh_scale=0.001 (generate, check_data, predict: mesh_scale=0.001)" in _fails(
+        store, "mm"
+    )
+    assert "data.mesh_scale=1000" in _fails(store, "tiny")
+    twice = MeshStore(tmp_path, scale=1e-6)
+    assert "data.mesh_scale=0.001 " in _fails(twice, "mm")
+    for scale in (0, -1, float("nan"), "x"):
+        with pytest.raises(UserError, match="mesh_scale="):
+            MeshStore(tmp_path, scale=scale)
     assert np.ptp(MeshStore(tmp_path, scale=0.001).load("mm").vertices, axis=0) == pytest.approx(
         [0.1, 0.2, 0.3]
     )
@@ -148,3 +158,9 @@ def test_turn_about_leaves_its_line() -> None:
     moved = (turn @ [*(point + np.array([0, 1, 0])), 1])[:3] - point
     assert moved @ [0, 1, 0] == pytest.approx(np.cos(1.0))
     assert moved @ np.cross(axis, [0, 1, 0]) == pytest.approx(np.sin(1.0))  # right-handed
+
+
+def test_an_unknown_mesh_is_told_what_there_is(tmp_path: Path) -> None:
+    message = _fails(MeshStore("builtin"), "cracker")
+    assert "there are banana, bleach_bottle," in message
+    assert "data.meshes=DIR" in message

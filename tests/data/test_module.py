@@ -79,10 +79,35 @@ def test_scenes_by_name_lists_and_the_rest(root, tmp_path):
             module(root, split=split).setup()
 
 
-def test_too_few_scenes_say_so(tmp_path):
-    fat_tree(tmp_path, scenes=2)
-    with pytest.raises(UserError, match="2 scenes cannot be divided into train, val, test"):
+@pytest.mark.parametrize(("scenes", "frames"), [(1, 10), (2, 5)])
+def test_few_scenes_are_split_by_frames_with_a_warning(tmp_path, caplog, scenes, frames):
+    fat_tree(tmp_path, scenes=scenes, frames=frames)
+    dm = PoseDataModule("fat", tmp_path, "toy", progress=False)
+    dm.setup()
+    parts = {name: [r.name for r in dm.records(name)] for name in ("train", "val", "test")}
+    assert [len(parts[name]) for name in ("train", "val", "test")] == [8, 1, 1]
+    # each image once, in blocks of neighbors
+    assert [*parts["train"], *parts["val"], *parts["test"]] == [r.name for r in dm.reader.records()]
+    assert f"{scenes} scene" in caplog.text
+    assert "scores will flatter" in caplog.text
+
+
+def test_an_image_is_never_cut_and_too_few_images_say_so(tmp_path):
+    folder = fat_folder(tmp_path / "mixed" / "kitchen_0", {"toy": 24})
+    for number in range(2):
+        for camera in ("left", "right"):
+            fat_frame(folder, number, [("toy", 24, pose())], camera)
+    dm = PoseDataModule("fat", tmp_path, "toy", split={"train": 0.5, "val": 0.5}, progress=False)
+    dm.setup("fit")
+    assert {r.im_id for r in dm.records("train")} == {0}  # both cameras'
+    assert {r.im_id for r in dm.records("val")} == {1}
+    with pytest.raises(UserError, match=r"2 images .* cannot be divided into train, val, test"):
         PoseDataModule("fat", tmp_path, "toy").setup()
+
+
+def test_no_frames_to_validate_on_say_so(root):
+    with pytest.raises(UserError, match=r"data\.split: no frames for val"):
+        _ = module(root, split={"train": 1.0}).val_dataset
 
 
 def test_bops_own_models_are_in_millimeters(tmp_path):
@@ -98,7 +123,7 @@ def test_bops_own_models_are_in_millimeters(tmp_path):
     )
     bop_scene(tmp_path / "000048", [[(2, pose())]])
     dm = PoseDataModule("bop", tmp_path, "obj_000002", tmp_path / "meshes", split={"test": 1.0})
-    np.testing.assert_allclose(dm.meshes.load("obj_000002").box_head, [LOW, HIGH], atol=1e-9)
+    np.testing.assert_allclose(dm.meshes.load("obj_000002").bounds, [LOW, HIGH], atol=1e-9)
     assert float(dm.test_dataset[0].visibility) == pytest.approx(1.0, abs=0.01)
 
 
@@ -300,8 +325,10 @@ def test_scenes_are_rendered_where_they_are_missing(tmp_path):
     (tmp_path / "new" / "_generator.json").write_text(json.dumps({"frames": 10}))
     dm.prepare_data()
     assert len(calls) == 2
-    with pytest.raises(UserError, match="no scenes here"):
+    with pytest.raises(UserError, match=r"no scenes here .* Nothing is rendered unless asked"):
         PoseDataModule("scenes", tmp_path / "none", "toy").prepare_data()
+    with pytest.raises(UserError, match="only 9 of 10 scenes' frames are here"):
+        PoseDataModule("scenes", tmp_path / "new", "toy").prepare_data()
 
 
 def test_object_models_and_published_points(root, tmp_path):

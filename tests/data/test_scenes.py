@@ -152,11 +152,11 @@ def test_the_foreseen_share_is_near_the_rendered_one(scene: SceneSet) -> None:
 
 def test_lookalikes_are_not_the_target(library: Library) -> None:
     target = library.store.load("carton")
-    sides = target.box_head[1] - target.box_head[0]
+    sides = target.bounds[1] - target.bounds[0]
     for seed in range(12):
         other = make_lookalike(target, "lookalike_00", [], np.random.default_rng(seed))
         assert other.name == "lookalike_00"
-        differs = np.abs((other.box_head[1] - other.box_head[0]) / sides - 1).max() > 0.1
+        differs = np.abs((other.bounds[1] - other.bounds[0]) / sides - 1).max() > 0.1
         same_print = (
             other.texture.shape == target.texture.shape and (other.texture == target.texture).all()
         )
@@ -198,7 +198,7 @@ def test_settled_objects_lie_on_the_table_and_touch_but_do_not_mix(scene: SceneS
 def test_solids_measure_their_mesh(library: Library) -> None:
     mesh = library.store.load("carton")
     solid = make_solid(mesh)
-    np.testing.assert_allclose(solid.center, mesh.box_head.mean(0))
+    np.testing.assert_allclose(solid.center, mesh.bounds.mean(0))
     assert solid.radius == pytest.approx(
         np.linalg.norm(mesh.vertices - solid.center, axis=1).max(), rel=0.02
     )

@@ -111,7 +111,7 @@ def test_without_a_mesh_the_hull_is_shown_closed_and_outwards() -> None:
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     # signed volume: outwards
     assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.06 * 0.16 * 0.21)
-    assert ((mesh.corner_normals[:, 0] * (a - mesh.box_head.mean(0))).sum(1) > 0).all()
+    assert ((mesh.corner_normals[:, 0] * (a - mesh.bounds.mean(0))).sum(1) > 0).all()
     flat = make_mesh(toy.square().hull, "square")
     assert np.allclose(np.abs(flat.vertices).max(0), [0.1, 0.1, 0])
     mug = builtin.build("mug")

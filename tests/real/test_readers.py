@@ -78,7 +78,7 @@ def test_key_frames_and_published_points(real_data, meshes):
     points = dm.object_model(0).points.numpy()
     assert len(points) == 2621
     # published points lie on the mesh, once in its frame
-    low, high = dm.meshes.load("003_cracker_box").box_head
+    low, high = dm.meshes.load("003_cracker_box").bounds
     assert (points > low - 0.002).all()
     assert (points < high + 0.002).all()
 

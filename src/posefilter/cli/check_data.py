@@ -1,6 +1,7 @@
 """Tell whether a dataset fits its meshes."""
 
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -8,18 +9,23 @@ from posefilter.cli.console import JSON, ended, typed
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.data.checking.check import check_dataset, format_report
-from posefilter.data.readers.registry import open_reader
-from posefilter.errors import UserError
-from posefilter.meshes.store import MeshStore
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.errors import ProblemsFound, UserError
 from posefilter.synthetic.generate import GENERATOR
+
+_FEW_IMAGES = 100
 
 
 def check_data(job: Job) -> None:
-    """Write data_report.json and a contact sheet; print the table."""
+    """Write data_report.json and a contact sheet; print the table.
+
+    Raises:
+        ProblemsFound: The data have problems; they are printed and in the report.
+    """
     cfg = job.cfg
     if cfg.data.root is None:
         raise UserError("data.root: is missing; name the dataset's folder")
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale)
+    store = open_meshes(cfg.meshes, cfg.mesh_scale, cfg.data.source, cfg.data.object)
     options = instantiate(cfg.data.options, "data.options") or {}
     reader = open_reader(cfg.data.source, cfg.data.root, cfg.data.object, store, "skip", **options)
     report = check_dataset(
@@ -31,7 +37,14 @@ def check_data(job: Job) -> None:
         "report": job.folder / "data_report.json",
         "pictures": job.folder / "contact_sheet.png",
     }
-    following = [] if report["problems"] else [train_on(cfg, name) for name in reader.objects]
+    following = (
+        []
+        if report["problems"]
+        else [
+            train_on(cfg, name, sum(record.object == name for record in reader.records()))
+            for name in reader.objects
+        ]
+    )
     ended(
         cfg.console,
         "checked",
@@ -39,13 +52,27 @@ def check_data(job: Job) -> None:
         following,
         **report,
     )
+    if report["problems"]:
+        many = len(report["problems"])
+        raise ProblemsFound(
+            f"{cfg.data.root}: {many} problem{'' if many == 1 else 's'}; see {files['report']}"
+        )
 
 
-def train_on(cfg: DictConfig, name: str) -> str:
-    """Return the command that trains on an object of the data."""
+def train_on(cfg: DictConfig, name: str, images: int) -> str:
+    """Return the command that trains on an object of the data.
+
+    Args:
+        cfg: The check's settings.
+        name: The object.
+        images: How many images show it.
+    """
     # what train.py takes by default
     rendered = cfg.data.source == "fat" and (Path(cfg.data.root) / GENERATOR).is_file()
-    source = {} if rendered else {"data": cfg.data.source}
-    return typed(
-        "train", **source, data__root=cfg.data.root, data__object=name, data__meshes=cfg.meshes
-    )
+    more: dict[str, Any] = {} if rendered else {"data": cfg.data.source}
+    more |= {"data__root": cfg.data.root, "data__object": name, "data__meshes": cfg.meshes}
+    if cfg.mesh_scale is not None:
+        more["data__mesh_scale"] = cfg.mesh_scale
+    if images < _FEW_IMAGES:  # the one image of a part may show little of the object
+        more |= {"data__min_visibility": 0.0, "data__min_visibility_test": 0.0}
+    return typed("train", **more)

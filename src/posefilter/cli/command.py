@@ -22,14 +22,16 @@ from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, settle_logging
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
+from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import trust
-from posefilter.errors import Stopped, UserError
+from posefilter.errors import ProblemsFound, Stopped, UserError
 from posefilter.paths import find_conf
 
 COMMANDS = ("train", "evaluate", "predict", "generate", "check_data", "report", "export")
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
+_FAILED = (FloatingPointError, ProblemsFound)  # nothing is wrong with the command line
 MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
 _MULTIRUN = ("-m", "--multirun")
 
@@ -68,7 +70,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         if trace:
             traceback.print_exception(error)
         print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
-        return FAILURE if isinstance(error, FloatingPointError) else MISTAKE
+        return FAILURE if isinstance(error, _FAILED) else MISTAKE
     finally:
         sys.argv = before
     return 0
@@ -125,6 +127,7 @@ def job_of(cfg: DictConfig) -> Job:
     own = HydraConfig.get()
     choices = {str(k): str(v) for k, v in own.runtime.choices.items()}
     swept = own.mode is RunMode.MULTIRUN
+    replace_typed(cfg, own.overrides.task)
     return Job(
         cfg,
         choices,
@@ -153,6 +156,7 @@ def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Jo
     OmegaConf.set_struct(cfg, False)
     cfg.pop("hydra")
     OmegaConf.set_struct(cfg, True)
+    replace_typed(cfg, overrides)
     return Job(cfg, choices, list(overrides), folder, name, False)
 
 

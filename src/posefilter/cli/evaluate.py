@@ -208,6 +208,8 @@ def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictCo
         plain = OmegaConf.to_container(data)
         assert isinstance(plain, dict)
         check_data({str(key): value for key, value in plain.items()}, typed)
+    if data.get("generate") and not any(key.startswith("generate") for key in typed):
+        data.generate = None  # a mistyped folder must not be filled with a new dataset
     return data
 
 

@@ -26,12 +26,14 @@ def generate(job: Job) -> None:
             f"{summary.frames} frames in {summary.folders} folders, {summary.rendered} of them "
             f"rendered now{speed}"
         )
+    scale = {} if job.cfg.mesh_scale is None else {"mesh_scale": job.cfg.mesh_scale}
     following = typed(
         "check_data",
         data="fat",
         data__root=summary.out,
         data__object=job.cfg.object,
         meshes=job.cfg.meshes,
+        **scale,
     )
     ended(
         job.cfg.console,

@@ -48,7 +48,8 @@ def predict(job: Job) -> None:
             )
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    mesh = MeshStore(cfg.meshes).load(method.model.name) if cfg.meshes else None
+    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
+    mesh = store.load(method.model.name) if store else None
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run])

@@ -11,31 +11,39 @@ _MARK = "_generator.json"
 
 
 def ensure_scenes(root: Path, generate: Callable[[Path], Any] | None) -> None:
-    """Call `generate(root)` where scenes are missing, or rendering them was cut short.
+    """Render scenes where they are missing, or where rendering them was cut short.
 
-    Raises UserError without it.
+    Args:
+        root: The dataset's folder.
+        generate: Renders into a folder; None where nothing is to be rendered, as in evaluations.
+
+    Raises:
+        UserError: Scenes are missing, and there is no `generate`.
     """
-    if _complete(root):
+    there, wanted = _count(root)
+    if 0 < wanted <= there:
         return
-    if generate is None:
-        raise UserError(
-            f"{root}: no scenes here (data.root); render some with: python generate.py out={root}"
-        )
-    generate(root)
+    if generate is not None:
+        generate(root)
+        return
+    state = f"only {there} of {wanted} scenes' frames are here" if there else "no scenes here"
+    raise UserError(
+        f"{root}: {state} (data.root); is the folder mistyped? Nothing is rendered unless asked: "
+        f"by data.generate.frames=N, or: python generate.py out={root}"
+    )
 
 
-def _complete(root: Path) -> bool:
-    """Tell whether the folder holds scenes, and as many frames as its generator was to make."""
+def _count(root: Path) -> tuple[int, int]:
+    """Return how many frames a folder holds, and how many its generator was to make, if any did."""
     if not root.is_dir():
-        return False
+        return 0, 0
     frames = sum(1 for _ in root.rglob("*.left.json"))
     if frames == 0 or not (root / _MARK).is_file():
-        return frames > 0
+        return frames, frames
     try:
-        wanted = int(json.loads((root / _MARK).read_text())["frames"])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        return frames, int(json.loads((root / _MARK).read_text())["frames"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f"{root / _MARK}: not a generator's record ({error}); delete the folder to render it "
             f"anew"
         ) from error
-    return frames >= wanted

@@ -23,7 +23,7 @@ from posefilter.data.frames import FrameRecord, Reader, Sample
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
-from posefilter.data.readers.registry import default_mesh_scale, open_reader
+from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import BadData, UserError
@@ -139,9 +139,7 @@ class PoseDataModule(LightningDataModule):
         """Return the mesh store."""
         if isinstance(self._meshes, MeshStore):
             return self._meshes
-        return MeshStore(
-            self._meshes, scale=self._mesh_scale or default_mesh_scale(self.source, self._object)
-        )
+        return open_meshes(self._meshes, self._mesh_scale, self.source, self._object)
 
     @cached_property
     def reader(self) -> Reader:
@@ -222,8 +220,18 @@ class PoseDataModule(LightningDataModule):
 
     @property
     def val_dataset(self) -> FrameDataset:
-        """Return the validation frames."""
-        return self._dataset("val")
+        """Return the validation frames.
+
+        Raises:
+            UserError: The split leaves none.
+        """
+        dataset = self._dataset("val")
+        if len(dataset) == 0:
+            raise UserError(
+                "data.split: no frames for val, by which the best checkpoint is chosen; give it a "
+                "share, such as 'data.split={train: 0.8, val: 0.1, test: 0.1}'"
+            )
+        return dataset
 
     @property
     def test_dataset(self) -> FrameDataset:

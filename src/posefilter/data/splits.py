@@ -4,6 +4,7 @@ anything is learned.
 
 import fnmatch
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,9 @@ import numpy as np
 
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
+from posefilter.limits import read_bytes, read_lines
+
+log = logging.getLogger(__name__)
 
 NAMES = ("train", "val", "test")
 Share = float | str | Sequence[str]  # of the scenes; a file that lists frames; scenes by name
@@ -20,13 +24,25 @@ Share = float | str | Sequence[str]  # of the scenes; a file that lists frames; 
 def split_records(
     records: Sequence[FrameRecord], split: Mapping[str, Share | None], seed: int, root: Path
 ) -> dict[str, list[int]]:
-    """Return the indices of each split's records.
+    """Divide records into training, validation and test.
 
     A share is a fraction of the scenes, a list of scene names (* and ? allowed), a file of frames
     (`0048/000001` a line, or BOP's targets as JSON), or another part's name: the same frames again,
     as a test of memory wants. Fractions divide the scenes that neither lists nor files took,
-    shuffled by the seed. Raises UserError where names are unknown, fractions exceed one, or scenes
-    are too few.
+    shuffled by the seed. Where there are fewer scenes than fractions, images are divided instead,
+    in blocks of neighbors, with a warning.
+
+    Args:
+        records: The records of the dataset.
+        split: The share of each part; a part without one gets nothing.
+        seed: Shuffles the scenes.
+        root: The dataset's folder, where lists of frames are looked for.
+
+    Returns:
+        The indices of each part's records, in the dataset's order.
+
+    Raises:
+        UserError: Names are unknown, fractions exceed one, or there are fewer images than parts.
     """
     unknown = sorted(set(split) - set(NAMES))
     if unknown:
@@ -50,47 +66,88 @@ def split_records(
     fractions = {
         name: float(share)
         for name, share in split.items()
-        if isinstance(share, int | float) and share > 0
+        if isinstance(share, int | float) and not isinstance(share, bool) and share != 0
     }
     scenes = sorted({record.group for record in records} - set(taken))
-    owner = _divide(scenes, fractions, seed)
-    for i, record in enumerate(records):
-        if record.group in owner:
-            out[owner[record.group]].append(i)
+    if not all(0 < share <= 1 for share in fractions.values()) or _exceed_one(fractions):
+        raise UserError(f"data.split: fractions {fractions} must be positive and sum to 1 at most")
+    owner: dict[Any, str]
+    if len(scenes) >= len(fractions):
+        owner = _divide(scenes, fractions, seed)
+        left = [(i, owner.get(record.group)) for i, record in enumerate(records)]
+    else:
+        owner = _divide_images(records, set(scenes), fractions, root)
+        left = [(i, owner.get(_image(record))) for i, record in enumerate(records)]
+    for i, part in left:
+        if part is not None:
+            out[part].append(i)
     for name, share in split.items():
         if isinstance(share, str) and share in NAMES:
             out[name] = out[share]
     return out
 
 
+def _exceed_one(fractions: Mapping[str, float]) -> bool:
+    """Tell whether fractions are to share out more than there is."""
+    return sum(fractions.values()) > 1 + 1e-6
+
+
+def _image(record: FrameRecord) -> tuple[str, int]:
+    """Return what the records of one image have in common, those of a stereo pair too."""
+    return record.group, record.im_id
+
+
+def _divide_images(
+    records: Sequence[FrameRecord],
+    scenes: set[str],
+    fractions: Mapping[str, float],
+    root: Path,
+) -> dict[tuple[str, int], str]:
+    """Return the split of each image: blocks of neighbors, since neighbors are alike."""
+    images = sorted({_image(record) for record in records if record.group in scenes})
+    parts = ", ".join(fractions)
+    if len(images) < len(fractions):
+        raise UserError(
+            f"data.split: {len(images)} images in {root} cannot be divided into {parts}; use more, "
+            "or name one part, such as 'data.split={test: 1.0}'"
+        )
+    log.warning(
+        "data.split: %d scene%s in %s cannot be divided into %s: split by frames instead; frames "
+        "of one scene are alike, so scores will flatter",
+        len(scenes),
+        "" if len(scenes) == 1 else "s",
+        root,
+        parts,
+    )
+    counts = _counts(len(images), fractions)
+    owner, at = {}, 0
+    for name in (name for name in NAMES if name in counts):
+        owner.update(dict.fromkeys(images[at : at + counts[name]], name))
+        at += counts[name]
+    return owner
+
+
 def _divide(scenes: list[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
     """Return the split of each scene: every fraction gets one scene at least."""
-    total = sum(fractions.values())
-    if total > 1 + 1e-6 or any(f < 0 for f in fractions.values()):
-        raise UserError(
-            f"data.split: fractions {dict(fractions)} must be positive and sum to 1 at most"
-        )
-    if len(scenes) < len(fractions):
-        raise UserError(
-            f"data.split: {len(scenes)} scenes cannot be divided into {', '.join(fractions)}: a "
-            f"scene is never cut; "
-            "use more scenes, or name one part, such as split={test: 1.0}"
-        )
     order = [scenes[i] for i in np.random.default_rng([seed, 7]).permutation(len(scenes))]
-    counts = {name: max(1, round(fraction * len(scenes))) for name, fraction in fractions.items()}
-    while counts and sum(counts.values()) > len(scenes):
-        counts[max(counts, key=lambda name: counts[name])] -= 1
-    # rounding leaves no scene unused where the fractions are to use all
-    if counts and total > 1 - 1e-6:
-        counts[max(fractions, key=lambda name: fractions[name])] += len(scenes) - sum(
-            counts.values()
-        )
+    counts = _counts(len(scenes), fractions)
     owner, at = {}, 0
     # test first: more scenes later leave it alone for longest
     for name in (name for name in NAMES[::-1] if name in counts):
         owner.update(dict.fromkeys(order[at : at + counts[name]], name))
         at += counts[name]
     return owner
+
+
+def _counts(many: int, fractions: Mapping[str, float]) -> dict[str, int]:
+    """Return how many of `many` things each fraction gets, one at least."""
+    counts = {name: max(1, round(fraction * many)) for name, fraction in fractions.items()}
+    while counts and sum(counts.values()) > many:
+        counts[max(counts, key=lambda name: counts[name])] -= 1
+    # rounding leaves nothing unused where the fractions are to use all
+    if counts and sum(fractions.values()) > 1 - 1e-6:
+        counts[max(fractions, key=lambda name: fractions[name])] += many - sum(counts.values())
+    return counts
 
 
 def _named(records: Sequence[FrameRecord], patterns: list[str], part: str) -> list[int]:
@@ -121,12 +178,10 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
     if path is None:
         raise UserError(f"data.split: no such list of frames: {file} (nor below {root})")
     if path.suffix == ".json":
-        targets = {
-            (int(t["scene_id"]), int(t["im_id"]), int(t["obj_id"])) for t in _json_list(path)
-        }
+        targets = {(t["scene_id"], t["im_id"], t["obj_id"]) for t in _json_list(path)}
         chosen = [i for i, r in enumerate(records) if (r.scene_id, r.im_id, r.obj_id) in targets]
     else:
-        lines = {line.strip() for line in path.read_text().splitlines() if line.strip()}
+        lines = set(read_lines(path))
         chosen = [i for i, r in enumerate(records) if r.name in lines]
     if not chosen:
         raise UserError(
@@ -135,9 +190,13 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
     return chosen
 
 
-def _json_list(path: Path) -> list[dict[str, Any]]:
+def _json_list(path: Path) -> list[dict[str, int]]:
     try:
-        content = json.loads(path.read_text())
-        return [t for t in content if {"scene_id", "im_id", "obj_id"} <= set(t)]
-    except (json.JSONDecodeError, TypeError) as error:
+        content = json.loads(read_bytes(path))
+        return [
+            {key: int(t[key]) for key in ("scene_id", "im_id", "obj_id")}
+            for t in content
+            if {"scene_id", "im_id", "obj_id"} <= set(t)
+        ]
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise UserError(f"{path}: not a list of BOP targets ({error})") from error

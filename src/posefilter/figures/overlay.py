@@ -93,14 +93,9 @@ def view_poses(
     poses: Sequence[np.ndarray], shape: Shape, K: np.ndarray, height: int, width: int, shown: int
 ) -> View:
     """Return a close-up of where poses put the object; the whole frame where that is nowhere."""
-    box_head = get_bounds(shape)
+    bounds = get_bounds(shape)
     corners = np.array(
-        [
-            [box_head[i, 0], box_head[j, 1], box_head[k, 2]]
-            for i in (0, 1)
-            for j in (0, 1)
-            for k in (0, 1)
-        ]
+        [[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     )
     found = []
     for pose in poses:
@@ -216,7 +211,7 @@ def get_vertices(shape: Shape) -> np.ndarray:
 def get_bounds(shape: Shape) -> np.ndarray:
     """Return the least and greatest corners of the object's box.  -> (2, 3) [m]."""
     if isinstance(shape, Mesh):
-        return shape.box_head
+        return shape.bounds
     return np.stack([get_vertices(shape).min(0), get_vertices(shape).max(0)])
 
 

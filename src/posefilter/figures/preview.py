@@ -32,6 +32,8 @@ def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray:
     known = np.concatenate([sample.depth[sample.depth > 0] for _, sample in found] or [np.ones(1)])
     near, far = np.quantile(known, [0.01, 0.99])
     tiles = [draw_frame(sample, name, float(near), float(far)) for name, sample in found]
+    if len(tiles) == 1:  # the rows above and below need the width of two
+        tiles.append(np.full_like(tiles[0], 255))
     figure = arrange_grid([tiles[0], *tiles[1:]], len(tiles))
     head = draw_row(figure.shape[1], title, [("visible part", TRUTH)], size=18)
     return np.concatenate(

@@ -75,7 +75,7 @@ def _log_scene(rr: Any, stream: Any, shown: ViewData) -> None:
         rr.Points3D(shown.points, colors=shown.colors, radii=0.6 * shown.footprints),
         static=True,
     )
-    low, high = shown.mesh.box_head
+    low, high = shown.mesh.bounds
     size = {"centers": [(low + high) / 2], "half_sizes": [(high - low) / 2]}
     box = rr.Boxes3D(**size, colors=[ESTIMATE], fill_mode="majorwireframe")
     stream.log("estimate_box", _placed(rr, shown.estimate.pose), box, static=True)
@@ -231,9 +231,9 @@ def _layout(shown: ViewData) -> Any:
         ),
     )
     height, width = shown.rgb.shape[:2]
-    box_head = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
+    bounds = rrb.VisualBounds2D(x_range=[0, width], y_range=[0, height])
     image = rrb.Spatial2DView(
-        origin="/photograph", name="Particles on the photograph", visual_bounds=box_head
+        origin="/photograph", name="Particles on the photograph", visual_bounds=bounds
     )
     noise = rrb.TimeSeriesView(origin="/filter/noise", name="Noise level")
     effective = rrb.TimeSeriesView(origin="/filter/effective", name="Effective particles")

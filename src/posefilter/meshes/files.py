@@ -9,7 +9,7 @@ import trimesh
 
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, creased_normals
-from posefilter.meshes.obj import JSON, Material, RawMesh, read_image, read_obj
+from posefilter.meshes.obj import PLAIN, Material, RawMesh, read_image, read_obj
 
 SUFFIXES = (".obj", ".ply", ".glb")
 
@@ -138,7 +138,7 @@ def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:
     faces = np.asarray(mesh.faces, dtype=np.int64)
     visual = mesh.visual
     uv = colors = None
-    material = JSON
+    material = PLAIN
     if isinstance(visual, trimesh.visual.TextureVisuals):
         uv = None if visual.uv is None else np.asarray(visual.uv)[faces]
         material = _trimesh_material(visual.material)

@@ -44,7 +44,7 @@ class Mesh:
     symmetries: np.ndarray = field(default_factory=_identity)
 
     @cached_property
-    def box_head(self) -> np.ndarray:
+    def bounds(self) -> np.ndarray:
         """Return the corners of the axis-aligned box, least and greatest.  (2, 3) [m]."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
@@ -194,7 +194,7 @@ def object_model(
     """
     if points is None:
         points = surface_points(mesh, *sample_surface(mesh, count, seed))
-    low, high = mesh.box_head
+    low, high = mesh.bounds
     return ObjectModel(
         name=mesh.name,
         points=torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)),

@@ -20,7 +20,7 @@ class Material(NamedTuple):
     image: np.ndarray | None  # (h, w, 3) uint8 RGB
 
 
-JSON = Material(np.full(3, 0.7), None)
+PLAIN = Material(np.full(3, 0.7), None)
 
 
 class RawMesh(NamedTuple):
@@ -61,7 +61,7 @@ def _read_mtl(path: Path, source: Path) -> dict[str, Material]:
         rest = rest.strip()
         if key == "newmtl":
             name = rest
-            materials[name] = JSON
+            materials[name] = PLAIN
         elif key == "Kd" and name:
             materials[name] = materials[name]._replace(
                 color=np.array([float(x) for x in rest.split()[:3]])
@@ -100,7 +100,9 @@ def read_obj(path: Path) -> RawMesh:
     colors = (
         _rectangle(numbers["v"], 6)[:, 3:] if numbers["v"] and len(numbers["v"][0]) >= 6 else None
     )
-    known = [library.get(name, JSON) for name in materials] or list(library.values())[:1] or [JSON]
+    known = (
+        [library.get(name, PLAIN) for name in materials] or list(library.values())[:1] or [PLAIN]
+    )
     faces = index[..., 0]
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UserError(f"{path}: a face names a vertex that is not there (is the file cut short?)")

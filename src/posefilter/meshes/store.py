@@ -3,6 +3,7 @@ project draws itself.
 """
 
 import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +43,12 @@ class MeshStore:
     ) -> None:
         self.root, self.scale, self.symmetry_steps = root, scale, symmetry_steps
         self._given = dict(symmetries or {})
-        self._files = {} if str(root) == BUILTIN else _find_meshes(Path(root))
+        if not (isinstance(scale, int | float) and 0 < scale < math.inf):
+            raise UserError(f"mesh_scale={scale}: meters a unit of the mesh files, such as 0.001")
+        self._files: dict[str, Path] = {}
+        self._ambiguous: dict[str, str] = {}  # folders that do not tell which mesh is meant
+        if str(root) != BUILTIN:
+            self._files, self._ambiguous = _find_meshes(Path(root))
         self._loaded: dict[str, Mesh] = {}
 
     def names(self) -> list[str]:
@@ -59,15 +65,20 @@ class MeshStore:
         return self._loaded[name]
 
     def _load(self, name: str) -> Mesh:
+        if name in self._ambiguous:
+            raise UserError(self._ambiguous[name])
         if name not in self.names():
             near = difflib.get_close_matches(name, self.names(), n=1, cutoff=0.3)
-            hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(self.names())}"
-            raise UserError(f"no mesh named '{name}' in {self.root}: {hint}")
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise UserError(
+                f"no mesh named '{name}' in {self.root}; there are {', '.join(self.names())}; "
+                f"other meshes: data.meshes=DIR (generate, check_data, predict: meshes=DIR){hint}"
+            )
         if str(self.root) == BUILTIN:
             mesh = builtin.build(name)
         else:
             mesh = read_mesh(self._files[name], name, self.scale)
-            _check_unit(mesh, self._files[name])
+            _check_unit(mesh, self._files[name], self.scale)
         symmetries = self._symmetries(name)
         return mesh if symmetries is None else replace(mesh, symmetries=symmetries)
 
@@ -87,34 +98,39 @@ class MeshStore:
         return ycb.symmetries(name, self.symmetry_steps)
 
 
-def _find_meshes(root: Path) -> dict[str, Path]:
+def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
+    """Return the mesh of each class, and for classes whose mesh is not clear, why."""
     if not root.is_dir():
         raise UserError(
             f"{root}: no such folder of meshes (use 'builtin' for those that the "
             f"project draws itself)"
         )
     files: dict[str, Path] = {}
-    for entry in sorted(root.iterdir()):
-        found = (
-            _mesh_in(entry)
-            if entry.is_dir()
-            else entry
-            if entry.suffix.lower() in SUFFIXES
-            else None
-        )
-        if found is not None:
-            files.setdefault(entry.name if entry.is_dir() else entry.stem, found)
-    if not files:
+    ambiguous: dict[str, str] = {}
+    try:
+        for entry in sorted(root.iterdir()):
+            if not entry.is_dir():
+                if entry.suffix.lower() in SUFFIXES:
+                    files.setdefault(entry.stem, entry)
+                continue
+            found = _mesh_in(entry)
+            if isinstance(found, Path):
+                files.setdefault(entry.name, found)
+            elif found is not None:
+                ambiguous[entry.name] = found
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be read ({error.strerror})") from error
+    if not files and not ambiguous:
         kinds = "{obj,ply,glb}"
         raise UserError(
             f"{root}: no meshes here; expected <class>/google_16k/textured.obj, "
             f"<class>/*.{kinds} or *.{kinds}"
         )
-    return files
+    return files, {name: why for name, why in ambiguous.items() if name not in files}
 
 
-def _mesh_in(folder: Path) -> Path | None:
-    """Return the mesh that stands for a class's folder, None where there is none."""
+def _mesh_in(folder: Path) -> Path | str | None:
+    """Return the mesh that stands for a class's folder, None for none, or why it is not clear."""
     preferred = [
         folder / "google_16k" / "textured.obj",
         *(folder / f"textured{suffix}" for suffix in SUFFIXES),
@@ -124,7 +140,7 @@ def _mesh_in(folder: Path) -> Path | None:
             return path
     others = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
     if len({p.stem for p in others}) > 1:
-        raise UserError(
+        return (
             f"{folder}: {len(others)} meshes and none named textured.*: cannot tell "
             f"which one is meant"
         )
@@ -132,15 +148,17 @@ def _mesh_in(folder: Path) -> Path | None:
     return min(others, key=lambda p: SUFFIXES.index(p.suffix.lower()), default=None)
 
 
-def _check_unit(mesh: Mesh, path: Path) -> None:
+def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
+    """Raise UserError, naming the setting that mends it, where an object cannot be so large."""
     across = diameter(mesh.vertices)
     if across > _LARGEST:
         factor, unit = 0.001, "millimeters"
     elif across < _SMALLEST:
-        factor, unit = 1000.0, "kilometres, or scaled twice"
+        factor, unit = 1000.0, "kilometers, or scaled twice"
     else:
         return
+    value = f"{scale * factor:g}"
     raise UserError(
-        f"{path}: {across:.3g} m across: the mesh is probably in {unit}; give the "
-        f"mesh store scale={factor:g}"
+        f"{path}: {across:.3g} m across: the mesh is probably in {unit}; give "
+        f"data.mesh_scale={value} (generate, check_data, predict: mesh_scale={value})"
     )

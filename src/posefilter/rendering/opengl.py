@@ -73,13 +73,13 @@ class GLRenderer:
             moderngl: Any = importlib.import_module("moderngl")
         except ImportError as error:
             raise UserError(
-                "renderer=moderngl: the package is missing; pip install 'posefilter[moderngl]'"
+                "renderer=opengl: the package moderngl is missing; pip install 'posefilter[moderngl]'"
             ) from error
         try:
             self._gl: Any = moderngl.create_context(standalone=True, backend="egl")
         except Exception as error:
             raise UserError(
-                f"renderer=moderngl: no off-screen OpenGL here ({error}); install Mesa's EGL, or "
+                f"renderer=opengl: no off-screen OpenGL here ({error}); install Mesa's EGL, or "
                 f"use embree"
             ) from error
         self._gl.enable(moderngl.DEPTH_TEST)

@@ -71,11 +71,11 @@ class ObjectInFrame:
 
 def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
     """Describe a mesh by its own bounding box: upright turned y down, centerd."""
-    center = mesh.box_head.mean(0)
+    center = mesh.bounds.mean(0)
     aligned = np.eye(4)
     aligned[:3, :3] = _ALIGNED_FROM_UPRIGHT
     aligned[:3, 3] = -_ALIGNED_FROM_UPRIGHT @ center
-    sides = np.abs(_ALIGNED_FROM_UPRIGHT @ (mesh.box_head[1] - mesh.box_head[0]))
+    sides = np.abs(_ALIGNED_FROM_UPRIGHT @ (mesh.bounds[1] - mesh.bounds[0]))
     return ExportedObject(mesh.name, seg_id, aligned, sides)
 
 
@@ -117,15 +117,15 @@ def camera_settings(
 
 
 def frame_record(
-    objects: Sequence[ObjectInFrame], K: np.ndarray, eye: float = 0.0
+    objects: Sequence[ObjectInFrame], K: np.ndarray, right: float = 0.0
 ) -> dict[str, Any]:
-    """Return a frame's JSON.  eye: how far right of the left camera this one stands [m].
+    """Return a frame's JSON.  right: how far right of the left camera this one stands [m].
 
     There is no world here: the world frame (left-handed, x forward, y right, z up, centimeters) is
     the left camera's place.
     """
     camera = {
-        "location_worldframe": [0.0, eye * CM, 0.0],
+        "location_worldframe": [0.0, right * CM, 0.0],
         "quaternion_xyzw_worldframe": [0.0, 0.0, 0.0, 1.0],
     }
     return {"camera_data": camera, "objects": [_object_record(one, K) for one in objects]}

@@ -7,12 +7,14 @@ import json
 import logging
 import multiprocessing
 import os
+import shutil
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,11 +22,11 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from posefilter.errors import UserError
-from posefilter.meshes.store import MeshStore
+from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.progress import bars
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.painter import Job, Painter, make_renderer
-from posefilter.synthetic.scenes import SceneSettings
+from posefilter.synthetic.scenes import SceneSettings, choose_distractors
 from posefilter.synthetic.sensor import sensor_model
 from posefilter.synthetic.settle import load_mujoco
 
@@ -56,7 +58,7 @@ class Summary:
 def generate(
     out: Path | str,
     frames: int,
-    meshes: str | Path = "builtin",
+    meshes: str | Path = BUILTIN,
     object: str = "003_cracker_box",
     seed: int = 0,
     workers: int = 2,
@@ -72,15 +74,39 @@ def generate(
     settle: bool = False,
     renderer: str = "embree",
     progress: bool = True,
+    mesh_scale: float | None = None,
 ) -> Summary:
-    """Render `frames` frames of `object` into a FAT dataset at `out`, or go on with one that was
-    begun.
+    """Render frames of an object into a FAT dataset, or go on with one that was begun.
 
-    size: (width, height) [px]. camera: "ycb_video", "fat", or (fx, fy, cx, cy) [px] for that size.
-    sensor: "kinect" or "ideal". occlusion: the largest share of the target that may be hidden;
-    occluded_share: of frames in which something stands right in front of it. Frame i depends on the
-    settings, the seed and i alone. Raises UserError for bad values, and where `out` was begun with
-    other settings.
+    Frame i depends on the settings, the seed and i alone. Settings and the meshes that the frames
+    take are checked before anything is written.
+
+    Args:
+        out: The dataset's folder.
+        frames: How many frames it is to hold.
+        meshes: "builtin" or a folder.
+        object: The mesh that every frame shows.
+        seed: Decides every draw.
+        workers: Processes that render.
+        size: Width and height [px].
+        stereo: Also render a right camera.
+        sensor: "kinect" or "ideal".
+        camera: "ycb_video", "fat", or (fx, fy, cx, cy) [px] for that size.
+        occlusion: The largest share of the object that may be hidden.
+        occluded_share: The share of frames in which something stands right in front of it.
+        distractors: The least and most objects beside it.
+        tabletop_share: The share of frames on a table; in the rest objects float.
+        frames_per_scene: Frames that share surroundings and distractors.
+        settle: Let objects fall and come to rest (mujoco).
+        renderer: "embree" or "opengl".
+        progress: Draw a bar.
+        mesh_scale: Meters a unit of the mesh files; None: 1.
+
+    Returns:
+        What was done.
+
+    Raises:
+        UserError: A value or mesh is wrong, or `out` was begun with other settings.
     """
     out = Path(out)
     scenes = SceneSettings(
@@ -105,17 +131,17 @@ def generate(
         int(frames_per_scene),
         renderer,
         scenes,
+        1.0 if mesh_scale is None else float(mesh_scale),
     )
     _check(job, frames, workers)
-    store = MeshStore(meshes)
-    if object not in store.names():
-        store.load(object)  # says what is wrong with the name
-    _claim(out, job, frames)
+    store = MeshStore(meshes, scale=job.mesh_scale)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
+    check_meshes(job, store, todo)
+    _claim(out, job, frames)
     if todo:
         log.info("rendering %d frames of %s into %s", len(todo), object, out)
     began = time.perf_counter()
-    for _ in _run(job, out, todo, workers, progress):
+    for _ in _run(job, out, todo, workers, progress, store):
         pass
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
@@ -178,6 +204,22 @@ def _check(job: Job, frames: int, workers: int) -> None:
         load_mujoco()
 
 
+def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
+    """Read the meshes that frames take: the object and their scenes' distractors, no others.
+
+    Raises:
+        UserError: One is not there, cannot be read, or is in another unit.
+    """
+    if job.object not in store.names() or frames:
+        store.load(job.object)
+    if job.meshes == BUILTIN:
+        return
+    for number in sorted({frame // job.frames_per_scene for frame in frames}):
+        rng = job.scene_generator(number)
+        for name in choose_distractors(store, job.object, job.scenes, rng):
+            store.load(name)
+
+
 def _claim(out: Path, job: Job, frames: int) -> None:
     """Write the settings into a new dataset, or make sure that the one there has the same."""
     settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
@@ -185,17 +227,23 @@ def _claim(out: Path, job: Job, frames: int) -> None:
     if path.is_file():
         try:
             record = json.loads(path.read_text())
-            there, frames = record["settings"], max(frames, int(record["frames"]))
-        except (ValueError, KeyError, TypeError) as error:
+            there, before = _with_defaults(record["settings"]), int(record["frames"])
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(
                 f"{path}: not a generator's record any more ({error}); choose another out="
             ) from error
         differing = sorted(k for k in {*there, *settings} if there.get(k) != settings.get(k))
-        if differing:
+        if not any(out.glob("mixed/*/[0-9]*.json")):
+            # an earlier start failed before its first frame: nothing is kept of it
+            for folder in out.glob("mixed/scene*_0"):
+                shutil.rmtree(folder)
+        elif differing:
             keys = ", ".join(differing)
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
+        else:
+            frames = max(frames, before)
         for partial in out.glob("mixed/*/.*.part"):
             partial.unlink(missing_ok=True)
     elif out.is_dir() and any(out.iterdir()):
@@ -209,7 +257,15 @@ def _claim(out: Path, job: Job, frames: int) -> None:
     fat.write_json(path, {"settings": settings, "frames": frames, "versions": versions})
 
 
-def _run(job: Job, out: Path, todo: list[int], workers: int, progress: bool) -> Iterator[int]:
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return a record's settings with those that came later, and today's name of the renderer."""
+    out = {"mesh_scale": 1.0, **settings}
+    return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out
+
+
+def _run(
+    job: Job, out: Path, todo: list[int], workers: int, progress: bool, store: MeshStore
+) -> Iterator[int]:
     """Render frames, here or in processes; yield the number done after each lot."""
     lots: dict[tuple[int, int], list[int]] = {}
     for i in todo:
@@ -225,7 +281,7 @@ def _run(job: Job, out: Path, todo: list[int], workers: int, progress: bool) -> 
     with bars(*columns, shown=progress) as bar:
         task = bar.add_task("frames", total=len(todo), rate="")
         began, done = time.perf_counter(), 0
-        for count in _results(job, out, list(lots.values()), workers):
+        for count in _results(job, out, list(lots.values()), workers, store):
             done += count
             bar.update(
                 task, completed=done, rate=f"{done / (time.perf_counter() - began):.1f} frames/s"
@@ -233,10 +289,12 @@ def _run(job: Job, out: Path, todo: list[int], workers: int, progress: bool) -> 
             yield done
 
 
-def _results(job: Job, out: Path, lots: list[list[int]], workers: int) -> Iterator[int]:
+def _results(
+    job: Job, out: Path, lots: list[list[int]], workers: int, store: MeshStore
+) -> Iterator[int]:
     """Yield how many frames each lot had, as they finish."""
     if workers == 1 or len(lots) <= 1:
-        painter = Painter(job, out)
+        painter = Painter(job, out, store)
         for lot in lots:
             for frame in lot:
                 painter.write(frame)

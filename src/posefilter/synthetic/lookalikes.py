@@ -25,7 +25,7 @@ def make_lookalike(
         return stretched(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
     if printed and kind < 0.55:
         return stretched(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
-    sides = (target.box_head[1] - target.box_head[0]) * rng.uniform(0.45, 1.25, 3)
+    sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
     base = typical_color(target.texture) if kind < 0.85 else None
     return box(name, np.maximum(sides, 0.02), [as_bytes(label(rng, 96, base)) for _ in range(6)])
 

@@ -26,6 +26,7 @@ from posefilter.synthetic.scenes import (
 from posefilter.synthetic.sensor import sense, sensor_model
 
 ATTEMPTS = 400
+RENDERERS = ("embree", "opengl")
 
 
 @dataclass(frozen=True)
@@ -43,22 +44,27 @@ class Job:
     frames_per_scene: int
     renderer: str
     scenes: SceneSettings
+    mesh_scale: float = 1.0  # meters a unit of the mesh files
 
     def folder(self, frame: int) -> str:
         """Return the folder of a frame."""
         return f"mixed/scene{frame // self.frames_per_scene:04d}_0"
 
-    def eyes(self) -> tuple[tuple[str, float], ...]:
+    def cameras(self) -> tuple[tuple[str, float], ...]:
         """Return the cameras, and how far right of the left one they stand [m]."""
         return (("left", 0.0), ("right", fat.BASELINE)) if self.stereo else (("left", 0.0),)
+
+    def scene_generator(self, number: int) -> np.random.Generator:
+        """Return the generator that a folder's scene set is drawn from."""
+        return np.random.default_rng([self.seed, 1, number])
 
     def files(self, out: Path, frame: int) -> list[Path]:
         """Return the files of a frame, the one that is written last at the end."""
         stem = out / self.folder(frame) / f"{frame % self.frames_per_scene:06d}"
         endings = ("jpg", "depth.png", "seg.png", "json")
         return [
-            stem.with_name(f"{stem.name}.{eye}.{ending}")
-            for eye, _ in reversed(self.eyes())
+            stem.with_name(f"{stem.name}.{camera}.{ending}")
+            for camera, _ in reversed(self.cameras())
             for ending in endings
         ]
 
@@ -70,20 +76,29 @@ def make_renderer(name: str) -> Renderer:
     """
     if name == "embree":
         return EmbreeRenderer()
-    if name == "moderngl":
+    if name == "opengl":
         from posefilter.rendering.opengl import GLRenderer
 
         return GLRenderer()
-    raise UserError(f"renderer={name}: unknown; choose from embree, moderngl")
+    if name == "moderngl":
+        raise UserError("renderer=moderngl: is now called opengl")
+    raise UserError(f"renderer={name}: unknown; choose from {', '.join(RENDERERS)}")
 
 
 class Painter:
     """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
 
-    def __init__(self, job: Job, out: Path) -> None:
+    def __init__(self, job: Job, out: Path, store: MeshStore | None = None) -> None:
+        """Make a painter.
+
+        Args:
+            job: What to render.
+            out: The dataset's folder.
+            store: The job's meshes, where they are open already.
+        """
         self.job, self.out = job, out
         self.K = np.array(job.K)
-        self.library = Library(MeshStore(job.meshes))
+        self.library = Library(store or MeshStore(job.meshes, scale=job.mesh_scale))
         self.renderer = make_renderer(job.renderer)
         self.sensor = sensor_model(job.sensor)
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
@@ -91,16 +106,16 @@ class Painter:
     def scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
         """Return a folder's set, and its classes by name; write the folder's settings."""
         if self._scene is None or self._scene[0] != number:
-            rng = np.random.default_rng([self.job.seed, 1, number])
+            rng = self.job.scene_generator(number)
             scene = draw_set(self.library, self.job.object, self.job.scenes, rng)
             solids = (scene.target, *scene.distractors, *scene.lookalikes)
             step = min(12, 255 // len(solids))
             exported = [fat.export_object(s.mesh, step * (k + 1)) for k, s in enumerate(solids)]
             folder = self.out / self.job.folder(number * self.job.frames_per_scene)
             folder.mkdir(parents=True, exist_ok=True)
-            cameras = [name for name, _ in self.job.eyes()]
+            names = [name for name, _ in self.job.cameras()]
             fat.write_json(folder / fat.OBJECT_SETTINGS, fat.object_settings(exported))
-            camera = fat.camera_settings(self.K, self.job.height, self.job.width, cameras)
+            camera = fat.camera_settings(self.K, self.job.height, self.job.width, names)
             fat.write_json(folder / fat.CAMERA_SETTINGS, camera)
             self._scene = number, scene, {one.name: one for one in exported}
         return self._scene[1], self._scene[2]
@@ -130,9 +145,9 @@ class Painter:
         layout, picture, rng = self.draw(frame)
         _, exported = self.scene(frame // self.job.frames_per_scene)
         pending = []
-        for k, (_, eye) in enumerate(self.job.eyes()):
+        for k, (_, right) in enumerate(self.job.cameras()):
             if k > 0:
-                layout_here = shift_camera(layout, eye)
+                layout_here = shift_camera(layout, right)
                 picture = self.renderer.render(
                     layout_here.instances(),
                     self.K,
@@ -143,7 +158,7 @@ class Painter:
                 )
             else:
                 layout_here = layout
-            pending.append(self._images(layout_here, picture, exported, eye, rng))
+            pending.append(self._images(layout_here, picture, exported, right, rng))
         files = iter(self.job.files(self.out, frame))
         for images, record in reversed(pending):
             for image in images:
@@ -161,7 +176,7 @@ class Painter:
         layout: Layout,
         picture: Rendered,
         exported: dict[str, fat.ExportedObject],
-        eye: float,
+        right: float,
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
         """Return a camera's color, depth and segment images, and its record."""
@@ -179,7 +194,7 @@ class Painter:
                     )
                 )
         return [photo, fat.depth_units(depth), ids[picture.index]], fat.frame_record(
-            objects, self.K, eye
+            objects, self.K, right
         )
 
     def _truncated(self, hull: np.ndarray) -> float:

@@ -139,7 +139,7 @@ def apart(a: Placed, b: Placed) -> bool:
 
 def face(solid: Solid) -> float:
     """Return the second largest side of a solid's box [m]: how much it hides at best."""
-    low, high = solid.mesh.box_head
+    low, high = solid.mesh.bounds
     return float(np.sort(high - low)[1])
 
 

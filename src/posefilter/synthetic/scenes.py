@@ -94,12 +94,19 @@ class Library:
         return self._solids[name]
 
 
+def choose_distractors(
+    store: MeshStore, target: str, settings: SceneSettings, rng: np.random.Generator
+) -> list[str]:
+    """Choose the meshes that a scene set takes its distractors from: the set's first draw."""
+    others = [name for name in store.names() if name != target]
+    return [others[i] for i in rng.permutation(len(others))[: settings.classes]]
+
+
 def draw_set(
     library: Library, target: str, settings: SceneSettings, rng: np.random.Generator
 ) -> SceneSet:
     """Draw what the frames of one folder share."""
-    others = [name for name in library.store.names() if name != target]
-    chosen = [others[i] for i in rng.permutation(len(others))[: settings.classes]]
+    chosen = choose_distractors(library.store, target, settings, rng)
     goal = library.solid(target)
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
@@ -268,6 +275,7 @@ __all__ = [
     "Placed",
     "SceneSet",
     "SceneSettings",
+    "choose_distractors",
     "draw_layout",
     "draw_set",
     "shift_camera",

@@ -23,7 +23,7 @@ class Solid:
 def make_solid(mesh: Mesh) -> Solid:
     """Measure a mesh."""
     hull = mesh.vertices[np.unique((fibonacci_sphere(300) @ mesh.vertices.T).argmax(1))]
-    center = mesh.box_head.mean(0)
+    center = mesh.bounds.mean(0)
     rests, weights = resting_rotations(hull)
     return Solid(
         mesh, hull, center, float(np.linalg.norm(hull - center, axis=1).max()), rests, weights

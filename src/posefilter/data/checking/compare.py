@@ -207,7 +207,7 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
             )
         )
     center = np.eye(4)
-    center[:3, 3] = -view.mesh.box_head.mean(0)
+    center[:3, 3] = -view.mesh.bounds.mean(0)
     out.append(
         (
             "poses are of a frame at the center of the bounding box (as BOP's), the mesh has "

@@ -52,3 +52,17 @@ def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> floa
     """
     names = [objects] if isinstance(objects, str) else list(objects or [])
     return 0.001 if source == "bop" and all(name.startswith("obj_") for name in names) else 1.0
+
+
+def open_meshes(
+    root: str | Path, scale: float | None, source: str, objects: str | Sequence[str] | None
+) -> MeshStore:
+    """Open the meshes of a dataset.
+
+    Args:
+        root: "builtin" or a folder.
+        scale: Meters a unit of the mesh files; None: as `default_mesh_scale` has it.
+        source: The dataset's format.
+        objects: The classes asked for.
+    """
+    return MeshStore(root, scale=default_mesh_scale(source, objects) if scale is None else scale)

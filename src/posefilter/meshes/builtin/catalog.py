@@ -63,7 +63,7 @@ def boxed(name: str, size: tuple[float, float, float], prints: dict[str, np.ndar
 def _brick() -> Mesh:
     """Make the foam brick, which half turns about its three axes leave as it is."""
     mesh = boxed("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
-    center = mesh.box_head.mean(0)
+    center = mesh.bounds.mean(0)
     return replace(
         mesh,
         symmetries=np.stack([np.eye(4), *(turn_about(axis, np.pi, center) for axis in np.eye(3))]),

@@ -1,0 +1,123 @@
+"""Commands about data: what is typed replaces, one scene is enough, problems end with a status."""
+
+import json
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.cli.check_data import check_data
+from posefilter.cli.command import FAILURE, compose_job, run_command
+from posefilter.cli.evaluate import data_settings
+from posefilter.cli.generate import generate
+from posefilter.cli.train import build_data
+from posefilter.errors import ProblemsFound, UserError
+
+HOME = Path(__file__).parents[2]
+CONF = HOME / "conf"
+DEFAULTS = {"train": 0.8, "val": 0.1, "test": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("command", "overrides", "split"),
+    [
+        ("train", [], DEFAULTS),
+        ("train", ["data.split={test: 1.0}"], {"test": 1.0}),
+        ("evaluate", ["data=ycb_video", "++data.split={test: 1.0}"], {"test": 1.0}),
+        ("train", ["data.split.test=0.05"], {**DEFAULTS, "test": 0.05}),
+        ("train", ["data.split={train: 0.5}", "data.split.val=0.5"], {"train": 0.5, "val": 0.5}),
+        (
+            "train",
+            ["experiment=memorize", "data.split={train: 0.9, val: 0.1}"],
+            {"train": 0.9, "val": 0.1},
+        ),
+        (
+            "train",
+            ["data.split={test: keyframe.txt, train: 0.9, val: 0.1}"],
+            {"test": "keyframe.txt", "train": 0.9, "val": 0.1},
+        ),
+    ],
+)
+def test_a_split_that_is_typed_replaces(
+    tmp_path: Path, command: str, overrides: list[str], split: dict[str, object]
+) -> None:
+    job = compose_job(command, CONF, overrides, tmp_path)
+    assert job.cfg.data.split == split
+
+
+def test_the_next_commands_of_few_frames_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    out = tmp_path / "ten"
+    size = ["size=[96,72]", "workers=1", "console=json", "seed=4"]
+    generate(compose_job("generate", CONF, [f"out={out}", "frames=10", *size], tmp_path))
+    (following,) = json.loads(capsys.readouterr().out)["next"]
+    words = shlex.split(following)
+    assert words[:2] == ["python", "check_data.py"]
+    arguments = [*words[2:], "console=json"]
+    check_data(compose_job("check_data", CONF, arguments, tmp_path / "check"))
+    (following,) = json.loads(capsys.readouterr().out)["next"]
+    words = shlex.split(following)
+    assert words[:2] == ["python", "train.py"]
+    data = build_data(compose_job("train", CONF, words[2:], tmp_path).cfg.data, "json")
+    data.setup()
+    assert [len(data.records(name)) for name in ("train", "val", "test")] == [8, 1, 1]
+    assert "scores will flatter" in caplog.text
+
+
+def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    size = ["size=[96,72]", "workers=1", "console=json"]
+    generate(compose_job("generate", CONF, [f"out={tmp_path}/one", "frames=1", *size], tmp_path))
+    assert (tmp_path / "one" / "preview.png").is_file()
+    assert json.loads(capsys.readouterr().out)["frames"] == 1
+
+
+def test_problems_end_with_a_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "data"
+    size = ["size=[96,72]", "workers=1", "console=json"]
+    generate(compose_job("generate", CONF, [f"out={out}", "frames=2", *size], tmp_path))
+    folder = out / "mixed" / "scene0000_0"
+    content = json.loads((folder / "_camera_settings.json").read_text())
+    for camera in content["camera_settings"]:
+        camera["intrinsic_settings"]["cx"] += 20
+    (folder / "_camera_settings.json").write_text(json.dumps(content))
+    asked = ["data=fat", f"data.root={out}", "data.object=carton", "console=json"]
+    with pytest.raises(ProblemsFound, match=r"data: 2 problems; see .*data_report\.json"):
+        check_data(compose_job("check_data", CONF, asked, tmp_path / "check"))
+    monkeypatch.chdir(tmp_path)
+    assert run_command("check_data", HOME, [*asked, f"out={tmp_path / 'again'}"]) == FAILURE
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert json.loads((tmp_path / "again" / "data_report.json").read_text())["problems"]
+
+
+def test_an_evaluation_renders_nothing_unless_asked(tmp_path: Path) -> None:
+    typed = ["data=scenes", f"++data.root={tmp_path / 'mistyped'}"]
+    job = compose_job("evaluate", CONF, [*typed, "++data.object=carton"], tmp_path)
+    with pytest.raises(UserError, match=r"mistyped: no scenes here .* Nothing is rendered"):
+        build_data(data_settings(job, {}, None), "json")
+    assert not (tmp_path / "mistyped").exists()
+    small = ["++data.generate.frames=1", "++data.generate.size=[96,72]"]
+    job = compose_job("evaluate", CONF, [*typed, *small, "++data.object=carton"], tmp_path)
+    build_data(data_settings(job, {}, None), "json")
+    assert (tmp_path / "mistyped" / "mixed").is_dir()
+
+
+def test_a_mesh_scale_reaches_the_meshes(tmp_path: Path) -> None:
+    (tmp_path / "box.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 4\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n100 0 0\n0 100 0\n0 0 100\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
+    )
+    typed = [f"data.meshes={tmp_path}", "data.object=box", f"data.root={tmp_path}"]
+    with pytest.raises(UserError, match=r"data\.mesh_scale=0\.001"):
+        build_data(compose_job("train", CONF, typed, tmp_path).cfg.data, "json")
+    typed += ["data.mesh_scale=0.001", "data.generate.frames=0"]
+    job = compose_job("train", CONF, typed, tmp_path)
+    assert job.cfg.data.generate.mesh_scale == 0.001
+    with pytest.raises(UserError, match="frames=0"):  # the next thing that is wrong
+        build_data(job.cfg.data, "json")
+    predicts = compose_job("predict", CONF, ["meshes=x", "mesh_scale=0.001"], tmp_path)
+    assert np.isclose(predicts.cfg.mesh_scale, 0.001)
