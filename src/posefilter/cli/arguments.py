@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from posefilter.cli.renamed import rename
 from posefilter.errors import UserError
 
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
@@ -22,15 +23,27 @@ def bracketed(arguments: list[str]) -> list[str]:
 
 
 def check_choices(arguments: list[str], conf: Path) -> None:
-    """Raise UserError where a group is given a value instead of the name of one of its files: Hydra
-    stumbles over it.
+    """Raise UserError where a group is given a value instead of the name of one of its files, where
+    a choice is typed as a setting, and for names that have changed: Hydra stumbles over them.
     """
     for argument in arguments:
-        group, _, value = argument.partition("=")
-        if value.startswith(("[", "{")) and re.fullmatch(r"\w+", group) and (conf / group).is_dir():
-            options = sorted(file.stem for file in (conf / group).glob("*.yaml"))
+        key, _, value = argument.partition("=")
+        group = key.replace(".", "/") if re.fullmatch(r"\w+", value) else key
+        own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
+        if own and group != key:
+            raise UserError(f"{argument}: names a choice; type {group}={value}")
+        if own and value.startswith(("[", "{")):
+            options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
+        now = None if own and (conf / group / f"{value}.yaml").is_file() else rename(argument)
+        if now is not None:
+            raise UserError(f"{argument}: is now {now}")
+
+
+def list_choices(group: Path) -> list[str]:
+    """Return the choices of a group of conf/; files that begin with `_` are bases of others."""
+    return sorted(f.stem for f in group.glob("*.yaml") if not f.stem.startswith("_"))
 
 
 def spelled(arguments: Sequence[str]) -> list[str]:

@@ -17,7 +17,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from posefilter.cli.arguments import bracketed, check_choices, spelled
+from posefilter.cli.ablations import register_ablations
+from posefilter.cli.arguments import bracketed, check_choices, list_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, settle_logging
 from posefilter.cli.instantiate import hint
@@ -140,11 +141,12 @@ def job_of(cfg: DictConfig) -> Job:
 
 def register_resolvers() -> None:
     """Teach configurations `${first:a,b}` (not null), `${plain:text}` (fit for a folder),
-    `${run_of:checkpoint}`.
+    `${run_of:checkpoint}`, and the table of ablations.
     """
     OmegaConf.register_new_resolver("first", first, replace=True)
     OmegaConf.register_new_resolver("run_of", run_of, replace=True)
     OmegaConf.register_new_resolver("plain", plain_name, replace=True)
+    register_ablations()
 
 
 def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Job:
@@ -184,14 +186,17 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         and error.missing_cfg_file
     ):
         group, _, choice = error.missing_cfg_file.rpartition("/")
-        options = sorted(error.options)
-        if not options:  # the choices of some groups lie in a folder each
-            inner, group = group, group.partition("/")[0]
-            choice = f"{inner.partition('/')[2]}/{choice}".lstrip("/")
-            options = sorted(
-                str(f.relative_to(conf / group).with_suffix(""))
-                for f in (conf / group).rglob("*.yaml")
-            )
+        if group.split("/")[0] == "preset":  # its choices lie in a folder for each method
+            inner, group = group, "preset"
+            choice = f"{inner.removeprefix('preset').lstrip('/')}/{choice}".lstrip("/")
+            options = [
+                f"{folder.name}/{choice}"
+                for folder in sorted((conf / group).iterdir())
+                if folder.is_dir() and folder.name != "size"
+                for choice in list_choices(folder)
+            ]
+        else:
+            options = sorted(one for one in error.options if not one.startswith("_"))
         return (
             f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
             f"are {', '.join(options)}"
@@ -232,7 +237,7 @@ def known_keys(name: str, conf: Path, arguments: list[str], wrong: str) -> list[
             cfg = compose(name, good, return_hydra_config=True)
         except HydraException:
             cfg = compose(name, return_hydra_config=True)
-    groups = [str(k) for k in cfg.hydra.runtime.choices if "/" not in str(k)]
+    groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra/")]
     keys: list[str] = []
 
     def walk(node: Any, prefix: str) -> None:

@@ -30,7 +30,7 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
     chosen: dict[str, bool | int | float | str] = {
         group: choice
         for group, choice in job.choices.items()
-        if "/" not in group and group not in _PASSING and choice not in ("None", "null")
+        if group.split("/")[0] not in ("hydra", *_PASSING) and choice not in ("None", "null")
     }
     settings = OmegaConf.to_container(job.cfg, resolve=False)
     assert isinstance(settings, dict)

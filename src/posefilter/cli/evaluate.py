@@ -183,7 +183,8 @@ def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictCo
     settings = (
         dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
     )
-    tree = {**trained, "data": settings, "augment": {}, "seed": trained.get("seed", 0)}
+    settings["augment"] = {}
+    tree = {**trained, "data": settings, "seed": trained.get("seed", 0)}
     if chosen and own:
         before = OmegaConf.create(trained).data
         for key in OF_THE_CHECKPOINT:

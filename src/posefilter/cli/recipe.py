@@ -14,6 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from posefilter.cli.renamed import find_renamed
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
 from posefilter.paths import stays_inside
@@ -87,6 +88,11 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
     choices, settings = recipe["choices"], recipe["settings"]
     if not (isinstance(choices, dict) and isinstance(settings, dict)):
         raise UserError(f"{said}: its recipe's choices and settings should be mappings")
+    old = find_renamed(recipe)
+    if old is not None:
+        raise UserError(
+            f"{said}: was written by an earlier version ({old[0]} is now {old[1]}); train it again"
+        )
     foreign = sorted(str(key) for key in settings if key in NOT_KEPT)
     if foreign:
         raise UserError(

@@ -81,7 +81,7 @@ class DirectDisplacement:
     label asks for (Huber).
 
     Each step is judged by itself: its label takes the place where it stood as given, and blames no
-    earlier step for it. What was seen there is another matter: with place_gradient=flows it teaches
+    earlier step for it. What was seen there is another matter: with model.detach_position=false it teaches
     the displacement that led there, by this loss as by any.
     """
 

@@ -188,8 +188,8 @@ class PoseEstimator(LightningModule):
             raise FloatingPointError(
                 f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: "
                 f"a roll-out's can grow "
-                "with each step; choose place_gradient=stopped or train_filter=short (image "
-                "space), or fewer filter.steps"
+                "with each step; choose model.detach_position=true or "
+                "model/train_rollout=truncated (image space), or fewer filter.steps"
             )
 
     # -- validation and test ----------------------------------------------------------------------

@@ -53,8 +53,8 @@ class ImageSpace(PoseEstimator):
     net: given the patch's size, how many extra numbers a particle is told and how many make a pose;
     bounds: how particles bound the object in the image; lessons: losses beside the chosen one, by
     name; stages: factors on all of them as training proceeds (null: 1 throughout); relevance:
-    weight of the loss on the context's map, if it tells one; place_gradient: whether what is read
-    at a place also teaches the displacement that led there; truncate: cut the gradient through
+    weight of the loss on the context's map, if it tells one; detach_position: whether what is read
+    at a position has no gradient with respect to the displacement that led there; truncate: cut the gradient through
     places that are looked at, and through the latent, every so many steps (null: never), which
     changes no value. A place still hands its own gradient on to the next, so that over a long
     roll-out this damps the growth; only 1, a cut at every step, ends it.
@@ -78,7 +78,7 @@ class ImageSpace(PoseEstimator):
         aux_losses: Mapping[str, Auxiliary | None] | None = None,
         loss_schedule: Sequence[Stage] | None = None,
         relevance: float = 1.0,
-        place_gradient: bool = True,
+        detach_position: bool = False,
         truncate: int | None = None,
         object_model: ObjectModel | None = None,
         **base: Any,
@@ -102,9 +102,9 @@ class ImageSpace(PoseEstimator):
         check_poses(self)
         check_votes(self)
         check_fragments(self)
-        self.relevance_weight, self.place_gradient, self.truncate = (
+        self.relevance_weight, self.detach_position, self.truncate = (
             relevance,
-            place_gradient,
+            detach_position,
             truncate,
         )
         if object_model is not None:  # not in the base, where the pose code is not there yet
@@ -140,7 +140,7 @@ class ImageSpace(PoseEstimator):
         state, latent = particles.state, particles.latent
         if self.truncate and step.number % self.truncate == 0:
             state, latent = state.detach(), latent.detach()
-        if not self.place_gradient:
+        if self.detach_position:
             state = state.detach()
         patch = self.glimpse(scene.image, state)
         extra = torch.cat(

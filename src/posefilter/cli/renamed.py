@@ -1,0 +1,155 @@
+"""Names of settings that have changed: what was typed before, and what is typed now."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+# groups whose choices, and settings, are found elsewhere
+GROUPS = {
+    "initialise": "filter/initialize",
+    "initialize": "filter/initialize",
+    "schedule": "filter/schedule",
+    "reweigh": "filter/reweight",
+    "reweight": "filter/reweight",
+    "resample": "filter/resample",
+    "propose": "filter/propagate",
+    "propagate": "filter/propagate",
+    "estimate": "filter/estimate",
+    "refine": "filter/refine",
+    "context": "model/encoder",
+    "encoder": "model/encoder",
+    "glimpse": "model/glimpse",
+    "net": "model/net",
+    "pose_code": "model/pose_head",
+    "pose_head": "model/pose_head",
+    "bounds": "model/box_head",
+    "box_head": "model/box_head",
+    "motion": "model/displacement",
+    "displacement": "model/displacement",
+    "likelihood": "model/likelihood",
+    "proposals": "model/proposals",
+    "lesson": "model/candidate_sampler",
+    "candidate_sampler": "model/candidate_sampler",
+    "train_filter": "model/train_rollout",
+    "motion_lesson": "loss/aux/displacement",
+    "aux_displacement": "loss/aux/displacement",
+    "likelihood_lesson": "loss/aux/likelihood",
+    "aux_likelihood": "loss/aux/likelihood",
+    "pose_lesson": "loss/aux/pose",
+    "aux_pose": "loss/aux/pose",
+    "stages": "loss/schedule",
+    "loss_schedule": "loss/schedule",
+    "augment": "data/augment",
+    "rung": "ablation",
+    "deviation": "preset",
+}
+# groups and settings that are one setting now
+KEYS = {
+    "normalisation": "model.net.normalization",
+    "normalization": "model.net.normalization",
+    "place_gradient": "model.detach_position",
+    "model.place_gradient": "model.detach_position",
+    "patch": "model.glimpse.size",
+    "lessons": "model.aux_losses",
+    "aux_losses": "model.aux_losses",
+}
+_NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
+_CHOICES = {
+    "filter": {"pose_paper": "pose filter.particles=1000 filter.steps=100"},
+    "filter/estimate": {"best": "argmax"},
+    "filter/resample": {"never": "none"},
+    "filter/propagate": {"still": "identity"},
+    "model/displacement": {"held": "gated"},
+    "model/encoder": {
+        "resnet18": "resnet model.encoder.trunk.kind=resnet18",
+        "resnet34": "resnet model.encoder.trunk.kind=resnet34",
+    },
+    "model/train_rollout": {"same": "full", "short": "truncated"},
+    "loss/aux/displacement": {
+        "center": "towards model.aux_losses.displacement.loss.label.target=center"
+    },
+    "loss/schedule": {
+        "three": "three_stages",
+        "three_motion": "three_stages_displacement",
+        "only_motion": "displacement_only",
+        "only_likelihood": "likelihood_only",
+    },
+    "model.detach_position": {
+        "flows": "false",
+        "stopped": "true",
+        "true": "false",
+        "false": "true",
+    },
+    "experiment": {"memorise": "memorize"},
+    "console": {"plain": "json"},
+    "sweep": {"ladder": "ablation", "ladder_detect": "ablation_detect"},
+    "ablation": {
+        "s4_lesson": "s4_displacement_loss",
+        "s5_place": "s5_position",
+        "s9_lesson_and_place": "s9_displacement_loss_and_position",
+        "c1_normalisation": "c1_normalization",
+        "c5_lesson": "c5_displacement_loss",
+        "c6_place": "c6_position",
+        "c8_short": "c8_truncated",
+        "pose_c16_held": "pose_c16_gated",
+        "box_c12_held": "box_c12_gated",
+        "m1_normalisation": "m1_normalization",
+        "m5_lesson": "m5_displacement_loss",
+        "m6_place": "m6_position",
+        "m8_short": "m8_truncated",
+        "m12_held": "m12_gated",
+        "m13_rate": "m13_scheduler",
+    },
+}
+_BUDGET = "the preset, with its size apart: preset/size="
+
+
+def rename(override: str) -> str | None:
+    """Return what is typed today for an override with names of before; None where nothing changed.
+
+    Args:
+        override: As typed, such as `initialise=uniform` or `resample.alpha=0.2`.
+    """
+    sign, key, equals, value = _split(override)
+    if key == "budget":
+        return _BUDGET + value.partition("/")[0]
+    new = _rename_key(key)
+    choices = _CHOICES.get(new, {})
+    values = ",".join(choices.get(one, one) for one in value.split(","))
+    if (new, values) == (key, value):
+        return None
+    return f"{sign}{new}{equals}{values}"
+
+
+def _split(override: str) -> tuple[str, str, str, str]:
+    found = re.fullmatch(r"([+~]*)([^=]*)(=?)(.*)", override, re.DOTALL)
+    assert found is not None
+    return found[1], found[2], found[3], found[4]
+
+
+def _rename_key(key: str) -> str:
+    if key in KEYS:
+        return KEYS[key]
+    if key in GROUPS:
+        return GROUPS[key]
+    head, dot, rest = key.partition(".")
+    if not dot:
+        return key
+    if head in GROUPS:
+        group = GROUPS[head]
+        return f"{_NODES.get(group, group.replace('/', '.'))}.{rest}"
+    return f"{KEYS[head]}.{rest}" if head in KEYS else key
+
+
+def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return the first name of before in a checkpoint's recipe, and today's; None where there is
+    none.
+
+    Args:
+        recipe: Its `choices` and `settings`.
+    """
+    old = [*recipe.get("choices", ()), *recipe.get("settings", ())]
+    for name in map(str, old):
+        if name in GROUPS or name in KEYS:
+            return name, _rename_key(name)
+    return None
