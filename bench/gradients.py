@@ -24,7 +24,7 @@ from posefilter.cli.train import build_data, build_method, quiet, recipe
 
 HOME = Path(__file__).parents[1]
 STEPS = (1, 2, 4, 8, 16, 30)
-LADDERS = {"cnn_patch": "ladder_detect", "patch_pf": "ablation"}
+LADDERS = {"cnn_patch": "ablation_detect", "patch_pf": "ablation"}
 RUNGS = (
     "paper",
     "s1_glimpse",
@@ -32,7 +32,7 @@ RUNGS = (
     "c1_normalization",
     "c2_glimpse",
     "c3_bounded",
-    "c6_place",
+    "c6_position",
 )
 
 

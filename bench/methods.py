@@ -27,8 +27,11 @@ MODELS = (*DETECTORS, *WITH_POSE)
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"
 # ablations of more than one seed; the detectors' paper and working are in the table of
 # memorization, with all seeds
-TELLING = "paper,s4_lesson,s5_place,s9_lesson_and_place,c5_lesson,c6_place,c9_context,pose_c12_loss,working"
-TELLING_BOX = "s2_bounded,c1_normalization,c6_place"
+TELLING = (
+    "paper,s4_displacement_loss,s5_position,s9_displacement_loss_and_position,c5_displacement_loss,"
+    "c6_position,c9_context,pose_c12_loss,working"
+)
+TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
@@ -62,11 +65,13 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ),
     ]
     lines += [
-        ablation("resampling", "resample=none,systematic,guided", MEMORISED, model)
+        ablation("resampling", "filter/resample=none,systematic,guided", MEMORISED, model)
         for model in MODELS
     ]
     lines += [
-        Line("ladder_detect", f"model={m} experiment=memorize sweep=ablation_detect seed=0", into=m)
+        Line(
+            "ablation_detect", f"model={m} experiment=memorize sweep=ablation_detect seed=0", into=m
+        )
         for m in DETECTORS
     ]
     lines += [Line("held_out", f"{FOUR},pose_pf seed=0")]  # pose_pf beside them
@@ -78,20 +83,26 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ablation("iterations", "filter.steps=1,2,3,5,10,30,100", HELD_OUT, model)
         for model in MODELS
     ]
-    noise = "propagate=learned,learned_and_gaussian filter.steps=10,100"
+    noise = "filter/propagate=learned,learned_and_gaussian filter.steps=10,100"
     lines += [ablation("noise", noise, HELD_OUT, model) for model in WITH_POSE]
     lines += [
         Line("ablation", f"model={m} experiment=memorize sweep=ablation seed=0", into=m)
         for m in WITH_POSE
     ]
     # does the gradient through the place harm where nothing multiplies it, and whose?
-    short = "model=patch_pf experiment=memorize sweep=ablation ablation=c5_lesson,c6_place train_filter=short"
+    short = (
+        "model=patch_pf experiment=memorize sweep=ablation "
+        "ablation=c5_displacement_loss,c6_position model/train_rollout=truncated"
+    )
     lines += [
-        Line("place_gradient", f"{short} loss_schedule=none,only_motion,only_likelihood seed=0,1,2")
+        Line(
+            "detach_position",
+            f"{short} loss/schedule=none,displacement_only,likelihood_only seed=0,1,2",
+        )
     ]
     for models, sweep, ablations in (
         (WITH_POSE, "ablation", TELLING),
-        (DETECTORS, "ladder_detect", TELLING_BOX),
+        (DETECTORS, "ablation_detect", TELLING_BOX),
     ):
         seeds = f"experiment=memorize sweep={sweep} ablation={ablations} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
@@ -103,9 +114,9 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("held_out", f"{FOUR} seed=1,2"),
         Line(
             "held_out_less",
-            "model=patch_pf ablation=m9_context,pose_m17_fragments,m11_muon,m5_lesson seed=0",
+            "model=patch_pf ablation=m9_context,pose_m17_fragments,m11_muon,m5_displacement_loss seed=0",
         ),
-        ablation("held_out_less", "resample=none", HELD_OUT, "patch_pf"),
+        ablation("held_out_less", "filter/resample=none", HELD_OUT, "patch_pf"),
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     if meshes:

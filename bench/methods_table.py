@@ -25,6 +25,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from posefilter.cli.ablations import find_ablation
 from posefilter.metrics.registry import find_metric, read_number
 from posefilter.report.events import read_events
 
@@ -63,7 +64,6 @@ SILENT = (
     "data.meshes",
     "data.workers",
 )
-RUNGS = Path(__file__).parents[1] / "conf" / "ablation"
 # of ablations, by what their names begin with
 ORDER = ("paper", "s", "box_s", "c", "box_c", "pose_c", "working", "m", "box_m", "pose_m")
 
@@ -98,11 +98,11 @@ def key_of(run: dict[str, Any]) -> tuple[str, str, str]:
 
 
 def place(key: tuple[str, str, str]) -> tuple[Any, ...]:
-    """Return what rows are sorted by: methods and numbers as one counts them, ablations as the
-    ablation climbs.
+    """Return what rows are sorted by: methods and numbers as one counts them, ablations in
+    order.
     """
     model, variant, rest = key
-    ablation = re.search(rf"\brung=({'|'.join(ORDER)})(\d*)(?:_|\b)", rest)
+    ablation = re.search(rf"\bablation=({'|'.join(ORDER)})(\d*)(?:_|\b)", rest)
     climbed = (ORDER.index(ablation[1]), int(ablation[2] or 0)) if ablation else (-1, 0)
     return (
         model,
@@ -113,18 +113,12 @@ def place(key: tuple[str, str, str]) -> tuple[Any, ...]:
 
 
 def told(rest: str) -> str:
-    """Return what was chosen, as it is typed; a ablation also in its file's own words."""
+    """Return what was chosen, as it is typed; an ablation also in its description's words."""
     if not rest:
         return ""
-    ablation = re.search(r"\brung=(\w+)", rest)
-    file = RUNGS / f"{ablation[1]}.yaml" if ablation else None
-    lines = file.read_text().splitlines() if file and file.is_file() else []
-    words = (
-        lines[1].removeprefix("# ").rstrip(".")
-        if len(lines) > 1 and lines[1].startswith("# ")
-        else ""
-    )
-    return f"`{rest}`" + (f" {words}" if words else "")
+    named = re.search(r"\bablation=(\w+)", rest)
+    ablation = find_ablation(named[1]) if named else None
+    return f"`{rest}`" + (f" {ablation.description.rstrip('.')}" if ablation else "")
 
 
 def figure(run: dict[str, Any], read: Callable[[dict[str, Any]], Any]) -> float | None:

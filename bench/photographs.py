@@ -61,26 +61,60 @@ def plan() -> list[Run]:
     """Return all trainings; a warm start follows the run that it starts from."""
     few = "data.limit_val=2 data.limit_test=10"
     warm = f"warm_start={CRACKER}"
-    from_drill = f"augment=camera_whole warm_start={DRILL}"
+    from_drill = f"data/augment=camera_whole warm_start={DRILL}"
     pair = f"data.limit_val=4 data.limit_test=20 {warm}"
     return [
-        Run("mustard_pose_camera", "006_mustard_bottle", "pose_pf", 300, f"augment=camera {pair}"),
-        Run("mustard_pose_strong", "006_mustard_bottle", "pose_pf", 300, f"augment=strong {pair}"),
-        Run("drill_pose_camera", "035_power_drill", "pose_pf", 400, f"augment=camera {few} {warm}"),
-        Run("sugar_pose_camera", "004_sugar_box", "pose_pf", 300, f"augment=camera {few} {warm}"),
         Run(
-            "gelatin_pose_camera", "009_gelatin_box", "pose_pf", 300, f"augment=camera {few} {warm}"
+            "mustard_pose_camera",
+            "006_mustard_bottle",
+            "pose_pf",
+            300,
+            f"data/augment=camera {pair}",
+        ),
+        Run(
+            "mustard_pose_strong",
+            "006_mustard_bottle",
+            "pose_pf",
+            300,
+            f"data/augment=strong {pair}",
+        ),
+        Run(
+            "drill_pose_camera",
+            "035_power_drill",
+            "pose_pf",
+            400,
+            f"data/augment=camera {few} {warm}",
+        ),
+        Run(
+            "sugar_pose_camera",
+            "004_sugar_box",
+            "pose_pf",
+            300,
+            f"data/augment=camera {few} {warm}",
+        ),
+        Run(
+            "gelatin_pose_camera",
+            "009_gelatin_box",
+            "pose_pf",
+            300,
+            f"data/augment=camera {few} {warm}",
         ),
         Run(
             "chef_can_pose_camera",
             "002_master_chef_can",
             "pose_pf",
             300,
-            f"augment=camera {few} {warm}",
+            f"data/augment=camera {few} {warm}",
         ),
-        Run("mug_pose_camera", "025_mug", "pose_pf", 300, f"augment=camera {few} {warm}"),
-        Run("foam_pose_camera", "061_foam_brick", "pose_pf", 300, f"augment=camera {few} {warm}"),
-        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, "augment=camera_whole"),
+        Run("mug_pose_camera", "025_mug", "pose_pf", 300, f"data/augment=camera {few} {warm}"),
+        Run(
+            "foam_pose_camera",
+            "061_foam_brick",
+            "pose_pf",
+            300,
+            f"data/augment=camera {few} {warm}",
+        ),
+        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, "data/augment=camera_whole"),
         Run("mustard_patch_camera", "006_mustard_bottle", "patch_pf", 1000, from_drill),
         Run("sugar_patch_camera", "004_sugar_box", "patch_pf", 1000, from_drill),
     ]

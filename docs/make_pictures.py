@@ -64,8 +64,8 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
 # the ablations of docs/methods.md that its picture shows, and what to say of each
 ABLATIONS = {
     "paper": "The paper's",
-    "c5_lesson": "Told the way, and few arrive",
-    "c6_place": "No gradient through the place",
+    "c5_displacement_loss": "Told the way, and few arrive",
+    "c6_position": "No gradient through the place",
     "c9_context": "And global context",
 }
 # those with a pose first: each has one color in all charts

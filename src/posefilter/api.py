@@ -32,7 +32,7 @@ def load(
         weights: A checkpoint, a run's folder, or the name of weights that ship with posefilter,
             such as `003_cracker_box`; or a list of these, one an object.
         overrides: What to change of the filter, as typed on the command line: such as
-            `filter.particles=1000` or `refine=none`.
+            `filter.particles=1000` or `filter/refine=none`.
         device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
 
     Returns:

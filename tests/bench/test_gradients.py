@@ -75,11 +75,11 @@ def test_a_place_that_is_taken_as_given_ends_the_growth(gradients, tmp_path: Pat
         "threads=1",
     ]
     growth = {}
-    for ablation in ("c3_bounded", "c6_place"):
+    for ablation in ("c3_bounded", "c6_position"):
         first, last = (
-            gradients.gradient("cnn_patch", "ladder_detect", ablation, steps, small)
+            gradients.gradient("cnn_patch", "ablation_detect", ablation, steps, small)
             for steps in (1, 8)
         )
         growth[ablation] = last / first
     assert growth["c3_bounded"] > 1000
-    assert growth["c6_place"] < 10
+    assert growth["c6_position"] < 10

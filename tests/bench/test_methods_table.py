@@ -41,11 +41,11 @@ def test_seeds_are_joined_and_other_choices_kept_apart(tmp_path: Path) -> None:
 
 
 def test_what_a_single_row_changed_is_told(tmp_path: Path) -> None:
-    run(tmp_path / "a", 0.9, "model=patch_pf", "variant=working", "resample=none")
+    run(tmp_path / "a", 0.9, "model=patch_pf", "variant=working", "filter/resample=none")
     assert (
         methods_table.table(methods_table.read_runs([tmp_path]))
         .splitlines()[2]
-        .startswith("| patch_pf | `resample=none` |")
+        .startswith("| patch_pf | `filter/resample=none` |")
     )
 
 

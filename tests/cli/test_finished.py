@@ -23,7 +23,7 @@ def job(folder: Path, overrides: list[str], swept: bool = True) -> Job:
         (TYPED, True),
         (["seed=1", "model=downsized"], True),
         ([*TYPED, "threads=1", "out=elsewhere", "data.workers=2"], True),
-        ([*TYPED, "encoder=none"], False),
+        ([*TYPED, "model/encoder=none"], False),
         (["model=downsized", "seed=2", "console=json"], False),
     ],
     ids=["the same", "another order", "with other hands", "another piece", "another seed"],

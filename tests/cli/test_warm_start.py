@@ -21,7 +21,9 @@ CONF = Path(__file__).parents[2] / "conf"
 def build(folder: Path, name: str, seed: int, *overrides: str) -> PoseEstimator:
     """Return an untrained method for a builtin object."""
     torch.manual_seed(seed)
-    small = ["net.width=16", "net.latent_width=8"] if "model=patch_pf" in overrides else []
+    small = (
+        ["model.net.width=16", "model.net.latent_width=8"] if "model=patch_pf" in overrides else []
+    )
     method = build_method(recipe(compose_job("train", CONF, [*overrides, *small], folder)))
     method.set_object(object_model(MeshStore("builtin").load(name), count=200))
     return method

@@ -10,12 +10,12 @@ from posefilter.cli.command import compose_job
 from posefilter.cli.instantiate import instantiate
 
 CONF = Path(__file__).parents[2] / "conf"
-CHOICES = sorted(path.stem for path in (CONF / "augment").glob("*.yaml"))
+CHOICES = sorted(path.stem for path in (CONF / "data" / "augment").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_every_augmentation_builds_and_runs(choice: str, tmp_path: Path) -> None:
-    cfg = compose_job("train", CONF, [f"augment={choice}"], tmp_path).cfg
+    cfg = compose_job("train", CONF, [f"data/augment={choice}"], tmp_path).cfg
     augment = instantiate(cfg.data.augment, "data.augment")
     if augment is None:
         assert choice == "none"

@@ -45,9 +45,11 @@ def test_a_single_figure_is_switched_off_by_its_name(tmp_path: Path) -> None:
 
 
 def test_a_run_is_told_apart_by_choices_and_settings_but_not_by_where_it_is(tmp_path: Path) -> None:
-    job = compose(tmp_path, "refine=none", "filter.particles=50", f"out={tmp_path}", "seed=3")
+    job = compose(
+        tmp_path, "filter/refine=none", "filter.particles=50", f"out={tmp_path}", "seed=3"
+    )
     settings = comparable(job)
-    assert settings["refine"] == "none"
+    assert settings["filter/refine"] == "none"
     assert settings["filter.particles"] == 50
     assert settings["seed"] == 3
     assert "model.filter" not in settings  # it repeats the section `filter`

@@ -7,12 +7,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
+from posefilter.cli.arguments import check_choices, list_choices
 from posefilter.cli.checkpoints import build_method, check_loss, recipe
 from posefilter.cli.command import compose_job, explain
+from posefilter.cli.comparing import leaves
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
@@ -20,21 +24,16 @@ from posefilter.models.pose_pf import PosePF
 
 HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
-MODELS = sorted(path.stem for path in (CONF / "model").glob("*.yaml"))
-VARIANTS = sorted(path.stem for path in (CONF / "variant").glob("*.yaml"))
-EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
-SWEEPS = sorted(path.stem for path in (CONF / "sweep").glob("*.yaml"))
+MODELS = list_choices(CONF / "model")
+VARIANTS = list_choices(CONF / "variant")
+EXPERIMENTS = list_choices(CONF / "experiment")
+SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect"]
 BUILT = (
-    "initialize",
-    "schedule",
-    "reweight",
-    "resample",
-    "propagate",
-    "estimate",
-    "refine",
+    *(f"filter/{step}" for step in ("initialize", "schedule", "reweight", "resample")),
+    *(f"filter/{step}" for step in ("propagate", "estimate", "refine")),
     "loss",
-    "lesson",
-    "likelihood",
+    "model/candidate_sampler",
+    "model/likelihood",
 )
 
 
@@ -54,15 +53,31 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_what_a_deviation_and_a_budget_set_holds(model: str, variant: str, tmp_path: Path) -> None:
+def test_what_a_preset_sets_holds(model: str, variant: str, tmp_path: Path) -> None:
     """No choice later in the list of defaults may undo it."""
     cfg = compose(tmp_path, f"model={model}", f"variant={variant}").cfg
-    files = [CONF / kind / model / f"{variant}.yaml" for kind in ("deviation", "budget")]
-    bodies = [OmegaConf.load(file) for file in files if file.is_file()]
-    for group, settings in (pair for body in bodies for pair in body.items()):
-        for name, value in settings.items() if OmegaConf.is_dict(settings) else []:
-            if not OmegaConf.is_interpolation(settings, name):
-                assert cfg[group][name] == value, f"{group}.{name}"
+    body = OmegaConf.load(CONF / "preset" / model / f"{variant}.yaml")
+    del body["defaults"]
+    settings = dict(leaves(OmegaConf.to_container(body)))
+    assert settings
+    for key, value in settings.items():
+        assert OmegaConf.select(cfg, key) == value, key
+
+
+@pytest.mark.parametrize("model", [m for m in MODELS if m != "pose_pf"])
+def test_a_papers_choices_are_had_at_the_working_size(model: str, tmp_path: Path) -> None:
+    """`preset/size` changes numbers alone, and makes them those of the working preset."""
+    paper = compose(tmp_path, f"model={model}", "variant=paper")
+    small = compose(tmp_path, f"model={model}", "variant=paper", f"preset/size={model}")
+    working = compose(tmp_path, f"model={model}")
+    ignored = {"preset/size", "hydra/launcher"}
+    assert {k: v for k, v in small.choices.items() if k not in ignored} == {
+        k: v for k, v in paper.choices.items() if k not in ignored
+    }
+    for key in ("filter.particles", "filter.steps", "data.batch_size", "data.image_width"):
+        assert OmegaConf.select(small.cfg, key) == OmegaConf.select(working.cfg, key), key
+    assert small.cfg.model.net.width == working.cfg.model.net.width
+    assert small.cfg.model.truncate is working.cfg.model.truncate is None
 
 
 def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:
@@ -87,10 +102,13 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None:
-    params = OmegaConf.load(CONF / "sweep" / f"{sweep}.yaml").hydra.sweeper.params
     model = "cnn_patch" if "detect" in sweep else "patch_pf"
+    with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
+        swept = hydra_compose("train", [f"sweep={sweep}"], return_hydra_config=True)
     points = [
-        f"{key}={value}" for key, values in params.items() for value in str(values).split(",")
+        f"{key}={value}"
+        for key, values in swept.hydra.sweeper.params.items()
+        for value in str(values).split(",")
     ]
     assert points
     for point in points:
@@ -105,7 +123,7 @@ def test_every_piece_builds_by_itself(group: str, tmp_path: Path) -> None:
             assert instantiate(cfg, group) is not None, path
 
 
-@pytest.mark.parametrize("data", sorted(path.stem for path in (CONF / "data").glob("*.yaml")))
+@pytest.mark.parametrize("data", sorted(path.stem for path in (CONF / "data").glob("[!_]*.yaml")))
 def test_every_data_choice_builds(data: str, tmp_path: Path) -> None:
     module = instantiate(compose(tmp_path, f"data={data}", "data.root=somewhere").cfg.data, "data")
     assert module.source == data
@@ -124,7 +142,7 @@ MISTAKES = {
     "filter.partcles=5": ("filter.partcles", "filter.particles"),
     "data=scene": ("data=scene", "scenes"),
     "trainer.max_step=3": ("trainer.max_step", "trainer.max_steps"),
-    "experiment=memorize": ("experiment=memorize", "memorize"),
+    "experiment=memorise": ("experiment=memorise", "is now experiment=memorize"),
     "loss=add": ("loss=add", "contrast, regression"),
     "filter.particles=many": ("filter.particles='many'", "whole number"),
     "filter.particles=0": ("particles=0", "1 or more"),
@@ -133,13 +151,15 @@ MISTAKES = {
     "seed=x": ("seed=x", "whole number"),
     "console=loud": ("console=loud", "json"),
     "resume=nowhere": ("resume=nowhere", "not a run's folder"),
-    "initialize.x=1": ("initialize.x", "no such setting"),
+    "filter.initialize.x=1": ("filter.initialize.x", "no such setting"),
+    "filter.refine=none": ("filter.refine=none", "type filter/refine=none"),
+    "filter/refine=non": ("filter/refine=non", "none"),
     "x=[1": ("[1",),
     "loss=[bce,add]": ("loss=[bce,add]", "takes the name of a choice", "add, add_s"),
-    "loss_schedule=[{until: 1.0}]": (
-        "loss_schedule=[{until: 1.0}]",
+    "loss/schedule=[{until: 1.0}]": (
+        "loss/schedule=[{until: 1.0}]",
         "takes the name of a choice",
-        "three_motion",
+        "three_stages_displacement",
     ),
 }
 
@@ -218,7 +238,7 @@ class TestBuilding:
         assert later([torch.nn.Parameter(torch.zeros(1))]).param_groups[0]["lr"] == 0.5
 
 
-@pytest.mark.parametrize("entry", sorted(path.stem for path in CONF.glob("*.yaml")))
+@pytest.mark.parametrize("entry", list_choices(CONF))
 def test_no_setting_is_called_as_a_group_that_its_command_does_not_compose(entry: str) -> None:
     """Hydra would take `size=[320,240]` for the choice of a group `size`, and say that there is no
     such setting.
@@ -231,19 +251,26 @@ def test_no_setting_is_called_as_a_group_that_its_command_does_not_compose(entry
         for key in item
     }
     groups = {path.name for path in CONF.iterdir() if path.is_dir()}
-    # debug is read before Hydra; augment is what a data module asks for, and not to be typed
-    handled = {"debug", "augment"}
+    handled = {"debug"}  # it is read before Hydra
     assert not (set(page) & groups) - composed - handled
 
 
-@pytest.mark.parametrize(
-    ("typed", "meant"), [("budget=patch_pf/wrking", "patch_pf/working"), ("encoder=unett", "unet")]
-)
-def test_a_choice_that_is_not_there_names_the_nearest(
-    typed: str, meant: str, tmp_path: Path
-) -> None:
+def test_a_choice_that_is_not_there_names_the_nearest(tmp_path: Path) -> None:
+    typed = "model/encoder=unett"
     with pytest.raises(MissingConfigException) as caught:
         compose_job("train", CONF, ["model=patch_pf", typed], tmp_path)
     told = explain(caught.value, "train", CONF, [typed])
-    assert told.startswith(f"{typed}: there is no such choice; did you mean '{meant}'; there are ")
+    assert told.startswith(f"{typed}: there is no such choice; did you mean 'unet'; there are ")
     assert "\n" not in told
+
+
+def test_a_preset_that_is_not_there_is_refused_though_a_method_need_not_have_one(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(UserError, match=r"preset=patch_pf/wrking.*'patch_pf/working'"):
+        check_choices(["preset=patch_pf/wrking"], CONF)
+    own = tmp_path / "preset" / "patch_pf" / "wrking.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text("# @package _global_\n{}\n")
+    check_choices(["preset=patch_pf/wrking", "--config-dir", str(tmp_path)], CONF)
+    check_choices(["preset=null"], CONF)

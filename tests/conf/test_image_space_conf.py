@@ -5,10 +5,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 from toy import scenes, square
 
+from posefilter.cli.ablations import (
+    ABLATIONS,
+    Ablation,
+    list_detector_ablations,
+    list_pose_ablations,
+)
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.errors import UserError
@@ -63,7 +70,7 @@ def test_the_papers_figures(model: str, tmp_path: Path) -> None:
         "cnn_patch": (50, 30, 9),
         "downsized": (50, 30, 9),
     }[model]
-    assert (job.cfg.filter.particles, job.cfg.filter.steps, job.cfg.patch) == want
+    assert (job.cfg.filter.particles, job.cfg.filter.steps, job.cfg.model.glimpse.size) == want
     assert job.choices["loss"] == {"pixel_pf": "add", "patch_pf": "bce"}.get(model, "chamfer")
     assert (job.cfg.data.image_width == 160) == (model == "downsized")
     method = build_method(recipe(job), square())
@@ -77,18 +84,36 @@ def test_the_papers_figures(model: str, tmp_path: Path) -> None:
 
 
 REMEDIES = [
-    "encoder=none", "encoder=pyramid", "encoder=resnet18", "glimpse=integer", "normalization=batch", "displacement=unbounded",
-    "aux_displacement=none", "aux_displacement=center", "aux_likelihood=none", "aux_likelihood=focal", "loss_schedule=three",
-    "train_filter=same", "resample=none", "resample=guided", "initialize=from_relevance", "initialize=informed",
-    "propagate=learned_and_gaussian", "patch=6", "displacement=gated", "place_gradient=flows", "loss_schedule=three_motion",
-    "loss_schedule=only_motion", "loss_schedule=only_likelihood",
-]  # fmt: skip
+    "model/encoder=none",
+    "model/encoder=pyramid",
+    "model/encoder=resnet model.encoder.trunk.kind=resnet18",
+    "model/glimpse=integer",
+    "model.net.normalization=batch",
+    "model/displacement=unbounded",
+    "loss/aux/displacement=none",
+    "loss/aux/displacement=towards model.aux_losses.displacement.loss.label.target=center",
+    "loss/aux/likelihood=none",
+    "loss/aux/likelihood=focal",
+    "loss/schedule=three_stages",
+    "model/train_rollout=full",
+    "filter/resample=none",
+    "filter/resample=guided",
+    "filter/initialize=from_relevance",
+    "filter/initialize=informed",
+    "filter/propagate=learned_and_gaussian",
+    "model.glimpse.size=6",
+    "model/displacement=gated",
+    "model.detach_position=false",
+    "loss/schedule=three_stages_displacement",
+    "loss/schedule=displacement_only",
+    "loss/schedule=likelihood_only",
+]
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "downsized"])
 @pytest.mark.parametrize("change", REMEDIES)
 def test_each_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
-    method = build(tmp_path, f"model={model}", change)
+    method = build(tmp_path, f"model={model}", *change.split())
     step(method)
     with torch.no_grad():
         trace = method.eval().predict_step(scenes(2), 0)
@@ -102,17 +127,18 @@ def test_the_motions_margin_is_as_much_of_the_object_at_either_width(tmp_path: P
     }  # type: ignore[attr-defined]
     assert margins == {"pixel_pf": 3, "patch_pf": 3, "cnn_patch": 6, "downsized": 3}
     assert (
-        "displacement" not in build(tmp_path, "model=cnn_patch", "aux_displacement=none").aux_losses
+        "displacement"
+        not in build(tmp_path, "model=cnn_patch", "loss/aux/displacement=none").aux_losses
     )
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        "pose_head=absolute",
-        "pose_head=own_point aux_pose=none",
-        "estimate=densest_pose",
-        "estimate=mean",
+        "model/pose_head=absolute",
+        "model/pose_head=own_point loss/aux/pose=none",
+        "filter/estimate=densest_pose",
+        "filter/estimate=mean",
     ],
 )
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf"])
@@ -121,8 +147,8 @@ def test_each_pose_remedy_is_one_choice(model: str, change: str, tmp_path: Path)
 
 
 def test_fragments_are_not_left_untaught(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="aux_pose=own_point"):
-        build(tmp_path, "model=patch_pf", "aux_pose=none")
+    with pytest.raises(UserError, match="loss/aux/pose=own_point"):
+        build(tmp_path, "model=patch_pf", "loss/aux/pose=none")
     method = build(tmp_path, "model=patch_pf")
     step(method)
     last = [m for m in method.net.pose if isinstance(m, torch.nn.Linear)][-1]
@@ -132,74 +158,68 @@ def test_fragments_are_not_left_untaught(tmp_path: Path) -> None:
 
 def test_the_memorization_test_shows_the_images_that_it_learned(tmp_path: Path) -> None:
     job = compose_job("train", CONF, ["model=patch_pf", "experiment=memorize"], tmp_path)
-    assert job.choices["augment"] == "none"
+    assert job.choices["data/augment"] == "none"
     data = job.cfg.data
     assert data.split.test == data.split.val == "train"
     assert data.limit_train == data.limit_test == data.limit_val
     assert data.min_visibility == data.min_visibility_test
 
 
-SEVERAL = {  # ablations that are more than one choice, or a setting of one
-    "s9_lesson_and_place": {"aux_displacement", "place_gradient"},
-    "box_s10_steps": set(),
-    "m7_informed": set(),
-    "m8_short": {"train_filter", "initialize"},
-    "pose_c11_own_point": {"pose_head", "aux_pose"},
-    "pose_c15_noise": {"propagate", "schedule"},
-    "pose_m14_own_point": {"pose_head", "aux_pose", "estimate"},
-    "pose_m18_noise": {"propagate", "schedule"},
+SEVERAL = {  # ablations that are more than one change
+    "s9_displacement_loss_and_position": 2,
+    "m8_truncated": 2,
+    "pose_c11_own_point": 2,
+    "pose_c15_noise": 2,
+    "pose_m14_own_point": 3,
+    "pose_m18_noise": 2,
 }
 
 
-@pytest.mark.parametrize("sweep", ["ablation", "ladder_detect"])
-def test_each_rung_of_the_ladder_changes_what_its_name_says(sweep: str, tmp_path: Path) -> None:
-    model = "patch_pf" if sweep == "ablation" else "cnn_patch"
-    ablations = (
-        (CONF / "sweep" / f"{sweep}.yaml")
-        .read_text()
-        .split("ablation: paper,")[1]
-        .strip()
-        .split(",")
+@pytest.mark.parametrize("ablation", ABLATIONS, ids=[a.name for a in ABLATIONS])
+def test_each_ablation_changes_what_it_says(ablation: Ablation, tmp_path: Path) -> None:
+    """Its choices and settings are its parent's, but for its own overrides."""
+    model = "cnn_patch" if ablation.name.startswith("box_") else "patch_pf"
+    parent = ablation.parent if "=" in ablation.parent else f"ablation={ablation.parent}"
+    before, after = (
+        compose_job("train", CONF, [f"model={model}", typed], tmp_path)
+        for typed in (parent, f"ablation={ablation.name}")
     )
-    # these cannot be trained; the next is still a remedy more than they
-    if sweep == "ladder_detect":
-        ablations[ablations.index("c6_place") : ablations.index("c6_place")] = [
-            "c3_bounded",
-            "c4_balanced",
-            "c5_lesson",
-        ]
-    said = [f"model={model}", f"sweep={sweep}"]
-    base = {
-        v: compose_job("train", CONF, [*said, f"ablation={v}"], tmp_path).choices
-        for v in ("paper", "working")
+    assert len(ablation.overrides) == SEVERAL.get(ablation.name, "variant" not in ablation.parent)
+    ignored = ("ablation", "hydra/launcher")
+    changed = {
+        group
+        for group in after.choices
+        if after.choices[group] != before.choices.get(group) and group not in ignored
     }
-    assert base["paper"]["variant"] == "paper"
-    before = base["paper"]
-    ignored = ("ablation", "variant", "deviation", "sweep")
-    for ablation in ablations:
-        choices = compose_job("train", CONF, [*said, f"ablation={ablation}"], tmp_path).choices
-        # a detector's ablation starts from the paper's size, whose long roll-outs are among what
-        # fails
-        less = ablation.startswith(("m", "box_m", "pose_m"))
-        whole = sweep == "ablation" or less or ablation in ("box_c14_size", "working")
-        assert choices["budget"] == f"{model}/{'working' if whole else 'paper'}", (
-            "else a ablation is more than its remedy"
-        )
-        if ablation.startswith("c") or ablation.startswith(("box_c", "pose_c")):
-            against, before = before, choices
-        else:
-            against = base["working" if less else "paper"]
-        changed = {
-            k
-            for k in choices
-            if choices[k] != against.get(k) and k not in ignored and not k.startswith("hydra")
-        }
-        assert changed == SEVERAL.get(ablation, changed), ablation
-        assert ablation == "working" or ablation in SEVERAL or len(changed) == 1, (
-            ablation,
-            changed,
-        )
-    start = compose_job(
-        "train", CONF, [*said, "ablation=m7_informed"], tmp_path
-    ).cfg.train_filter.initialize
-    assert start.share == 0
+    assert changed == {
+        o.partition("=")[0] for o in ablation.overrides if "." not in o.split("=")[0]
+    }
+    for override in ablation.overrides:
+        key, _, value = override.partition("=")
+        now = OmegaConf.select(after.cfg, key) if "." in key else after.choices[key]
+        assert str(now).lower() == value.replace("${model}", model), override
+        if "." in key:
+            assert OmegaConf.select(before.cfg, key) != now, override
+
+
+@pytest.mark.parametrize(
+    ("sweep", "model", "names"),
+    [
+        ("ablation", "patch_pf", list_pose_ablations()),
+        ("ablation_detect", "cnn_patch", list_detector_ablations()),
+    ],
+)
+def test_a_sweep_of_the_table_is_of_one_size(
+    sweep: str, model: str, names: list[str], tmp_path: Path
+) -> None:
+    """All runs of a method with a pose are as large as the working preset; a detector's start from
+    the paper's size, whose long roll-outs are among what fails.
+    """
+    working = compose_job("train", CONF, [f"model={model}"], tmp_path).cfg
+    for name in (names[0], names[-1]):
+        typed = [f"model={model}", f"sweep={sweep}", f"ablation={name}"]
+        cfg = compose_job("train", CONF, typed, tmp_path).cfg
+        whole = sweep == "ablation" or name.startswith("box_m")
+        assert (cfg.filter.steps == working.filter.steps) == whole
+        assert (cfg.model.net.width == working.model.net.width) == whole
+        assert cfg.filter.particles == (128 if sweep == "ablation" else 32)

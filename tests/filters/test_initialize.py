@@ -154,9 +154,9 @@ def test_informed_starts_read_the_mask_in_training_only() -> None:
 @pytest.mark.parametrize(
     ("piece", "method", "words"),
     [
-        (UniformPixels(), Poses(), "initialize=uniform draws pixels"),
-        (FromRelevance(), Poses(), "initialize=from_relevance draws pixels"),
-        (FromDepth(), Pixels(), "initialize=from_depth draws poses"),
+        (UniformPixels(), Poses(), "filter/initialize=uniform draws pixels"),
+        (FromRelevance(), Poses(), "filter/initialize=from_relevance draws pixels"),
+        (FromDepth(), Pixels(), "filter/initialize=from_depth draws poses"),
         (FromRelevance(), Pixels(), "no map of relevance"),
         (FromProposals(), Pixels(), "proposes no poses"),
     ],

@@ -17,7 +17,7 @@ from posefilter.images import check_images
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
 NAME = "003_cracker_box"
-FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "refine=none"]
+FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "filter/refine=none"]
 
 
 def read_scene(number: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

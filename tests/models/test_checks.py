@@ -47,8 +47,8 @@ def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_objec
     choice: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as refusal:
-        check_estimate(build(tmp_path, *choice.split(), "estimate=agreement"))
-    one_line(refusal, "estimate=agreement", "estimate=argmax")
+        check_estimate(build(tmp_path, *choice.split(), "filter/estimate=agreement"))
+    one_line(refusal, "filter/estimate=agreement", "filter/estimate=argmax")
     check_estimate(build(tmp_path, *choice.split()))
 
 
@@ -60,7 +60,7 @@ def test_agreement_serves_both_pose_methods_before_they_know_their_object(
     job = compose_job(
         "train",
         CONF,
-        [f"model={model}", "estimate=agreement", f"train_filter={train_filter}"],
+        [f"model={model}", "filter/estimate=agreement", f"train_filter={train_filter}"],
         tmp_path,
     )
     method = build_method(recipe(job))
@@ -69,9 +69,18 @@ def test_agreement_serves_both_pose_methods_before_they_know_their_object(
 
 
 def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: Path) -> None:
-    small = ["filter.particles=8", "filter.first_particles=null", "filter.steps=1", "refine=none"]
+    small = [
+        "filter.particles=8",
+        "filter.first_particles=null",
+        "filter.steps=1",
+        "filter/refine=none",
+    ]
     method = build(
-        tmp_path, "initialize=from_depth", "proposals=none", "likelihood=contrastive", *small
+        tmp_path,
+        "filter/initialize=from_depth",
+        "model/proposals=none",
+        "model/likelihood=contrastive",
+        *small,
     ).eval()
     assert isinstance(method.filter.estimate, Argmax)
     with torch.no_grad():
@@ -79,7 +88,7 @@ def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: 
         method.filter.estimate = Agreement()
         with pytest.raises(UserError) as refusal:
             method.predict_step(scenes(1), 0)
-    one_line(refusal, "estimate=agreement", "PosePF", "estimate=argmax")
+    one_line(refusal, "filter/estimate=agreement", "PosePF", "filter/estimate=argmax")
 
 
 @pytest.mark.parametrize("variant", ["paper", "working"])
@@ -88,8 +97,10 @@ def test_votes_are_refused_where_the_memory_is_a_latent(
     model: str, variant: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as refusal:
-        check_votes(images(tmp_path, f"model={model}", f"variant={variant}", "box_head=votes"))
-    one_line(refusal, "box_head=votes", "box_head=pose", "box_head=spread")
+        check_votes(
+            images(tmp_path, f"model={model}", f"variant={variant}", "model/box_head=votes")
+        )
+    one_line(refusal, "model/box_head=votes", "model/box_head=pose", "model/box_head=spread")
     for box_head in ("pose", "spread"):
         check_votes(
             images(tmp_path, f"model={model}", f"variant={variant}", f"box_head={box_head}")
@@ -97,35 +108,42 @@ def test_votes_are_refused_where_the_memory_is_a_latent(
 
 
 def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
-    for legal in ("box_head=votes", "box_head=spread"):
+    for legal in ("model/box_head=votes", "model/box_head=spread"):
         check_votes(images(tmp_path, "model=cnn_patch", legal))
-    check_votes(images(tmp_path, "model=cnn_patch", "box_head=spread", "net.latent_width=0"))
+    check_votes(
+        images(tmp_path, "model=cnn_patch", "model/box_head=spread", "model.net.latent_width=0")
+    )
     for width in (0, 3):
         with pytest.raises(UserError) as refusal:
             check_votes(
-                images(tmp_path, "model=cnn_patch", "box_head=votes", f"net.latent_width={width}")
+                images(
+                    tmp_path, "model=cnn_patch", "model/box_head=votes", f"net.latent_width={width}"
+                )
             )
-        one_line(refusal, f"net.latent_width={width}", "box_head=votes needs 4")
+        one_line(refusal, f"net.latent_width={width}", "model/box_head=votes needs 4")
 
 
 WIDE = ["filter.particles=8", "filter.first_particles=20", "filter.steps=2"]
 LEGAL = [
-    "train_filter=short filter.first_particles=20 filter.steps=2",
-    "train_filter=same filter.first_particles=null filter.steps=2",
-    "train_filter=same filter.first_particles=8 filter.steps=2",
+    "model/train_rollout=truncated filter.first_particles=20 filter.steps=2",
+    "model/train_rollout=full filter.first_particles=null filter.steps=2",
+    "model/train_rollout=full filter.first_particles=8 filter.steps=2",
     # one cloud is of one size, whatever it is
-    "train_filter=same filter.first_particles=20 filter.steps=1",
+    "model/train_rollout=full filter.first_particles=20 filter.steps=1",
 ]
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "cnn_patch"])
 def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> None:
     batch = scenes(2)
-    method = images(tmp_path, f"model={model}", "train_filter=same", *WIDE)
+    method = images(tmp_path, f"model={model}", "model/train_rollout=full", *WIDE)
     with pytest.raises(UserError) as refusal:
         check_training_clouds(method)
     one_line(
-        refusal, "filter.first_particles=20", "filter.first_particles=null", "train_filter=short"
+        refusal,
+        "filter.first_particles=20",
+        "filter.first_particles=null",
+        "model/train_rollout=truncated",
     )
     with torch.no_grad():  # a wide search is fine where nothing is taught
         trace = method.eval().predict_step(batch, 0)
@@ -139,30 +157,35 @@ def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> 
 
 def test_a_short_filters_own_first_cloud_is_named_as_it_is_typed(tmp_path: Path) -> None:
     wide = [
-        "train_filter.first_particles=200",
-        "train_filter.resample._target_=posefilter.filters.resample.Systematic",
+        "model.train_filter.first_particles=200",
+        "model.train_filter.resample._target_=posefilter.filters.resample.Systematic",
     ]
     method = images(tmp_path, "model=patch_pf", *wide)
     assert isinstance(method.train_filter.resample, Systematic)
     with pytest.raises(UserError) as refusal:
         check_training_clouds(method)
-    one_line(refusal, "train_filter.first_particles=200", "train_filter.first_particles=null")
+    one_line(
+        refusal, "model.train_filter.first_particles=200", "model.train_filter.first_particles=null"
+    )
 
 
 NUMBERS = {
     "model=patch_pf patch=-1": ["patch=-1", "1 pixel or more"],
-    "model=cnn_patch patch=0": ["patch=0", "1 pixel or more"],
-    "model=pixel_pf glimpse=integer patch=0": ["patch=0", "1 pixel or more"],
-    "model=patch_pf glimpse.spacing=0": ["glimpse.spacing=0", "above 0"],
-    "model=patch_pf estimate.options=0": ["estimate", "options=0", "1 or more"],
-    "model=patch_pf estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
-    "model=patch_pf estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
-    "candidate_sampler.levels=1": ["lesson", "levels=1", "2 or more"],
-    "candidate_sampler.particles=-1": ["lesson", "particles=-1", "0 for none"],
-    "model=patch_pf net.latent_width=0": ["net", "latent_width=0", "1 or more"],
-    "model=patch_pf net.layers=0": ["net", "layers=0", "1 or more"],
-    "model=cnn_patch net.width=0": ["net", "width=0", "1 or more"],
-    "model=cnn_patch net.hidden=-1": ["net", "hidden=-1", "0 or more"],
+    "model=cnn_patch model.glimpse.size=0": ["model.glimpse.size=0", "1 pixel or more"],
+    "model=pixel_pf model/glimpse=integer model.glimpse.size=0": [
+        "model.glimpse.size=0",
+        "1 pixel or more",
+    ],
+    "model=patch_pf model.glimpse.spacing=0": ["model.glimpse.spacing=0", "above 0"],
+    "model=patch_pf filter.estimate.options=0": ["estimate", "options=0", "1 or more"],
+    "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
+    "model=patch_pf filter.estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
+    "model.candidate_sampler.levels=1": ["lesson", "levels=1", "2 or more"],
+    "model.candidate_sampler.particles=-1": ["lesson", "particles=-1", "0 for none"],
+    "model=patch_pf model.net.latent_width=0": ["net", "latent_width=0", "1 or more"],
+    "model=patch_pf model.net.layers=0": ["net", "layers=0", "1 or more"],
+    "model=cnn_patch model.net.width=0": ["net", "width=0", "1 or more"],
+    "model=cnn_patch model.net.hidden=-1": ["net", "hidden=-1", "0 or more"],
 }
 
 
@@ -178,19 +201,25 @@ def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(
 @pytest.mark.parametrize(
     "typed",
     [
-        "model=pixel_pf patch=1", "model=patch_pf patch=6", "model=cnn_patch patch=1", "model=patch_pf estimate.options=1",
-        "model=patch_pf estimate.hypotheses=1", "model=patch_pf estimate.options=100", "model=patch_pf estimate.rounds=0",
-        "model=patch_pf net.layers=1", "model=cnn_patch net.hidden=0", "model=patch_pf "
-                                                                       "glimpse.spacing=2",
+        "model=pixel_pf model.glimpse.size=1",
+        "model=patch_pf model.glimpse.size=6",
+        "model=cnn_patch model.glimpse.size=1",
+        "model=patch_pf filter.estimate.options=1",
+        "model=patch_pf filter.estimate.hypotheses=1",
+        "model=patch_pf filter.estimate.options=100",
+        "model=patch_pf filter.estimate.rounds=0",
+        "model=patch_pf model.net.layers=1",
+        "model=cnn_patch model.net.hidden=0",
+        "model=patch_pf model.glimpse.spacing=2",
     ],
-)  # fmt: skip
+)
 def test_the_least_that_is_legal_takes_a_step(typed: str, tmp_path: Path) -> None:
     batch = scenes(2)
     method = images(
         tmp_path,
         *typed.split(),
-        "encoder=none",
-        "train_filter=same",
+        "model/encoder=none",
+        "model/train_rollout=full",
         "filter.particles=8",
         "filter.steps=2",
     )
@@ -203,15 +232,19 @@ def test_the_least_that_is_legal_takes_a_step(typed: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "typed",
     [
-        "candidate_sampler.levels=2",
-        "candidate_sampler.particles=0",
-        "candidate_sampler.particles=1",
+        "model.candidate_sampler.levels=2",
+        "model.candidate_sampler.particles=0",
+        "model.candidate_sampler.particles=1",
     ],
 )
 def test_the_fewest_persistent_particles_and_levels_teach(typed: str, tmp_path: Path) -> None:
     batch = scenes(2)
     method = build(
-        tmp_path, typed, "proposals=none", "initialize=from_depth", "likelihood=contrastive"
+        tmp_path,
+        typed,
+        "model/proposals=none",
+        "filter/initialize=from_depth",
+        "model/likelihood=contrastive",
     ).train()
     for visit in range(3):
         losses = method.training_losses(batch, method.generator("train", visit))
@@ -233,15 +266,21 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("model=cnn_patch box_head=pose", ("box_head=pose", "CnnPatch", "box_head=votes")),
-        ("model=patch_pf pose_head=none aux_pose=none", ("pose_head=none", "PatchPF", "own_point")),
         (
-            "model=cnn_patch aux_likelihood=quality",
-            ("aux_likelihood=quality", "CnnPatch", "balanced"),
+            "model=cnn_patch model/box_head=pose",
+            ("model/box_head=pose", "CnnPatch", "model/box_head=votes"),
         ),
         (
-            "model=downsized aux_pose=own_point",
-            ("aux_pose=own_point", "Downsized", "aux_pose=none"),
+            "model=patch_pf model/pose_head=none loss/aux/pose=none",
+            ("model/pose_head=none", "PatchPF", "own_point"),
+        ),
+        (
+            "model=cnn_patch loss/aux/likelihood=quality",
+            ("loss/aux/likelihood=quality", "CnnPatch", "balanced"),
+        ),
+        (
+            "model=downsized loss/aux/pose=own_point",
+            ("loss/aux/pose=own_point", "Downsized", "loss/aux/pose=none"),
         ),
     ],
 )

@@ -91,7 +91,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
         "displacement": Bounded(0.3),
         "bounds": VotedBox() if detects else PoseBox(),
         "lessons": aux_losses,
-        "place_gradient": False,
+        "detach_position": True,
         "filter": run_filter(
             64, 4, resample=Systematic(), estimate=Argmax() if detects else Agreement()
         ),

@@ -75,7 +75,7 @@ def test_a_stopped_place_keeps_the_likelihoods_loss_out_of_the_motion() -> None:
                 3,
                 loss=Bce(OnObject(3)),
                 glimpse=SmoothGlimpse(3),
-                place_gradient=not stopped,
+                detach_position=stopped,
             )
         )
         assert learns(method, "displacement") is learning

@@ -156,7 +156,7 @@ def test_neither_mask_nor_truth_is_looked_at(trained: PosePF) -> None:
 def test_without_proposals_the_start_must_be_another(trained: PosePF) -> None:
     method = working()
     method.proposals = None
-    with pytest.raises(UserError, match="proposals=dense"):
+    with pytest.raises(UserError, match="model/proposals=dense"):
         error(method, 1)
 
 
@@ -192,7 +192,7 @@ def test_the_papers_samples_lie_where_they_are_said_to() -> None:
 def test_the_papers_lesson_refuses_another_likelihood() -> None:
     method = working()
     method.candidate_sampler = LabeledRays()
-    with pytest.raises(UserError, match="likelihood=paper"):
+    with pytest.raises(UserError, match="model/likelihood=paper"):
         method.training_losses(scenes(1), torch.Generator().manual_seed(0))
 
 

@@ -261,7 +261,7 @@ def parts(trace: Trace) -> list[Tensor]:
 def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) -> None:
     torch.manual_seed(0)
     method = working(
-        kind, 3, place_gradient=True, train_filter=run_filter(12, 6, resample=Systematic())
+        kind, 3, detach_position=False, train_filter=run_filter(12, 6, resample=Systematic())
     )
     whole, cut = roll(method, None), roll(method, truncate)
     for a, b in zip(parts(whole), parts(cut), strict=True):
@@ -274,7 +274,7 @@ def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) 
 def test_a_step_that_is_cut_looks_back_at_none() -> None:
     torch.manual_seed(0)
     # reads patch, context and place
-    method = working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 6))
+    method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
     every = {(later, earlier) for later in range(6) for earlier in range(later)}
     whole = roll(method, None)
     assert pairs(whole, "displacement") == pairs(whole, "memory") == every
@@ -288,7 +288,7 @@ def test_a_step_that_is_cut_looks_back_at_none() -> None:
 
 def test_a_memory_is_cut_into_stretches() -> None:
     torch.manual_seed(0)
-    method = working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 6))
+    method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
     # no particle moves, so that latent is all that a step hands on
     method.train_filter.propagate = Identity()
     assert pairs(roll(method, 2), "memory") == {(1, 0), (3, 2), (5, 4)}
@@ -302,7 +302,7 @@ def test_places_that_are_judged_are_not_cut() -> None:
     looked at is cut.
     """
     torch.manual_seed(0)
-    trace = roll(working(PatchPF, 3, place_gradient=True, train_filter=run_filter(12, 4)), 1)
+    trace = roll(working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 4)), 1)
     for earlier in range(3):
         (gradient,) = torch.autograd.grad(
             trace.particles[3].state.sum(), trace.outputs[earlier].displacement, retain_graph=True

@@ -161,5 +161,5 @@ def test_images_that_are_not_too_wide_are_looked_at_as_they_are() -> None:
     free.load_state_dict(bounded.state_dict())
     with torch.no_grad():
         assert torch.equal(bounded(*scene(), K).levels[0], free(*scene(), K).levels[0])
-    with pytest.raises(UserError, match=r"context.most_px=16"):
+    with pytest.raises(UserError, match=r"model.encoder.most_px=16"):
         ConvEncoder(most_px=16)

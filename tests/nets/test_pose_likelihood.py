@@ -168,7 +168,7 @@ def test_what_the_context_says_changes_the_score() -> None:
 
 def test_context_without_a_proposal_network_is_refused() -> None:
     net = PoseLikelihood(width=32, blocks=1, context=2)
-    with pytest.raises(UserError, match="proposals=dense"):
+    with pytest.raises(UserError, match="model/proposals=dense"):
         net(lay_out(*image(), K), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator())
 
 

@@ -42,7 +42,7 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     found = read_sweep(sweep)
     panel = chart_over("filter.particles", found, group_jobs(found), [find_metric("add/auc")])[0]
     none, gradient = panel.lines
-    assert none.label == "refine=none"
+    assert none.label == "filter/refine=none"
     assert list(gradient.x) == [50.0, 1000.0]
     assert list(gradient.y) == pytest.approx([70.5 + 1 / 3, 80 + 1 / 3])
     assert list(gradient.low) == pytest.approx([68.5, 78.0])

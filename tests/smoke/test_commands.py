@@ -163,7 +163,7 @@ def test_pieces_change_at_test_time_and_sweeps_sum_up(
     typed = [
         f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}",
         f"data.root={tiny_scenes}",
-        "refine=none",
+        "filter/refine=none",
         "-m",
         "filter.particles=4,8",
     ]
@@ -195,7 +195,7 @@ def test_unknown_pieces_are_told(
 def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_scenes: Path) -> None:
     weights = tmp_path / "carton.ckpt"
     typed = [f"checkpoint={trained / 'checkpoints' / 'best.ckpt'}", f"out={weights}"]
-    assert run_command("export", HOME, [*typed, "refine=none", "filter.particles=9"]) == 0
+    assert run_command("export", HOME, [*typed, "filter/refine=none", "filter.particles=9"]) == 0
     assert weights.stat().st_size < 5e6
     recipe = torch.load(weights, weights_only=True)["recipe"]
     kept = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)["recipe"]["choices"]
@@ -325,10 +325,10 @@ def test_plain_is_for_machines(
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("initialize=from_depth", "initialize=from_depth.*PatchPF"),
-        ("initialize=from_relevance encoder=pyramid", "from_relevance.*PatchPF"),
-        ("resample=guided encoder=none", "resample=guided"),
-        ("refine=rescore", "refine.*PatchPF"),
+        ("filter/initialize=from_depth", "filter/initialize=from_depth.*PatchPF"),
+        ("filter/initialize=from_relevance model/encoder=pyramid", "from_relevance.*PatchPF"),
+        ("filter/resample=guided model/encoder=none", "filter/resample=guided"),
+        ("filter/refine=rescore", "refine.*PatchPF"),
     ],
 )
 def test_pieces_that_do_not_fit_are_told_of_before_any_training(

@@ -30,68 +30,253 @@ _DETACHED = "model.detach_position=true"
 _LAYER = "model.net.normalization=layer"
 _SMALL_NOISE = ("filter/propagate=learned_and_gaussian", "filter/schedule=pixels")
 
-# fmt: off
 ABLATIONS = (
     Ablation("paper", "The paper's.", "variant=paper"),
     Ablation("working", "All modifications.", "variant=working"),
-
     Ablation("s1_glimpse", "Paper, with bilinear glimpses.", "paper", ("model/glimpse=smooth",)),
-    Ablation("s2_bounded", "Paper, with bounded displacement.", "paper", ("model/displacement=bounded",)),
-    Ablation("s3_balanced", "Paper, with a class-balanced loss on the likelihood.", "paper", (_BALANCED,)),
-    Ablation("s4_displacement_loss", "Paper, with a loss on the displacement itself.", "paper", (_TOWARDS,)),
+    Ablation(
+        "s2_bounded", "Paper, with bounded displacement.", "paper", ("model/displacement=bounded",)
+    ),
+    Ablation(
+        "s3_balanced", "Paper, with a class-balanced loss on the likelihood.", "paper", (_BALANCED,)
+    ),
+    Ablation(
+        "s4_displacement_loss",
+        "Paper, with a loss on the displacement itself.",
+        "paper",
+        (_TOWARDS,),
+    ),
     Ablation("s5_position", "Paper, without gradient through the position.", "paper", (_DETACHED,)),
-    Ablation("s6_informed", "Paper, with half of the particles started on or around the object in training.", "paper", ("filter/initialize=informed",)),
-    Ablation("s7_context", "Paper, with features of the whole image.", "paper", ("model/encoder=unet",)),
-    Ablation("s8_resample", "Paper, with resampling by likelihood.", "paper", ("filter/resample=systematic",)),
-    Ablation("s9_displacement_loss_and_position", "Paper, with a loss on the displacement itself, without gradient through the position.", "paper", (_TOWARDS, _DETACHED)),
-    Ablation("box_s10_steps", "Paper, with ten steps instead of 30 (detectors).", "paper", ("filter.steps=10",)),
-
-    Ablation("c1_normalization", "Paper, with normalization that does not mix particles.", "paper", (_LAYER,)),
-    Ablation("c2_glimpse", "Also bilinear glimpses.", "c1_normalization", ("model/glimpse=smooth",)),
-    Ablation("c3_bounded", "Also bounded displacement.", "c2_glimpse", ("model/displacement=bounded",)),
-    Ablation("c4_balanced", "Also a class-balanced loss on the likelihood.", "c3_bounded", (_BALANCED,)),
-    Ablation("c5_displacement_loss", "Also a loss on the displacement itself.", "c4_balanced", (_TOWARDS,)),
-    Ablation("c6_position", "Also no gradient through the position.", "c5_displacement_loss", (_DETACHED,)),
-    Ablation("c7_informed", "Also half of the particles started on or around the object in training.", "c6_position", ("filter/initialize=informed",)),
-    Ablation("c8_truncated", "Also training roll-outs of two steps.", "c7_informed", ("model/train_rollout=truncated",)),
-    Ablation("c9_context", "Also features of the whole image.", "c8_truncated", ("model/encoder=unet",)),
-    Ablation("c10_resample", "Also resampling by likelihood (in tests; the truncated training has none).", "c9_context", ("filter/resample=systematic",)),
-
-    Ablation("pose_c11_own_point", "Also a pose head on the particle's own object point, with a loss of its own.", "c10_resample", ("model/pose_head=own_point", "loss/aux/pose=own_point")),
-    Ablation("pose_c12_loss", "Also a loss on the pose that is weighted by its confidence.", "pose_c11_own_point", ("loss=confidence",)),
-    Ablation("pose_c13_agreement", "Also the pose on which most particles agree as the estimate.", "pose_c12_loss", ("filter/estimate=agreement",)),
-    Ablation("pose_c14_fragments", "Also the own object point as a fragment and an offset in it.", "pose_c13_agreement", ("model/pose_head=fragments",)),
-    Ablation("pose_c15_noise", "Also a little noise beside the learned displacement.", "pose_c14_fragments", _SMALL_NOISE),
-    Ablation("pose_c16_gated", "Also displacement gated by the likelihood.", "pose_c15_noise", ("model/displacement=gated",)),
+    Ablation(
+        "s6_informed",
+        "Paper, with half of the particles started on or around the object in training.",
+        "paper",
+        ("filter/initialize=informed",),
+    ),
+    Ablation(
+        "s7_context", "Paper, with features of the whole image.", "paper", ("model/encoder=unet",)
+    ),
+    Ablation(
+        "s8_resample",
+        "Paper, with resampling by likelihood.",
+        "paper",
+        ("filter/resample=systematic",),
+    ),
+    Ablation(
+        "s9_displacement_loss_and_position",
+        "Paper, with a loss on the displacement itself, without gradient through the position.",
+        "paper",
+        (_TOWARDS, _DETACHED),
+    ),
+    Ablation(
+        "box_s10_steps",
+        "Paper, with ten steps instead of 30 (detectors).",
+        "paper",
+        ("filter.steps=10",),
+    ),
+    Ablation(
+        "c1_normalization",
+        "Paper, with normalization that does not mix particles.",
+        "paper",
+        (_LAYER,),
+    ),
+    Ablation(
+        "c2_glimpse", "Also bilinear glimpses.", "c1_normalization", ("model/glimpse=smooth",)
+    ),
+    Ablation(
+        "c3_bounded", "Also bounded displacement.", "c2_glimpse", ("model/displacement=bounded",)
+    ),
+    Ablation(
+        "c4_balanced", "Also a class-balanced loss on the likelihood.", "c3_bounded", (_BALANCED,)
+    ),
+    Ablation(
+        "c5_displacement_loss",
+        "Also a loss on the displacement itself.",
+        "c4_balanced",
+        (_TOWARDS,),
+    ),
+    Ablation(
+        "c6_position",
+        "Also no gradient through the position.",
+        "c5_displacement_loss",
+        (_DETACHED,),
+    ),
+    Ablation(
+        "c7_informed",
+        "Also half of the particles started on or around the object in training.",
+        "c6_position",
+        ("filter/initialize=informed",),
+    ),
+    Ablation(
+        "c8_truncated",
+        "Also training roll-outs of two steps.",
+        "c7_informed",
+        ("model/train_rollout=truncated",),
+    ),
+    Ablation(
+        "c9_context", "Also features of the whole image.", "c8_truncated", ("model/encoder=unet",)
+    ),
+    Ablation(
+        "c10_resample",
+        "Also resampling by likelihood (in tests; the truncated training has none).",
+        "c9_context",
+        ("filter/resample=systematic",),
+    ),
+    Ablation(
+        "pose_c11_own_point",
+        "Also a pose head on the particle's own object point, with a loss of its own.",
+        "c10_resample",
+        ("model/pose_head=own_point", "loss/aux/pose=own_point"),
+    ),
+    Ablation(
+        "pose_c12_loss",
+        "Also a loss on the pose that is weighted by its confidence.",
+        "pose_c11_own_point",
+        ("loss=confidence",),
+    ),
+    Ablation(
+        "pose_c13_agreement",
+        "Also the pose on which most particles agree as the estimate.",
+        "pose_c12_loss",
+        ("filter/estimate=agreement",),
+    ),
+    Ablation(
+        "pose_c14_fragments",
+        "Also the own object point as a fragment and an offset in it.",
+        "pose_c13_agreement",
+        ("model/pose_head=fragments",),
+    ),
+    Ablation(
+        "pose_c15_noise",
+        "Also a little noise beside the learned displacement.",
+        "pose_c14_fragments",
+        _SMALL_NOISE,
+    ),
+    Ablation(
+        "pose_c16_gated",
+        "Also displacement gated by the likelihood.",
+        "pose_c15_noise",
+        ("model/displacement=gated",),
+    ),
     Ablation("pose_c17_muon", "Also Muon.", "pose_c16_gated", ("optimizer=muon",)),
-
-    Ablation("box_c11_votes", "Also votes for the box (detectors).", "c10_resample", ("model/box_head=votes",)),
-    Ablation("box_c12_gated", "Also displacement gated by the likelihood.", "box_c11_votes", ("model/displacement=gated",)),
+    Ablation(
+        "box_c11_votes",
+        "Also votes for the box (detectors).",
+        "c10_resample",
+        ("model/box_head=votes",),
+    ),
+    Ablation(
+        "box_c12_gated",
+        "Also displacement gated by the likelihood.",
+        "box_c11_votes",
+        ("model/displacement=gated",),
+    ),
     Ablation("box_c13_muon", "Also Muon.", "box_c12_gated", ("optimizer=muon",)),
-    Ablation("box_c14_size", "Also the working method's size: ten steps in tests, a narrower network with two layers more.", "box_c13_muon", (f"{SIZE}=${{model}}",)),
-
-    Ablation("m1_normalization", "Working, with the paper's normalization.", "working", ("model.net.normalization=batch",)),
-    Ablation("m2_glimpse", "Working, with whole-pixel glimpses.", "working", ("model/glimpse=integer",)),
-    Ablation("m3_bounded", "Working, with displacement that is neither bounded nor gated.", "working", ("model/displacement=unbounded",)),
-    Ablation("m4_balanced", "Working, without the loss on the likelihood.", "working", ("loss/aux/likelihood=none",)),
-    Ablation("m5_displacement_loss", "Working, without the loss on the displacement itself.", "working", ("loss/aux/displacement=none",)),
-    Ablation("m6_position", "Working, with gradient through the position.", "working", ("model.detach_position=false",)),
-    Ablation("m7_informed", "Working, with training particles that start anywhere.", "working", ("model.train_filter.initialize.share=0.0",)),
-    Ablation("m8_truncated", "Working, with full training roll-outs of particles half of which start on or around the object.", "working", ("model/train_rollout=full", "filter/initialize=informed")),
-    Ablation("m9_context", "Working, without features of the whole image.", "working", ("model/encoder=none",)),
-    Ablation("m10_resample", "Working, without resampling (in tests; the truncated training has none).", "working", ("filter/resample=none",)),
+    Ablation(
+        "box_c14_size",
+        "Also the working method's size: ten steps in tests, a narrower network with two layers more.",
+        "box_c13_muon",
+        (f"{SIZE}=${{model}}",),
+    ),
+    Ablation(
+        "m1_normalization",
+        "Working, with the paper's normalization.",
+        "working",
+        ("model.net.normalization=batch",),
+    ),
+    Ablation(
+        "m2_glimpse", "Working, with whole-pixel glimpses.", "working", ("model/glimpse=integer",)
+    ),
+    Ablation(
+        "m3_bounded",
+        "Working, with displacement that is neither bounded nor gated.",
+        "working",
+        ("model/displacement=unbounded",),
+    ),
+    Ablation(
+        "m4_balanced",
+        "Working, without the loss on the likelihood.",
+        "working",
+        ("loss/aux/likelihood=none",),
+    ),
+    Ablation(
+        "m5_displacement_loss",
+        "Working, without the loss on the displacement itself.",
+        "working",
+        ("loss/aux/displacement=none",),
+    ),
+    Ablation(
+        "m6_position",
+        "Working, with gradient through the position.",
+        "working",
+        ("model.detach_position=false",),
+    ),
+    Ablation(
+        "m7_informed",
+        "Working, with training particles that start anywhere.",
+        "working",
+        ("model.train_filter.initialize.share=0.0",),
+    ),
+    Ablation(
+        "m8_truncated",
+        "Working, with full training roll-outs of particles half of which start on or around the object.",
+        "working",
+        ("model/train_rollout=full", "filter/initialize=informed"),
+    ),
+    Ablation(
+        "m9_context",
+        "Working, without features of the whole image.",
+        "working",
+        ("model/encoder=none",),
+    ),
+    Ablation(
+        "m10_resample",
+        "Working, without resampling (in tests; the truncated training has none).",
+        "working",
+        ("filter/resample=none",),
+    ),
     Ablation("m11_muon", "Working, with AdamW instead of Muon.", "working", ("optimizer=adamw",)),
-    Ablation("m12_gated", "Working, with bounded displacement that is not gated.", "working", ("model/displacement=bounded",)),
-    Ablation("m13_scheduler", "Working, with a constant learning rate.", "working", ("scheduler=none",)),
-
-    Ablation("pose_m14_own_point", "Working, with a pose head that does not use the own point (so that nothing can agree on it).", "working", ("model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax")),
+    Ablation(
+        "m12_gated",
+        "Working, with bounded displacement that is not gated.",
+        "working",
+        ("model/displacement=bounded",),
+    ),
+    Ablation(
+        "m13_scheduler", "Working, with a constant learning rate.", "working", ("scheduler=none",)
+    ),
+    Ablation(
+        "pose_m14_own_point",
+        "Working, with a pose head that does not use the own point (so that nothing can agree on it).",
+        "working",
+        ("model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax"),
+    ),
     Ablation("pose_m15_loss", "Working, with the paper's ADD loss.", "working", ("loss=add",)),
-    Ablation("pose_m16_agreement", "Working, with the likeliest particle's pose as the estimate.", "working", ("filter/estimate=argmax",)),
-    Ablation("pose_m17_fragments", "Working, with the own point predicted directly.", "working", ("model/pose_head=own_point",)),
-    Ablation("pose_m18_noise", "Working, without noise beside the learned displacement.", "working", ("filter/propagate=learned", "filter/schedule=constant")),
-    Ablation("box_m14_votes", "Working, without votes for the box (detectors).", "working", ("model/box_head=spread",)),
+    Ablation(
+        "pose_m16_agreement",
+        "Working, with the likeliest particle's pose as the estimate.",
+        "working",
+        ("filter/estimate=argmax",),
+    ),
+    Ablation(
+        "pose_m17_fragments",
+        "Working, with the own point predicted directly.",
+        "working",
+        ("model/pose_head=own_point",),
+    ),
+    Ablation(
+        "pose_m18_noise",
+        "Working, without noise beside the learned displacement.",
+        "working",
+        ("filter/propagate=learned", "filter/schedule=constant"),
+    ),
+    Ablation(
+        "box_m14_votes",
+        "Working, without votes for the box (detectors).",
+        "working",
+        ("model/box_head=spread",),
+    ),
 )
-# fmt: on
 
 # Left out of the detectors' sweep: s5_position equals paper (a whole-pixel glimpse has no gradient
 # through its position), so s9 equals s4; s3, s6 and s8 say nothing about a detector; from c3_bounded

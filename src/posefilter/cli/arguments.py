@@ -2,6 +2,8 @@
 
 import re
 from collections.abc import Sequence
+from difflib import get_close_matches
+from itertools import pairwise
 from pathlib import Path
 
 from posefilter.cli.renamed import rename
@@ -36,9 +38,35 @@ def check_choices(arguments: list[str], conf: Path) -> None:
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
+        if key == "preset" and value != "null":
+            check_preset(value, [conf, *_config_folders(arguments)])
         now = None if own and (conf / group / f"{value}.yaml").is_file() else rename(argument)
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
+
+
+def check_preset(name: str, folders: Sequence[Path]) -> None:
+    """Raise UserError where no folder has a preset: a method need not have one, so that Hydra would
+    not complain.
+    """
+    if any((folder / "preset" / f"{name}.yaml").is_file() for folder in folders):
+        return
+    known = [
+        f"{folder.name}/{choice}"
+        for top in folders
+        for folder in sorted((top / "preset").glob("[!_]*"))
+        if folder.is_dir() and folder.name != "size"
+        for choice in list_choices(folder)
+    ]
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"; did you mean '{near[0]}'" if near else ""
+    raise UserError(f"preset={name}: there is no such choice{hint}; there are {', '.join(known)}")
+
+
+def _config_folders(arguments: Sequence[str]) -> list[Path]:
+    """Return the folders of settings that were typed by --config-dir (or -cd)."""
+    words = [part for a in arguments for part in a.split("=", 1)]
+    return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")]
 
 
 def list_choices(group: Path) -> list[str]:

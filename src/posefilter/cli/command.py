@@ -18,7 +18,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.cli.ablations import register_ablations
-from posefilter.cli.arguments import bracketed, check_choices, list_choices, spelled
+from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, settle_logging
 from posefilter.cli.instantiate import hint
@@ -186,17 +186,7 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         and error.missing_cfg_file
     ):
         group, _, choice = error.missing_cfg_file.rpartition("/")
-        if group.split("/")[0] == "preset":  # its choices lie in a folder for each method
-            inner, group = group, "preset"
-            choice = f"{inner.removeprefix('preset').lstrip('/')}/{choice}".lstrip("/")
-            options = [
-                f"{folder.name}/{choice}"
-                for folder in sorted((conf / group).iterdir())
-                if folder.is_dir() and folder.name != "size"
-                for choice in list_choices(folder)
-            ]
-        else:
-            options = sorted(one for one in error.options if not one.startswith("_"))
+        options = sorted(one for one in error.options if not one.startswith("_"))
         return (
             f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
             f"are {', '.join(options)}"

@@ -67,4 +67,4 @@ def check_settings(cfg: DictConfig) -> None:
         ):
             raise UserError(f"{key}={value}: must be a whole number, 0 or more")
     if cfg.get("console", "json") not in ("rich", "json"):
-        raise UserError(f"console={cfg.console}: choose rich or plain")
+        raise UserError(f"console={cfg.console}: choose rich or json")

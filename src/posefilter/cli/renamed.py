@@ -114,7 +114,8 @@ def rename(override: str) -> str | None:
     if key == "budget":
         return _BUDGET + value.partition("/")[0]
     new = _rename_key(key)
-    choices = _CHOICES.get(new, {})
+    # its values are turned round, so that they are renamed together with their key alone
+    choices = {} if key == new == "model.detach_position" else _CHOICES.get(new, {})
     values = ",".join(choices.get(one, one) for one in value.split(","))
     if (new, values) == (key, value):
         return None

@@ -18,8 +18,8 @@ def require_surface_points(method: Method) -> HasSurfacePoints:
     """
     if not isinstance(method, HasSurfacePoints):
         raise UserError(
-            f"estimate=agreement: no particle of {type(method).__name__} stands on a measured "
-            f"point; choose estimate=argmax"
+            f"filter/estimate=agreement: no particle of {type(method).__name__} stands on a measured "
+            f"point; choose filter/estimate=argmax"
         )
     return method
 

@@ -37,7 +37,7 @@ class Guided:
 
     The first stage of an auxiliary particle filter (Pitt and Shephard 1999). The weighted
     distribution is unchanged: relevant regions get more children, each of less weight. This holds
-    where weights are carried on (reweight=tempered, sequential); reweight=annealed discards them,
+    where weights are carried on (filter/reweight=tempered, sequential); filter/reweight=annealed discards them,
     so there it only concentrates the search.
 
     Args:
@@ -50,7 +50,7 @@ class Guided:
 
     def __init__(self, resampler: Resample, floor: float = 0.05) -> None:
         if not 0 < floor <= 1:
-            raise UserError(f"resample.floor={floor} must lie above 0, and at most at 1")
+            raise UserError(f"filter.resample.floor={floor} must lie above 0, and at most at 1")
         self.resampler = resampler
         self.floor = floor
 
@@ -67,7 +67,7 @@ class Guided:
         """
         if not isinstance(scene, HasRelevance):
             raise UserError(
-                "resample=guided: the method makes no map of relevance; choose a context that "
+                "filter/resample=guided: the method makes no map of relevance; choose an encoder that "
                 "does, such as unet"
             )
         relevance = scene.relevance.detach()
@@ -96,7 +96,7 @@ class Guided:
         )
         if resampled.shares is not None:
             raise UserError(
-                "resample=guided needs a resampler whose children have one ancestor "
+                "filter/resample=guided needs a resampler whose children have one ancestor "
                 "each; choose systematic"
             )
         log_weights = resampled.log_weights - preference.gather(1, resampled.ancestors)
@@ -106,4 +106,4 @@ class Guided:
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
         """Raise UserError: the relevance is known only after `bind`."""
-        raise UserError("resample=guided must be bound to a scene before it draws")
+        raise UserError("filter/resample=guided must be bound to a scene before it draws")

@@ -71,7 +71,7 @@ def require_pose_space(method: Method, choice: str) -> PoseSpace:
     """
     if not isinstance(method.space, PoseSpace):
         raise UserError(
-            f"initialize={choice} draws poses, but the particles of "
+            f"filter/initialize={choice} draws poses, but the particles of "
             f"{type(method).__name__} are pixels"
         )
     return method.space
@@ -81,7 +81,7 @@ def require_pixel_space(method: Method, choice: str) -> None:
     """Raise UserError, naming the choice, if the method's particles are poses."""
     if isinstance(method.space, PoseSpace):
         raise UserError(
-            f"initialize={choice} draws pixels, but the particles of "
+            f"filter/initialize={choice} draws pixels, but the particles of "
             f"{type(method).__name__} are poses"
         )
 
@@ -136,7 +136,7 @@ class FromRelevance:
         require_pixel_space(method, "from_relevance")
         if not isinstance(scene, HasRelevance):
             raise UserError(
-                f"initialize=from_relevance: {type(method).__name__} makes no map of "
+                f"filter/initialize=from_relevance: {type(method).__name__} makes no map of "
                 f"relevance; choose uniform"
             )
         weight = scene.relevance[:, 0].detach()
@@ -159,7 +159,7 @@ class FromProposals:
         """Return (B, N, 4, 4) [m]."""
         if not isinstance(method, ProposesPoses):
             raise UserError(
-                f"initialize=from_proposals: {type(method).__name__} proposes no "
+                f"filter/initialize=from_proposals: {type(method).__name__} proposes no "
                 f"poses; choose another start"
             )
         return method.propose_poses(scene, particles, generator)

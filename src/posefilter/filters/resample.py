@@ -107,7 +107,7 @@ class Soft:
 
     def __init__(self, alpha: float = 0.5) -> None:
         if not 0 <= alpha <= 1:
-            raise UserError(f"resample.alpha={alpha} must lie between 0 and 1")
+            raise UserError(f"filter.resample.alpha={alpha} must lie between 0 and 1")
         self.alpha = alpha
         self.scheme = Systematic()
 
@@ -138,7 +138,7 @@ class NoResampling:
         B, M = particles.log_weights.shape
         if count != M:
             raise UserError(
-                f"resample=none cannot turn {M} particles into {count}: leave "
+                f"filter/resample=none cannot turn {M} particles into {count}: leave "
                 f"filter.first_particles out"
             )
         return Resampled(

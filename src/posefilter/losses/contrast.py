@@ -36,7 +36,7 @@ class Contrast:
         if trace.particles[-1].state.dim() != 4:
             raise UserError(
                 "loss=contrast judges candidate poses, not points: choose "
-                "candidate_sampler=candidates, or loss=regression"
+                "model/candidate_sampler=candidates, or loss=regression"
             )
         poses, scores, sigma = (
             trace.outputs[-1].pose,

@@ -165,8 +165,8 @@ class LabeledRays:
         net = method.likelihood
         if not isinstance(net, PaperLikelihood):
             raise UserError(
-                "model.lesson: labeled rays teach the paper's likelihood only; choose "
-                "likelihood=paper or candidate_sampler=candidates"
+                "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood only; choose "
+                "model/likelihood=paper or model/candidate_sampler=candidates"
             )
         B, _, _, W = batch.depth.shape
         device = batch.rgb.device

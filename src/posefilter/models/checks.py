@@ -27,9 +27,9 @@ def check_estimate(method: "PoseEstimator") -> None:
         kind.tells_pose and hasattr(kind, "surface_points")
     ):
         raise UserError(
-            f"estimate=agreement: no particle of {kind.__name__} tells which point of the object "
+            f"filter/estimate=agreement: no particle of {kind.__name__} tells which point of the object "
             f"its own pixel shows; "
-            "choose estimate=argmax"
+            "choose filter/estimate=argmax"
         )
 
 
@@ -40,22 +40,22 @@ def check_poses(method: "ImageSpace") -> None:
     name, untold = type(method).__name__, isinstance(method.pose_head, NoPose)
     if method.tells_pose and untold:
         raise UserError(
-            f"pose_head=none: {name} is judged by its poses; choose fragments, "
+            f"model/pose_head=none: {name} is judged by its poses; choose fragments, "
             f"own_point or absolute"
         )
     if untold and isinstance(method.box_head, PoseBox):
         raise UserError(
-            f"box_head=pose: no particle of {name} tells a pose; choose "
-            f"box_head=votes or box_head=spread"
+            f"model/box_head=pose: no particle of {name} tells a pose; choose "
+            f"model/box_head=votes or model/box_head=spread"
         )
     losses = [candidate_sampler.loss for candidate_sampler in method.aux_losses.values()]
     if untold and any(isinstance(getattr(loss, "label", None), Quality) for loss in losses):
         raise UserError(
-            f"aux_likelihood=quality: no particle of {name} tells a pose; choose balanced or focal"
+            f"loss/aux/likelihood=quality: no particle of {name} tells a pose; choose balanced or focal"
         )
     if untold and any(isinstance(loss, SurfacePointLoss) for loss in losses):
         raise UserError(
-            f"aux_pose=own_point: no particle of {name} tells a pose; choose aux_pose=none"
+            f"loss/aux/pose=own_point: no particle of {name} tells a pose; choose loss/aux/pose=none"
         )
 
 
@@ -67,8 +67,8 @@ def check_fragments(method: "ImageSpace") -> None:
     )
     if isinstance(method.pose_head, SurfacePointFragments) and not taught:
         raise UserError(
-            "pose_head: nothing but aux_pose=own_point teaches fragments; choose it, "
-            "or pose_head=own_point"
+            "model/pose_head: nothing but loss/aux/pose=own_point teaches fragments; choose it, "
+            "or model/pose_head=own_point"
         )
 
 
@@ -84,13 +84,13 @@ def check_votes(method: "ImageSpace") -> None:
         return
     if isinstance(method.net, LatentNet):
         raise UserError(
-            "box_head=votes: the box's sides would take the place of all that the net remembers "
+            "model/box_head=votes: the box's sides would take the place of all that the net remembers "
             "from step to step; "
-            "choose box_head=pose or box_head=spread"
+            "choose model/box_head=pose or model/box_head=spread"
         )
     if method.latent_width != 4:
         raise UserError(
-            f"net.latent_width={method.latent_width}: box_head=votes needs 4, one for "
+            f"model.net.latent_width={method.latent_width}: model/box_head=votes needs 4, one for "
             f"each of the box's sides"
         )
 
@@ -101,12 +101,12 @@ def check_training_clouds(method: "ImageSpace") -> None:
     """
     rolled, name = (
         method.train_filter,
-        "filter" if method.train_filter is method.filter else "train_filter",
+        "filter" if method.train_filter is method.filter else "model.train_filter",
     )
     if rolled.steps > 1 and rolled.first_particles != rolled.particles:
         raise UserError(
             f"{name}.first_particles={rolled.first_particles}: a training needs as many as "
             f"{name}.particles="
-            f"{rolled.particles}; choose {name}.first_particles=null or train_filter=short "
+            f"{rolled.particles}; choose {name}.first_particles=null or model/train_rollout=truncated "
             f"(evaluate.py takes any)"
         )

@@ -35,7 +35,7 @@ class PoseScene(NamedTuple):
         """Return where the object is likely to be, (B, 1, h, w)."""
         if self.said is None:
             raise UserError(
-                "initialize=from_relevance needs the proposal network; choose proposals=dense"
+                "filter/initialize=from_relevance needs the proposal network; choose model/proposals=dense"
             )
         return torch.sigmoid(self.said.logit)[:, None]
 
@@ -124,7 +124,7 @@ class PosePF(PoseEstimator):
         """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
         if scene.said is None or scene.cells is None:
             raise UserError(
-                "initialize=from_proposals needs the proposal network; choose proposals=dense"
+                "filter/initialize=from_proposals needs the proposal network; choose model/proposals=dense"
             )
         if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
             raise UserError(

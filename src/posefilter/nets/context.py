@@ -54,7 +54,7 @@ class Pyramid(nn.Module):
         super().__init__()
         if levels < 1:
             raise UserError(
-                f"context.levels={levels}: must be 1 or more; choose encoder=none for none"
+                f"model.encoder.levels={levels}: must be 1 or more; choose model/encoder=none for none"
             )
         self.strides = tuple(2 ** (i + 1) for i in range(levels))
         self.width = levels * 9 * 5
@@ -64,7 +64,7 @@ class Pyramid(nn.Module):
         side = min(rgb.shape[-2:])
         if self.strides[-1] > side:
             raise UserError(
-                f"context.levels={len(self.strides)}: a cell of the last would be larger than the "
+                f"model.encoder.levels={len(self.strides)}: a cell of the last would be larger than the "
                 f"image; "
                 f"choose {side.bit_length() - 1} or fewer"
             )
@@ -133,7 +133,7 @@ class ConvEncoder(_Encoder, UNet):
     ) -> None:
         super().__init__(width)
         if most_px is not None and most_px < 32:
-            raise UserError(f"context.most_px={most_px}: must be 32 or more, or null")
+            raise UserError(f"model.encoder.most_px={most_px}: must be 32 or more, or null")
         self.most_px = most_px
         self.lay_trunk(widths)
         a, b = widths[:2]

@@ -19,7 +19,7 @@ class IntegerCut(nn.Module):
     def __init__(self, size: int) -> None:
         super().__init__()
         if size < 1:
-            raise UserError(f"glimpse.size={size}: must be 1 pixel or more")
+            raise UserError(f"model.glimpse.size={size}: must be 1 pixel or more")
         self.size = size
 
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
@@ -41,9 +41,9 @@ class SmoothGlimpse(nn.Module):
     def __init__(self, size: int, spacing: float = 1.0) -> None:
         super().__init__()
         if size < 1:
-            raise UserError(f"glimpse.size={size}: must be 1 pixel or more")
+            raise UserError(f"model.glimpse.size={size}: must be 1 pixel or more")
         if spacing <= 0:
-            raise UserError(f"glimpse.spacing={spacing}: must be above 0")
+            raise UserError(f"model.glimpse.spacing={spacing}: must be above 0")
         self.size = size
         self.spacing = spacing
 

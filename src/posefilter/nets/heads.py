@@ -157,7 +157,7 @@ class SurfacePointFragments(_SurfacePointHead):
     def __init__(self, fragments: int = 64) -> None:
         super().__init__()
         if fragments < 1:
-            raise UserError(f"pose_head.fragments={fragments}: must be 1 or more")
+            raise UserError(f"model.pose_head.fragments={fragments}: must be 1 or more")
         self.width = 6 + 4 * fragments
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))

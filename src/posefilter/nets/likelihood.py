@@ -150,8 +150,8 @@ class PoseLikelihood(nn.Module):
         """
         if points.context is None:
             raise UserError(
-                "likelihood=contextual reads the proposal network; choose proposals=dense or "
-                "likelihood=contrastive"
+                "model/likelihood=contextual reads the proposal network; choose model/proposals=dense or "
+                "model/likelihood=contrastive"
             )
         log_share, place, logit, features = points.context.split(
             [1, 3, 1, points.context.shape[-1] - 5], dim=-1

@@ -32,7 +32,7 @@ class ParticleNorm(nn.Module):
     def __init__(self, kind: str, width: int) -> None:
         super().__init__()
         if kind not in ("batch", "layer"):
-            raise UserError(f"normalization={kind!r} is unknown: choose batch or layer")
+            raise UserError(f"model.net.normalization={kind!r} is unknown: choose batch or layer")
         self.inner: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -118,7 +118,9 @@ class PatchNet(nn.Module):
     ) -> None:
         super().__init__()
         if pose_width:
-            raise UserError("net=patch tells no pose: choose pose_head=none, or net=latent")
+            raise UserError(
+                "model/net=patch tells no pose: choose model/pose_head=none, or model/net=latent"
+            )
         if width < 1 or min(hidden, latent_width) < 0:
             raise UserError(
                 f"net: width={width} must be 1 or more; hidden={hidden}, "

@@ -52,7 +52,9 @@ class ResNet(nn.Module):
     ) -> None:
         super().__init__()
         if kind not in DEPTHS:
-            raise UserError(f"context.trunk.kind={kind!r} is unknown: choose {' or '.join(DEPTHS)}")
+            raise UserError(
+                f"model.encoder.trunk.kind={kind!r} is unknown: choose {' or '.join(DEPTHS)}"
+            )
         self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.geometry = nn.Conv2d(7, 64, 7, padding=3)
@@ -107,12 +109,12 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
             )
         except OSError as error:
             raise UserError(
-                f"context.trunk.weights={weights}: cannot be fetched ({error})"
+                f"model.encoder.trunk.weights={weights}: cannot be fetched ({error})"
             ) from error
     else:
         if not Path(weights).is_file():
             raise UserError(
-                f"context.trunk.weights={weights}: no such file (a path, an http "
+                f"model.encoder.trunk.weights={weights}: no such file (a path, an http "
                 f"address, or null for none)"
             )
         state = torch.load(weights, map_location="cpu", weights_only=True)
@@ -123,7 +125,7 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
         name = (missing or strange)[0]
         what = "lacks" if missing else "has the unexpected"
         raise UserError(
-            f"context.trunk.weights={weights}: {what} {name}; is it another network "
+            f"model.encoder.trunk.weights={weights}: {what} {name}; is it another network "
             f"than trunk.kind says?"
         )
     trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})

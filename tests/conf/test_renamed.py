@@ -1,0 +1,79 @@
+"""Old names of settings, typed or in a checkpoint, end in one line that names the new ones."""
+
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli import run_command
+from posefilter.cli.arguments import check_choices
+from posefilter.cli.renamed import rename
+from posefilter.errors import UserError
+
+HOME = Path(__file__).parents[2]
+RENAMED = {
+    "initialise=uniform": "filter/initialize=uniform",
+    "initialize=informed": "filter/initialize=informed",
+    "reweigh=annealed": "filter/reweight=annealed",
+    "propose=still": "filter/propagate=identity",
+    "schedule=pixels": "filter/schedule=pixels",
+    "resample=never": "filter/resample=none",
+    "resample=none,systematic": "filter/resample=none,systematic",
+    "estimate=best": "filter/estimate=argmax",
+    "refine=none": "filter/refine=none",
+    "context=resnet34": "model/encoder=resnet model.encoder.trunk.kind=resnet34",
+    "pose_code=fragments": "model/pose_head=fragments",
+    "bounds=votes": "model/box_head=votes",
+    "motion=held": "model/displacement=gated",
+    "lesson=candidates": "model/candidate_sampler=candidates",
+    "proposals=none": "model/proposals=none",
+    "train_filter=short": "model/train_rollout=truncated",
+    "train_filter.steps=3": "model.train_filter.steps=3",
+    "motion_lesson=towards": "loss/aux/displacement=towards",
+    "aux_displacement=center": (
+        "loss/aux/displacement=towards model.aux_losses.displacement.loss.label.target=center"
+    ),
+    "likelihood_lesson=focal": "loss/aux/likelihood=focal",
+    "pose_lesson=own_point": "loss/aux/pose=own_point",
+    "stages=three_motion": "loss/schedule=three_stages_displacement",
+    "loss_schedule=only_likelihood": "loss/schedule=likelihood_only",
+    "place_gradient=stopped": "model.detach_position=true",
+    "place_gradient=flows": "model.detach_position=false",
+    "model.place_gradient=true": "model.detach_position=false",
+    "normalisation=batch": "model.net.normalization=batch",
+    "net.width=16": "model.net.width=16",
+    "net=latent": "model/net=latent",
+    "glimpse=smooth": "model/glimpse=smooth",
+    "patch=6": "model.glimpse.size=6",
+    "augment=whole": "data/augment=whole",
+    "resample.alpha=0.2": "filter.resample.alpha=0.2",
+    "++estimate.bandwidth=0.1": "++filter.estimate.bandwidth=0.1",
+    "filter=pose_paper": "filter=pose filter.particles=1000 filter.steps=100",
+    "rung=c8_short": "ablation=c8_truncated",
+    "ablation=s5_place": "ablation=s5_position",
+    "deviation=patch_pf/paper": "preset=patch_pf/paper",
+    "sweep=ladder": "sweep=ablation",
+    "experiment=memorise": "experiment=memorize",
+    "console=plain": "console=json",
+    "budget=patch_pf/working": "the preset, with its size apart: preset/size=patch_pf",
+}
+
+
+@pytest.mark.parametrize("typed", RENAMED)
+def test_an_old_name_is_answered_by_the_new_one(typed: str) -> None:
+    with pytest.raises(UserError) as caught:
+        check_choices([typed], HOME / "conf")
+    assert str(caught.value) == f"{typed}: is now {RENAMED[typed]}"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("now", sorted({*RENAMED.values()} - {RENAMED["budget=patch_pf/working"]}))
+def test_todays_names_are_left_alone(now: str) -> None:
+    for typed in now.split():
+        assert rename(typed) is None
+        check_choices([typed], HOME / "conf")
+
+
+def test_the_command_ends_in_that_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_command("train", HOME, [f"out={tmp_path}", "rung=c5_lesson"]) == 2
+    said = capfd.readouterr().err
+    assert said == "train: rung=c5_lesson: is now ablation=c5_displacement_loss\n"
