@@ -1,5 +1,4 @@
-"""What flows through posefilter.  Plain NamedTuples of tensors: they collate, move and unpack as
-they are.
+"""The data types of the pipeline: NamedTuples of tensors, which collate, move and unpack as such.
 
 Letters: B images, N particles, T steps, L latent width, P points, *S the shape of one state: (2,) a
 pixel, (4, 4) a pose. Units: meters, radians, pixels.  `a_from_b` maps b into a, so neighbors
@@ -12,7 +11,7 @@ from torch import Tensor
 
 
 class Batch(NamedTuple):
-    """One object of interest in each of B images, in the frame of the object's own mesh file."""
+    """One object in each of B images; poses refer to the frame of the object's mesh file."""
 
     rgb: Tensor  # (B, 3, H, W) in [0, 1]
     depth: Tensor  # (B, 1, H, W) z-depth [m], 0 where unknown
@@ -25,77 +24,74 @@ class Batch(NamedTuple):
 
 
 class ObjectModel(NamedTuple):
-    """What a method may know of the object: a few plain tensors, so that a checkpoint can carry
-    them.
-    """
+    """The object's geometry as plain tensors, so that a checkpoint can hold it."""
 
     name: str
     points: Tensor  # (P, 3) surface points that ADD is defined on [m], mesh frame
     center: Tensor  # (3,) center of the bounding box [m]
     radius: float  # half the bounding box's diagonal [m]
     diameter: float  # largest distance between two points [m]
-    # (S, 4, 4) object_from_object transforms that change nothing, the identity first
+    # (S, 4, 4) object_from_object symmetry transforms, the identity first
     symmetries: Tensor
     hull: Tensor  # (V, 3) vertices of a convex hull [m], for outlines
 
 
 class Particles(NamedTuple):
-    """All that a filter remembers from one step to the next."""
+    """Weighted particles: the filter's whole state between two steps."""
 
     state: Tensor  # (B, N, *S)
-    latent: Tensor  # (B, N, L), the latent; L = 0 where a method has none
+    latent: Tensor  # (B, N, L); L = 0 for methods without a latent
     log_weights: Tensor  # (B, N), normalized: logsumexp over N is 0
-    ancestors: Tensor  # (B, N) int64, each particle's parent in the previous cloud
+    ancestors: Tensor  # (B, N) int64, index of each particle's ancestor at the previous step
 
 
 class Resampled(NamedTuple):
-    """What a resampling made of a weighted cloud of M: N children, each of one parent, or a mix of
+    """The result of resampling M particles: N children, each of one ancestor or a mixture of
     several.
     """
 
-    ancestors: Tensor  # (B, N) int64, each child's (main) parent
-    log_weights: Tensor  # (B, N) that the children start with, normalized
-    # (B, N, M) how much of each parent a child is, rows sum to 1; None: all of its one parent
+    ancestors: Tensor  # (B, N) int64, each child's ancestor; of a mixture, the largest
+    log_weights: Tensor  # (B, N) the children's weights, normalized
+    # (B, N, M) weights of the mixtures, rows sum to 1; None: each child has one ancestor
     shares: Tensor | None = None
 
 
 class Fragments(NamedTuple):
-    """Which point of the object each particle's own measured point may be: a fragment of the
-    surface, and where in it.
+    """Predicted object point of each particle's measured point: a distribution over surface
+    fragments.
     """
 
-    # (B, N, K) log-probability of each fragment, given that the point is the object's
+    # (B, N, K) log-probability of each fragment, given that the point is on the object
     log_share: Tensor
-    # (B, N, K, 3) the object's point if it is that fragment, over the radius, from the object's
-    # center
-    place: Tensor
-    centers: Tensor  # (B, K, 3) the fragments' middles, likewise
-    reach: Tensor  # () the fragments' mean reach, over the radius
+    # (B, N, K, 3) the object point in each fragment, from the object's center, in radii
+    position: Tensor
+    centers: Tensor  # (B, K, 3) the fragments' centers, likewise
+    reach: Tensor  # () the fragments' mean radius, in radii of the object
 
 
 class ParticleOutput(NamedTuple):
-    """What a method makes of each particle at one step."""
+    """The method's output for each particle at one step."""
 
-    log_likelihood: Tensor  # (B, N), up to a constant an image
-    # (B, N, D) learned displacement in the space's tangent; zeros where the filter only diffuses
+    log_likelihood: Tensor  # (B, N), up to a constant for each image
+    # (B, N, D) predicted displacement in the space's tangent; zeros if there is none
     displacement: Tensor
-    pose: Tensor  # (B, N, 4, 4) camera_from_object that the particle stands for
+    pose: Tensor  # (B, N, 4, 4) predicted camera_from_object
     latent: Tensor  # (B, N, L)
-    # of the particles' own points; None where a method tells no more than `pose`
+    # of each particle's measured point; None if the method predicts poses only
     fragments: Fragments | None = None
 
 
 class Step(NamedTuple):
-    """Where in its run the filter stands."""
+    """One step of the filter."""
 
-    number: int  # 0 for the first cloud
-    steps: int  # how many clouds there will be
-    # () or (B,) noise level, in the space's unit ([m] or [px]); falls where the filter anneals
+    number: int  # 0 for the first
+    steps: int  # number of steps of the run
+    # () or (B,) noise level, in the space's unit ([m] or [px])
     sigma: Tensor
 
 
 class Belief(NamedTuple):
-    """The filter's last word: weighted poses, and the one pose that it would bet on."""
+    """The filter's result: weighted poses and a point estimate."""
 
     poses: Tensor  # (B, N, 4, 4) camera_from_object
     log_weights: Tensor  # (B, N), normalized
@@ -104,11 +100,11 @@ class Belief(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """Every step of one run: the clouds, what was read of them, and the belief at the end."""
+    """All steps of one run: particles, outputs and the belief."""
 
     particles: tuple[Particles, ...]
     outputs: tuple[ParticleOutput, ...]
     steps: tuple[Step, ...]
     belief: Belief
-    # (B, T) log of the mean weight at each step; None where no filter made the trace
+    # (B, T) log of the summed weights at each step; None if no filter made the trace
     log_evidence: Tensor | None = None

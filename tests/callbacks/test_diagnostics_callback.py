@@ -14,7 +14,7 @@ from toy import scenes
 from posefilter.callbacks.diagnostics import Diagnostics, draw_diagnostics, has_pixel_particles
 from posefilter.figures.canvas import AXES
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.metrics.signs import SignsOfFailure
+from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
 
 
@@ -44,7 +44,7 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     trainer = SimpleNamespace(
         loggers=[logger], global_step=7, sanity_checking=False, is_global_zero=True
     )
-    signs = SignsOfFailure()
+    signs = FilterDiagnostics()
     signs.update(run, batch)
     hull = torch.zeros(4, 3)
     method = SimpleNamespace(

@@ -19,7 +19,7 @@ from posefilter.figures.layout import CAPTION, cut_text, format_length
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import PoseErrors
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors, write_errors
-from posefilter.metrics.scores import summary
+from posefilter.metrics.scores import summarize
 from posefilter.types import ObjectModel
 
 ROW = ImageError(1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125)
@@ -113,7 +113,7 @@ def test_metrics_come_out_of_the_rows_again(tested: tuple[Path, PoseErrors]) -> 
     for name in ("add", "add_s"):
         own = torch.tensor([getattr(row, f"{name}_mm") for row in rows], dtype=torch.float64) / 1000
         diameter = torch.tensor([row.diameter_mm for row in rows], dtype=torch.float64) / 1000
-        assert summary(own, diameter) == pytest.approx(expected[name], rel=1e-12)
+        assert summarize(own, diameter) == pytest.approx(expected[name], rel=1e-12)
     assert sum(math.isinf(row.add_mm) for row in rows) == expected["missed"] == 1
 
 

@@ -14,7 +14,7 @@ from posefilter.filters.initialize import (
     draw_from_depth,
 )
 from posefilter.geometry.camera import intrinsics, project
-from posefilter.geometry.lookup import touches
+from posefilter.geometry.lookup import overlaps_mask
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.protocols import Initialize
@@ -142,7 +142,7 @@ def test_proposals_are_the_methods_own() -> None:
 def test_informed_starts_read_the_mask_in_training_only() -> None:
     piece = Informed(UniformPixels(), share=0.5, around_px=0.0)
     seen, unseen = run(piece.train(), Pixels())
-    on = touches(images().mask, torch.stack([seen, unseen]))[0]
+    on = overlaps_mask(images().mask, torch.stack([seen, unseen]))[0]
     assert on[:2000].all()
     assert float(on[2000:].float().mean()) < 0.05
     assert unseen.std(0).min() > 4  # an image whose object is hidden is searched everywhere

@@ -16,7 +16,7 @@ from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.filters.transport import Ensemble, OptimalTransport
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.metrics.signs import distinct
+from posefilter.metrics.diagnostics import distinct
 from posefilter.protocols import Resample
 from posefilter.types import ParticleOutput, Particles, Step
 

@@ -3,7 +3,14 @@
 import pytest
 import torch
 
-from posefilter.geometry.lookup import center_of, least, nearest_true, shrink, touches, true_pixels
+from posefilter.geometry.lookup import (
+    argmin,
+    centroid,
+    erode,
+    mask_pixels,
+    nearest_mask_pixel,
+    overlaps_mask,
+)
 
 
 def blobs(seed: int) -> torch.Tensor:
@@ -18,7 +25,7 @@ def test_nearest_true_is_the_nearest_of_all_mask_pixels(seed: int) -> None:
     g = torch.Generator().manual_seed(seed)
     # in and out of the frame
     places = torch.rand(3, 200, 2, generator=g) * torch.tensor([60.0, 50.0]) - 14
-    found = nearest_true(mask, places, chunk=500)
+    found = nearest_mask_pixel(mask, places, chunk=500)
     for b in range(3):
         every = mask[b, 0].nonzero().flip(-1).float()
         distance = (places[b][:, None] - every).norm(dim=-1).min(1).values
@@ -30,16 +37,16 @@ def test_of_equal_values_the_first_is_the_least() -> None:
     values = torch.tensor(
         [[[2.0, 1.0, 1.0], [0.0, 0.0, 0.0]], [[3.0, 2.0, -torch.inf], [torch.inf, 5.0, 5.0]]]
     )
-    assert least(values).tolist() == [[1, 0], [2, 1]]
-    assert torch.equal(least(values), values.argmin(-1))
+    assert argmin(values).tolist() == [[1, 0], [2, 1]]
+    assert torch.equal(argmin(values), values.argmin(-1))
 
 
 def test_an_empty_mask_pulls_nowhere() -> None:
     mask = blobs(0)
     mask[1] = False
     places = torch.rand(3, 5, 2) * 20
-    assert torch.equal(nearest_true(mask, places)[1], places[1])
-    assert torch.equal(center_of(mask)[1], torch.tensor([15.5, 11.5]))
+    assert torch.equal(nearest_mask_pixel(mask, places)[1], places[1])
+    assert torch.equal(centroid(mask)[1], torch.tensor([15.5, 11.5]))
 
 
 @pytest.mark.parametrize("size", [1, 3, 6, 9])
@@ -50,7 +57,7 @@ def test_touches_is_what_a_loop_over_the_glimpse_finds(size: int) -> None:
         [torch.randint(-6, 38, (3, 80), generator=g), torch.randint(-6, 30, (3, 80), generator=g)],
         -1,
     )
-    met = touches(mask, places.float(), size)
+    met = overlaps_mask(mask, places.float(), size)
     for b in range(3):
         for n in range(80):
             u, v = (int(x) - (size - 1) // 2 for x in places[b, n])
@@ -62,7 +69,7 @@ def test_shrink_leaves_the_pixels_whose_surroundings_are_all_mask() -> None:
     mask = torch.zeros(2, 1, 12, 12, dtype=torch.bool)
     mask[0, 0, 0:7, 3:10] = True
     mask[1, 0, 5, 5] = True
-    small = shrink(mask, 2)
+    small = erode(mask, 2)
     wanted = torch.zeros(12, 12, dtype=torch.bool)
     wanted[2:5, 5:8] = True  # the frame's edge counts as background
     assert torch.equal(small[0, 0], wanted)
@@ -73,8 +80,8 @@ def test_lists_and_centers() -> None:
     mask = torch.zeros(2, 1, 9, 9, dtype=torch.bool)
     mask[0, 0, 2:4, 5:8] = True
     mask[1, 0, 8, 0] = True
-    places, real = true_pixels(mask)
+    places, real = mask_pixels(mask)
     assert real.sum(1).tolist() == [6, 1]
     assert places[1, 0].tolist() == [0.0, 8.0]
-    assert center_of(mask).tolist() == [[6.0, 2.5], [0.0, 8.0]]
-    assert true_pixels(mask, most=3)[1].sum(1).tolist() == [3, 1]
+    assert centroid(mask).tolist() == [[6.0, 2.5], [0.0, 8.0]]
+    assert mask_pixels(mask, most=3)[1].sum(1).tolist() == [3, 1]

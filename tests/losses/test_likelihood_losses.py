@@ -7,7 +7,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.labels.membership import OnObject, Quality
-from posefilter.losses.likelihood import BalancedBce, Bce, Focal, log_not
+from posefilter.losses.likelihood import BalancedBce, Bce, Focal, log1mexp
 
 ON, OFF = [6.0, 3.0], [15.0, 8.0]
 
@@ -76,12 +76,12 @@ def test_log_not_is_exact_and_its_slope_finite_at_both_ends() -> None:
     logit = torch.tensor(
         [-40.0, -3.0, 0.0, 5.0, 15.0, 28.0, 75.0], dtype=torch.float32, requires_grad=True
     )
-    out = log_not(torch.nn.functional.logsigmoid(logit))
+    out = log1mexp(torch.nn.functional.logsigmoid(logit))
     torch.testing.assert_close(out, torch.nn.functional.logsigmoid(-logit), rtol=1e-5, atol=1e-7)
     out.sum().backward()
     torch.testing.assert_close(logit.grad, -torch.sigmoid(logit.detach()), rtol=1e-4, atol=1e-7)
     far = torch.tensor([500.0], requires_grad=True)
-    log_not(torch.nn.functional.logsigmoid(far)).backward()
+    log1mexp(torch.nn.functional.logsigmoid(far)).backward()
     assert torch.isfinite(far.grad).all()
 
 

@@ -13,7 +13,7 @@ from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose
 from posefilter.metrics.collect import BoxIoU, ParticlesOnObject, PoseErrors
-from posefilter.metrics.scores import auc, median_mm, recall, summary
+from posefilter.metrics.scores import auc, median_mm, recall, summarize
 from posefilter.types import ObjectModel
 
 POINTS = torch.tensor([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
@@ -71,7 +71,7 @@ def test_recall_and_median() -> None:
     assert median_mm(errors) == pytest.approx(22.5)
     assert median_mm(errors[[0, 3, 3]]) == math.inf
     with pytest.raises(UserError, match="NaN"):
-        summary(torch.tensor([math.nan]), 0.1)
+        summarize(torch.tensor([math.nan]), 0.1)
 
 
 def test_misses_count_as_infinitely_wrong() -> None:

@@ -14,10 +14,10 @@ from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import NoResampling, Systematic
 from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Constant
-from posefilter.geometry.lookup import nearest_true
+from posefilter.geometry.lookup import nearest_mask_pixel
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.beliefs import on_object
-from posefilter.metrics.signs import SignsOfFailure
+from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.nets.heads import Bounded, Unbounded
 from posefilter.types import Batch, ParticleOutput, Particles, Step
 
@@ -39,7 +39,7 @@ class Told:
     def measure(
         self, scene: None, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
-        way = nearest_true(self.mask, particles.state) - particles.state
+        way = nearest_mask_pixel(self.mask, particles.state) - particles.state
         if self.answer == "mean":
             way = way.mean((0, 1)).expand_as(way)
         raw = (
@@ -91,7 +91,7 @@ def test_told_the_truth_every_particle_reaches_the_object(
     trace = pixel_filter(batch, Told(batch.mask, head, "truth"), Generator().manual_seed(0))
     assert on_object(batch.mask, trace.particles[0].state).max() < 0.3
     assert on_object(batch.mask, trace.particles[-1].state).min() == 1.0
-    signs = SignsOfFailure()
+    signs = FilterDiagnostics()
     signs.update(trace, batch)
     found = signs.compute()
     assert found["heading"] > 0.99
@@ -114,7 +114,7 @@ def test_told_only_the_mean_they_drift_together_and_miss() -> None:
     trace = ParticleFilter(100, 8, *pieces)(
         batch, Told(batch.mask, Unbounded(), "mean"), Generator().manual_seed(0)
     )
-    signs = SignsOfFailure()
+    signs = FilterDiagnostics()
     signs.update(trace, batch)
     found = signs.compute()
     assert found["pairwise_cosine"] > 0.99

@@ -151,7 +151,7 @@ def test_gradients_reach_the_features_but_not_what_is_said_of_the_object() -> No
     ).sum().backward()
     assert told.features.grad is not None
     assert told.features.grad.abs().max() > 0
-    assert told.place.grad is None
+    assert told.position.grad is None
     assert told.log_share.grad is None
     assert told.logit.grad is None
 

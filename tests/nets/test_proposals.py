@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from posefilter.geometry.camera import intrinsics, pixel_grid, rays
-from posefilter.geometry.fragments import nearest_fragment, spread_points
+from posefilter.geometry.fragments import nearest_fragment, sample_farthest_points
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, coordinate_loss
@@ -144,7 +144,7 @@ def test_the_loss_is_least_for_the_truth() -> None:
     right, error = coordinate_loss(said, cells, mask, pose, CENTER, RADIUS, 0.3)
     assert error.item() < 1e-6
     wrong, wrong_error = coordinate_loss(
-        said._replace(place=said.place + 0.1), cells, mask, pose, CENTER, RADIUS, 0.3
+        said._replace(position=said.position + 0.1), cells, mask, pose, CENTER, RADIUS, 0.3
     )
     assert wrong_error.item() == pytest.approx(0.1 * 3**0.5 * RADIUS, rel=1e-4)
     flipped, _ = coordinate_loss(
@@ -159,7 +159,7 @@ def test_the_loss_is_least_for_the_truth() -> None:
 def test_fragments_spread_over_the_surface() -> None:
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     points = points / points.norm(dim=-1, keepdim=True)
-    middles, reach = spread_points(points, 20)
+    middles, reach = sample_farthest_points(points, 20)
     assert (middles[:, None] - points).norm(dim=-1).amin(1).max() == 0  # each is one of the points
     apart = (torch.cdist(middles, middles) + 9 * torch.eye(20)).min()
     assert apart > 0.5  # 20 even caps of a sphere have middles about 0.8 apart

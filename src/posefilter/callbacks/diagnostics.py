@@ -16,8 +16,8 @@ from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
 from posefilter.figures.curves import draw_shares
 from posefilter.figures.trajectories import draw_trajectories
+from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.metrics.registry import find_metric
-from posefilter.metrics.signs import SignsOfFailure
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -60,7 +60,7 @@ class Diagnostics(Callback):
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
             return
-        found = cast(SignsOfFailure, scores["signs"]).compute()
+        found = cast(FilterDiagnostics, scores["signs"]).compute()
         for logger in trainer.loggers:
             logger.log_metrics(
                 {f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
@@ -89,7 +89,7 @@ class Diagnostics(Callback):
         """
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
         if "signs" in scores and trainer.is_global_zero:
-            found = cast(SignsOfFailure, scores["signs"]).compute()
+            found = cast(FilterDiagnostics, scores["signs"]).compute()
             figure = draw_diagnostics(found, "Diagnostics\nof the test")
             post_image(trainer, "diagnostics", figure, self.folder, "test")
 
@@ -122,7 +122,7 @@ def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:
     """Draw where the particles are against the step.
 
     Args:
-        found: What `SignsOfFailure` computed.
+        found: What `FilterDiagnostics` computed.
         title: Of the figure.
 
     Returns:

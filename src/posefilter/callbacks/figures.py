@@ -24,7 +24,7 @@ from posefilter.callbacks.gallery import (
 )
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.errors import UserError
-from posefilter.geometry.pose_error import thin
+from posefilter.geometry.pose_error import subsample
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -88,7 +88,7 @@ class Figures(Callback):
             return
         method = _method(pl_module)
         if self._points is None:
-            self._points = thin(method.model.points, 256).to(batch.rgb.device)
+            self._points = subsample(method.model.points, 256).to(batch.rgb.device)
         errors = compute_errors(outputs, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))

@@ -10,7 +10,7 @@ from posefilter.figures.layout import CAPTION, DETAIL, WIDTH, compose_figure, dr
 from posefilter.figures.overlay import trace_outline
 from posefilter.figures.panels import arrange_row
 from posefilter.figures.particles import choose_steps
-from posefilter.geometry.lookup import touches
+from posefilter.geometry.lookup import overlaps_mask
 
 ON: Color = (60, 220, 90)
 OFF: Color = (255, 80, 60)
@@ -22,7 +22,11 @@ _NUMBER = 40  # [px] where a row's number stands
 def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Tell which particles stand on a mask.  (H, W) bool, (*, 2) [px] -> (*) bool."""
     places = torch.from_numpy(np.asarray(pixels, np.float32).reshape(1, -1, 2))
-    return touches(torch.from_numpy(mask)[None, None], places)[0].numpy().reshape(pixels.shape[:-1])
+    return (
+        overlaps_mask(torch.from_numpy(mask)[None, None], places)[0]
+        .numpy()
+        .reshape(pixels.shape[:-1])
+    )
 
 
 def draw_trajectories(

@@ -79,14 +79,16 @@ class Agreement:
         provider = require_surface_points(method)
         center, radius = provider.model.center.to(particles.state), provider.model.radius
         point, known = provider.surface_points(scene, particles.state)
-        share, place = self._object_points(output, point, center, radius)
+        share, position = self._object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known
-        votes = draw_votes(point, weight, share, place, center, radius, self.hypotheses, generator)
+        votes = draw_votes(
+            point, weight, share, position, center, radius, self.hypotheses, generator
+        )
         weight = weight + 1e-9  # where none is known, all are
         top = weight.topk(min(self.hypotheses, weight.shape[1]), dim=1).indices
         top_poses = output.pose.detach().gather(1, top[..., None, None].expand(-1, -1, 4, 4))
         hypotheses = torch.cat([votes, top_poses], dim=1)
-        object_point = center + radius * place
+        object_point = center + radius * position
         fit = self._inliers(hypotheses, object_point[:, None], point[:, None], 2 * self.scale_m)
         support = (weight[:, None] * (share[:, None] * fit).sum(-1)).sum(-1)
         best = hypotheses[torch.arange(len(support), device=support.device), support.argmax(1)]
@@ -120,7 +122,7 @@ class Agreement:
         log_share, fragment = fragments.log_share.detach().topk(
             min(self.options, fragments.log_share.shape[-1]), dim=-1
         )
-        return log_share.exp(), fragments.place.detach().gather(
+        return log_share.exp(), fragments.position.detach().gather(
             2, fragment[..., None].expand(-1, -1, -1, 3)
         )
 

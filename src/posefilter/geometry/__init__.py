@@ -1,3 +1,1 @@
-"""Pure functions on tensors: rotations, rigid transforms, cameras and the spaces that particles
-live in.
-"""
+"""Pure functions on tensors: rotations, rigid transforms, cameras, and the spaces of particles."""

@@ -1,8 +1,7 @@
-"""Bounding boxes as (left, top, right, bottom) [px]: the outer edges, so that one pixel is a box of
-area 1.
+"""Bounding boxes as (left, top, right, bottom) [px]: outer edges, so one pixel is a box of area 1.
 
-An object's box is the whole object's, hidden parts too, as far as it lies in the frame. Metrics and
-losses share this page, so that a box is taught as it is judged.
+An object's box encloses the whole object, hidden parts too, as far as it lies in the frame.
+Metrics and losses share these functions, so that training and evaluation use the same box.
 """
 
 import torch
@@ -13,30 +12,39 @@ from posefilter.geometry.pose import transform
 
 
 def box_of_pose(poses: Tensor, points: Tensor, K: Tensor, height: int, width: int) -> Tensor:
-    """Return the box of the whole object's outline, hidden parts too, within the frame; zeros where
-    none of it is in it.
+    """Return the box of the whole object's outline within the frame.
 
-    (*, 4, 4) camera_from_object, (P, 3) hull or surface points [m], (*, 3, 3) -> (*, 4) [px].
+    Args:
+        poses: (*, 4, 4) camera_from_object [m].
+        points: (P, 3) hull or surface points [m], object frame.
+        K: (*, 3, 3) camera matrices [px].
+        height: The frame's height [px].
+        width: The frame's width [px].
+
+    Returns:
+        Boxes (*, 4) [px]; zeros where the object is out of the frame.
     """
     placed = transform(poses, points.to(poses))
     pixels = project(placed, K)
     frame = pixels.new_tensor([width - 0.5, height - 0.5])
     low = pixels.amin(-2).clamp_min(-0.5)
     high = torch.minimum(pixels.amax(-2), frame)
-    seen = (high > low).all(-1, keepdim=True) & (placed[..., 2] > 0).any(-1, keepdim=True)
-    return torch.cat([low, high], dim=-1) * seen
+    visible = (high > low).all(-1, keepdim=True) & (placed[..., 2] > 0).any(-1, keepdim=True)
+    return torch.cat([low, high], dim=-1) * visible
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Return the Jaccard index of box pairs, 0 where both are empty.
+    """Return the intersection over union of pairs of boxes; 0 where both are empty.
 
     (*, 4) x 2 [px] -> (*) in [0, 1].
     """
-    area = lambda x: (x[..., 2] - x[..., 0]).clamp_min(0) * (x[..., 3] - x[..., 1]).clamp_min(0)  # noqa: E731
-    common = area(
-        torch.cat(
-            [torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])], dim=-1
-        )
-    )
-    union = area(a) + area(b) - common
-    return torch.where(union > 0, common / union.clamp_min(1e-12), torch.zeros_like(union))
+    low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
+    intersection = _area(low, high)
+    union = _area(a[..., :2], a[..., 2:]) + _area(b[..., :2], b[..., 2:]) - intersection
+    return torch.where(union > 0, intersection / union.clamp_min(1e-12), torch.zeros_like(union))
+
+
+def _area(low: Tensor, high: Tensor) -> Tensor:
+    """Return the area between two corners, 0 where it is empty.  (*, 2) x 2 [px] -> (*)."""
+    size = (high - low).clamp_min(0)
+    return size[..., 0] * size[..., 1]

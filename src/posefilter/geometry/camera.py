@@ -15,8 +15,8 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
 def project(points: Tensor, K: Tensor) -> Tensor:
     """Project camera points to pixels.  (*, P, 3) [m], (*, 3, 3) [px] -> (*, P, 2) [px] as (u, v).
 
-    Points at or behind the camera's plane are projected as if they lay 1 mm before it; callers that
-    care test z.
+    Points less than 1 mm in front of the camera's plane, or behind it, are projected as if at 1 mm;
+    test z where that matters.
     """
     z = points[..., 2:].clamp_min(1e-3)
     focal = torch.stack([K[..., 0, 0], K[..., 1, 1]], -1)[..., None, :]
@@ -42,8 +42,9 @@ def back_project(pixels: Tensor, depth: Tensor, K: Tensor) -> Tensor:
 def pixel_grid(
     height: int, width: int, stride: int = 1, device: torch.device | None = None
 ) -> Tensor:
-    """Return the pixels at the center of each stride x stride cell.  -> (height // stride, width //
-    stride, 2) [px].
+    """Return the pixel at the center of each stride x stride cell.
+
+    -> (height // stride, width // stride, 2) [px].
     """
     offset = (stride - 1) / 2
     v = torch.arange(height // stride, device=device) * stride + offset
@@ -52,8 +53,9 @@ def pixel_grid(
 
 
 def resize_intrinsics(K: Tensor, scale_x: float, scale_y: float) -> Tensor:
-    """Return the camera matrix of an image resized by (scale_x, scale_y), pixel centers at
-    integers.  (*, 3, 3) [px].
+    """Return the camera matrix of an image resized by (scale_x, scale_y).
+
+    (*, 3, 3) [px]; pixel centers are at integers.
     """
     out = K.clone()
     out[..., 0, :] *= scale_x
@@ -64,7 +66,7 @@ def resize_intrinsics(K: Tensor, scale_x: float, scale_y: float) -> Tensor:
 
 
 def crop_intrinsics(K: Tensor, left: float, top: float) -> Tensor:
-    """Return the camera matrix of an image whose pixel (0, 0) was (left, top) before.
+    """Return the camera matrix of a crop whose first pixel is the image's pixel (left, top).
 
     (*, 3, 3) [px].
     """

@@ -1,27 +1,31 @@
-"""A surface cut into fragments: which of them a point lies in, and where."""
+"""Surface fragments, as in EPOS (Hodan et al. 2020): Voronoi cells of points on the surface."""
 
 import torch
 from torch import Tensor
 
 
-def pick_fragment(place: Tensor, fragment: Tensor) -> Tensor:
-    """Return the places of chosen fragments.  (*, K, 3), (*) int64 -> (*, 3)."""
-    return place.gather(-2, fragment[..., None, None].expand(*fragment.shape, 1, 3))[..., 0, :]
+def gather_fragment(position: Tensor, fragment: Tensor) -> Tensor:
+    """Return the positions in given fragments.  (*, K, 3), (*) int64 -> (*, 3)."""
+    return position.gather(-2, fragment[..., None, None].expand(*fragment.shape, 1, 3))[..., 0, :]
 
 
 def nearest_fragment(points: Tensor, centers: Tensor) -> Tensor:
-    """Return which fragment points belong to.  (B, *, 3), (B, K, 3) -> (B, *) int64."""
+    """Return the fragment that each point belongs to.  (B, *, 3), (B, K, 3) -> (B, *) int64."""
     flat = points.flatten(1, -2)
     nearness = 2 * flat @ centers.transpose(1, 2) - centers.square().sum(-1)[:, None]
     return nearness.argmax(-1).unflatten(1, points.shape[1:-1])
 
 
-def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
-    """Choose `count` points far from each other (farthest point sampling).  (P, 3) -> (count, 3),
-    their mean reach.
+def sample_farthest_points(points: Tensor, count: int) -> tuple[Tensor, float]:
+    """Select points far from each other by farthest point sampling.
 
-    The reach is the mean distance of all points to the nearest chosen one, in the points' unit, and
-    never 0. A set with fewer points gives some of them more than once.
+    Args:
+        points: (P, 3).
+        count: Number of points; if it exceeds P, some are selected repeatedly.
+
+    Returns:
+        The points (count, 3), and the mean distance of all points to the nearest selected one, in
+        the points' unit, at least 0.001.
     """
     distance = (points - points.mean(0)).norm(dim=-1)
     chosen, nearest = [], torch.full_like(distance, torch.inf)
@@ -33,39 +37,53 @@ def spread_points(points: Tensor, count: int) -> tuple[Tensor, float]:
     return points[chosen], max(float(nearest.mean()), 1e-3)
 
 
-def may_be_object(points: Tensor) -> Tensor:
-    """Tell which measured points can be of the object.  (*, 3) over the radius, from the object's
-    center -> (*) bool.
+def within_bounds(points: Tensor) -> Tensor:
+    """Return which measured points can belong to the object.
 
-    A fifth beyond its bounding ball is left to the sensor's error; farther off, a mask's pixel
-    shows what lies behind.
+    The bounding ball is enlarged by a fifth for the sensor's error. Points farther away lie on the
+    background that a mask's pixel can show.
+
+    (*, 3) from the object's center, in radii -> (*) bool.
     """
     return points.norm(dim=-1) < 1.2
 
 
-def cut_once(centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float) -> None:
-    """Fill buffers (K, 3) and () by cutting a surface into K fragments, over the radius, from the
-    center; once.
+def init_fragments(
+    centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float
+) -> None:
+    """Fill the buffers of fragments from a surface, unless they are filled already.
 
-    points: (P, 3) of the surface [m]; center: (3,) and radius [m]. Filled buffers stay: what was
-    learned is about their fragments, whatever points it is judged by later.
+    Filled buffers are kept, since weights are trained for their fragments.
+
+    Args:
+        centers: Buffer (K, 3) for the fragments' centers, from the object's center, in radii.
+        reach: Buffer () for the fragments' mean radius, in radii of the object.
+        points: (P, 3) surface points [m].
+        center: (3,) the object's center [m].
+        radius: The object's radius [m].
     """
     if bool(centers.any()):
         return
-    middles, mean = spread_points((points - center) / radius, len(centers))
+    middles, mean = sample_farthest_points((points - center) / radius, len(centers))
     centers.copy_(middles)
     reach.fill_(mean)
 
 
 def fragment_errors(
-    log_share: Tensor, place: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
+    log_share: Tensor, position: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the surprise at the true fragments, and the L1 error of the places in them, in units
-    of their reach.
+    """Return the cross-entropy of the true fragments, and the L1 error of the positions in them.
 
-    (B, *, K), (B, *, K, 3), (B, K, 3) and the true points (B, *, 3) over the radius, from the
-    center -> (B, *), (B, *).
+    Args:
+        log_share: (B, *, K) log-probabilities of the fragments.
+        position: (B, *, K, 3) predicted position in each fragment.
+        centers: (B, K, 3) the fragments' centers.
+        reach: The fragments' mean radius, the unit of the L1 error.
+        truth: (B, *, 3) true positions; all are from the object's center, in radii.
+
+    Returns:
+        Cross-entropies (B, *) [nat] and errors (B, *).
     """
     fragment = nearest_fragment(truth, centers)
     surprise = -log_share.gather(-1, fragment[..., None])[..., 0]
-    return surprise, (pick_fragment(place, fragment) - truth).abs().sum(-1) / reach
+    return surprise, (gather_fragment(position, fragment) - truth).abs().sum(-1) / reach

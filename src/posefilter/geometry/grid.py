@@ -1,5 +1,6 @@
-"""An even, nested grid over SO(3): HEALPix on the sphere times the circle, by Hopf coordinates
-(Yershova et al. 2010).
+"""A uniform, nested grid on SO(3): HEALPix on the sphere times the circle.
+
+Yershova et al.: Generating uniform incremental grids on SO(3) using the Hopf fibration (2010).
 """
 
 import math
@@ -15,11 +16,16 @@ _FACE_MERIDIAN = (1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7)  # each base face's center
 
 
 def healpix_directions(face: Tensor, x: Tensor, y: Tensor, nside: int) -> tuple[Tensor, Tensor]:
-    """Return (cos of the polar angle, azimuth [rad]) of HEALPix cells' centers (Gorski et al.
-    2005).  (*) int64 -> (*) x 2.
+    """Return the centers of HEALPix cells (Gorski et al. 2005).
 
-    face: 0 to 11; x, y: the cell within it, towards the north-east and the north-west, 0 to nside -
-    1.
+    Args:
+        face: (*) int64, base face, 0 to 11.
+        x: (*) int64, the cell's index towards the north-east, 0 to nside - 1.
+        y: (*) int64, the cell's index towards the north-west.
+        nside: Cells along the side of a base face.
+
+    Returns:
+        Cosines of the polar angles (*), azimuths (*) [rad].
     """
     ring = torch.tensor(_FACE_RING)[face] * nside - x - y - 1
     north, south = ring < nside, ring > 3 * nside
@@ -34,11 +40,11 @@ def healpix_directions(face: Tensor, x: Tensor, y: Tensor, nside: int) -> tuple[
 
 
 def so3_grid(level: int) -> Tensor:
-    """Return 72 x 8^level rotations, evenly spread.  -> (72 * 8**level, 3, 3) float32.
+    """Return 72 x 8^level uniformly spread rotations.  -> (72 * 8**level, 3, 3) float32.
 
-    A random rotation lies 28, 14, 7 and 3.5 degrees from the nearest of levels 0 to 3 on average,
-    and at most twice that. Nested: cell i of one level is cut into cells 8 i to 8 i + 7 of the
-    next. Cells at the south pole are slivers, whose parts lie up to 50 degrees apart.
+    The mean distance of a random rotation to the nearest one is 28, 14, 7 and 3.5 degrees at levels
+    0 to 3, the largest at most twice that. Cells 8 i to 8 i + 7 of a level subdivide cell i of the
+    level before. Cells at the south pole are narrow; their parts lie up to 50 degrees apart.
     """
     cells = torch.cartesian_prod(
         torch.arange(12), torch.arange(1), torch.arange(1), torch.arange(6)

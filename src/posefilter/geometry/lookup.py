@@ -1,12 +1,12 @@
-"""Reading images and masks at particles' places.  Pixel centers at integer (u, v)."""
+"""Sampling of images and masks at pixel positions.  Pixel centers are at integer (u, v)."""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 
-def window(size: int, device: torch.device | None = None) -> Tensor:
-    """Return the pixel offsets (u, v) of a glimpse, row by row.  -> (size * size, 2) [px]."""
+def patch_offsets(size: int, device: torch.device | None = None) -> Tensor:
+    """Return the pixel offsets (u, v) of a patch, in raster order.  -> (size * size, 2) [px]."""
     side = torch.arange(size, device=device) - (size - 1) // 2
     return torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).reshape(-1, 2)
 
@@ -14,13 +14,13 @@ def window(size: int, device: torch.device | None = None) -> Tensor:
 def nearest_pixel(pixels: Tensor) -> Tensor:
     """Round to whole pixels, halves upwards.
 
-    (*, 2) [px] -> (*, 2) int64; far-off particles are capped, not wrapped.
+    (*, 2) [px] -> (*, 2) int64; positions far off the frame are clamped so that none overflows.
     """
     return (pixels.detach() + 0.5).floor().clamp(-1e6, 1e6).long()
 
 
-def pick(image: Tensor, index: Tensor) -> Tensor:
-    """Read whole pixels, zero outside the frame.
+def gather_pixels(image: Tensor, index: Tensor) -> Tensor:
+    """Gather whole pixels, zero outside the frame.
 
     (B, C, H, W), (B, P, 2) int64 as (u, v) -> (B, P, C).
     """
@@ -32,11 +32,19 @@ def pick(image: Tensor, index: Tensor) -> Tensor:
 
 
 def sample(image: Tensor, pixels: Tensor, stride: int = 1, padding: str = "zeros") -> Tensor:
-    """Read an image, or a map of `stride` pixels a cell, bilinearly.  (B, C, h, w), (B, P, 2) [px]
-    -> (B, P, C).
+    """Sample an image, or a map of `stride` pixels a cell, bilinearly.
 
-    Differentiable in both. Cell i's center lies at pixel i stride + (stride - 1) / 2. padding:
-    zeros, or border (the edge's own values go on for ever).
+    Differentiable in image and positions. The center of cell i lies at pixel i stride +
+    (stride - 1) / 2.
+
+    Args:
+        image: (B, C, h, w).
+        pixels: (B, P, 2) [px].
+        stride: Pixels of a cell.
+        padding: "zeros", or "border" for the values at the edge.
+
+    Returns:
+        Values (B, P, C).
     """
     h, w = image.shape[-2:]
     cells = (pixels - (stride - 1) / 2) / stride
@@ -47,20 +55,21 @@ def sample(image: Tensor, pixels: Tensor, stride: int = 1, padding: str = "zeros
     )
 
 
-def touches(mask: Tensor, pixels: Tensor, size: int = 1) -> Tensor:
-    """Tell whether a size x size glimpse meets the mask.
+def overlaps_mask(mask: Tensor, pixels: Tensor, size: int = 1) -> Tensor:
+    """Return whether the size x size patch at each position overlaps the mask.
 
     (B, 1, H, W) bool, (B, P, 2) [px] -> (B, P) bool.
     """
     # far fewer pixels than the frame has
-    index = nearest_pixel(pixels)[:, :, None] + window(size, pixels.device)
-    return pick(mask, index.flatten(1, 2)).unflatten(1, index.shape[1:3]).flatten(2).any(-1)
+    index = nearest_pixel(pixels)[:, :, None] + patch_offsets(size, pixels.device)
+    inside = gather_pixels(mask, index.flatten(1, 2))
+    return inside.unflatten(1, index.shape[1:3]).flatten(2).any(-1)
 
 
-def shrink(mask: Tensor, margin_px: int) -> Tensor:
-    """Erode masks by a square of `margin_px`; a mask that would vanish stays as it is.
+def erode(mask: Tensor, margin_px: int) -> Tensor:
+    """Erode masks by a square of `margin_px`; a mask that would vanish is kept.
 
-    (B, 1, H, W) bool -> the same.
+    (B, 1, H, W) bool -> the same shape.
     """
     if margin_px == 0:
         return mask
@@ -71,7 +80,7 @@ def shrink(mask: Tensor, margin_px: int) -> Tensor:
 
 
 def _any_within(values: Tensor, side: int) -> Tensor:
-    """Tell whether any of `side` neighbors along the last axis is above 0: running sums.
+    """Return whether any of `side` neighbors along the last axis is above 0, by running sums.
 
     (*, n) -> (*, n - side + 1).
     """
@@ -79,11 +88,15 @@ def _any_within(values: Tensor, side: int) -> Tensor:
     return sums[..., side:] > sums[..., :-side]
 
 
-def true_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
-    """List each mask's pixels, padded to the longest list.  (B, 1, H, W) bool -> (B, M, 2) [px] as
-    (u, v), (B, M) bool real.
+def mask_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
+    """List each mask's pixels in raster order, padded to the longest list.
 
-    most: where a mask has more, an even selection in raster order.
+    Args:
+        mask: (B, 1, H, W) bool.
+        most: Maximum number; larger masks are subsampled evenly.
+
+    Returns:
+        Pixels (B, M, 2) [px] as (u, v), and which are not padding (B, M) bool.
     """
     found = []
     for one in mask[:, 0]:
@@ -92,28 +105,34 @@ def true_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
             pixels = pixels[torch.linspace(0, len(pixels) - 1, most, device=pixels.device).long()]
         found.append(pixels)
     longest = max(1, *(len(f) for f in found))
-    places = torch.stack([F.pad(f, (0, 0, 0, longest - len(f))) for f in found])
+    positions = torch.stack([F.pad(f, (0, 0, 0, longest - len(f))) for f in found])
     counts = torch.tensor([len(f) for f in found], device=mask.device)
-    return places, torch.arange(longest, device=mask.device) < counts[:, None]
+    return positions, torch.arange(longest, device=mask.device) < counts[:, None]
 
 
-def least(values: Tensor) -> Tensor:
-    """Return the first index of each row's least value: `argmin(-1)`.  (*, n) -> (*) int64.
+def argmin(values: Tensor) -> Tensor:
+    """Return the first index of each row's minimum.  (*, n) -> (*) int64.
 
-    On the processor numpy's, which compares many at once where PyTorch's takes them one by one.
+    On the CPU it uses numpy's vectorized argmin, which is faster than PyTorch's.
     """
     if values.device.type != "cpu":
         return values.argmin(-1)
     return torch.from_numpy(values.detach().numpy().argmin(-1))
 
 
-def nearest_true(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Tensor:
-    """Return the mask pixel nearest to each place; the place itself where a mask is empty.
+def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Tensor:
+    """Return the mask pixel nearest to each position; the position itself where a mask is empty.
 
-    (B, 1, H, W) bool, (B, P, 2) [px] -> (B, P, 2) [px], without gradient. A place on the mask finds
-    its own pixel; every other finds a pixel of the mask's rim, since from an inner one a step
-    towards the place would be nearer: exact, yet a search over the rim alone. chunk: distances held
-    at once, few enough for a processor's cache.
+    A position on the mask has its own pixel. The nearest one to any other lies on the mask's rim,
+    so a search over the rim is exact. Without gradient.
+
+    Args:
+        mask: (B, 1, H, W) bool.
+        pixels: (B, P, 2) positions [px].
+        chunk: Distances held at once, few enough for a CPU's cache.
+
+    Returns:
+        Nearest pixels (B, P, 2) [px].
     """
     pixels = pixels.detach()
     inner = (
@@ -124,21 +143,22 @@ def nearest_true(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Tensor:
         F.max_pool2d(F.pad((~mask).float(), (1, 1, 1, 1), value=1.0), (1, 3), stride=1)[:, :, 1:-1]
         == 0
     )
-    rim, real = true_pixels(mask & ~inner)
+    rim, real = mask_pixels(mask & ~inner)
     rim = rim.to(pixels.dtype)
     square = torch.where(real, rim.square().sum(-1), torch.inf)[:, None]
     parts = pixels.split(max(1, chunk // rim.shape[:2].numel()), dim=1)
     # |x - r|^2 less |x|^2, which is the same for every r
     best = torch.cat(
-        [least(torch.baddbmm(square, part, rim.transpose(1, 2), alpha=-2)) for part in parts], dim=1
+        [argmin(torch.baddbmm(square, part, rim.transpose(1, 2), alpha=-2)) for part in parts],
+        dim=1,
     )
     found = rim.gather(1, best[..., None].expand(-1, -1, 2))
     own = nearest_pixel(pixels)
-    found = torch.where(pick(mask.float(), own) > 0, own.to(found.dtype), found)
+    found = torch.where(gather_pixels(mask.float(), own) > 0, own.to(found.dtype), found)
     return torch.where(mask.flatten(1).any(1)[:, None, None], found, pixels)
 
 
-def center_of(mask: Tensor) -> Tensor:
+def centroid(mask: Tensor) -> Tensor:
     """Return the masks' centroids; the frame's center where a mask is empty.
 
     (B, 1, H, W) bool -> (B, 2) [px].

@@ -43,35 +43,44 @@ def transform(a_from_b: Tensor, points_b: Tensor) -> Tensor:
 
 
 def origin_of(pose: Tensor, point: Tensor) -> Tensor:
-    """Return where one object point lies in the camera.  (*, 4, 4), (3,) [m] -> (*, 3) [m]."""
+    """Return the position of one object point in the camera.  (*, 4, 4), (3,) [m] -> (*, 3) [m]."""
     return rotation_of(pose) @ point + translation_of(pose)
 
 
 def pose_about(rotation: Tensor, center_camera: Tensor, center_object: Tensor) -> Tensor:
-    """Return the pose that turns by `rotation` and brings `center_object` to `center_camera`.  ->
-    (*, 4, 4).
-    """
+    """Return the pose of a rotation that maps `center_object` to `center_camera`.  -> (*, 4, 4)."""
     return make_pose(rotation, center_camera - rotation @ center_object)
 
 
 def move_about(pose: Tensor, tangent: Tensor, center_object: Tensor) -> Tensor:
-    """Move poses by tangent vectors: turn about the object's center in its own frame, shift in the
-    camera's axes.
+    """Move poses by tangent vectors: rotation about the object's center, translation in the camera.
 
-    (*, 4, 4), (*, 6) as [shift [m], turn [rad]], (3,) [m] -> (*, 4, 4). Turning about the center
-    rather than the frame's origin keeps the two parts independent, wherever a mesh's author put the
-    origin.
+    Rotation about the center, rather than the origin of the mesh's frame, keeps both parts
+    independent of each other.
+
+    Args:
+        pose: (*, 4, 4) camera_from_object [m].
+        tangent: (*, 6), translation [m] in the camera's axes, then rotation vector [rad] in the
+            object's axes.
+        center_object: (3,) the object's center [m].
+
+    Returns:
+        Moved poses (*, 4, 4).
     """
     rotation = rotation_of(pose) @ exp_so3(tangent[..., 3:])
     return pose_about(rotation, origin_of(pose, center_object) + tangent[..., :3], center_object)
 
 
 def fit_rigid(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-    """Return the rigid transform target_from_source of least weighted squares (Kabsch 1976; Umeyama
-    1991, no scale).
+    """Return the rigid transform of least weighted squared error (Kabsch 1976; Umeyama 1991).
 
-    (*, P, 3), (*, P, 3) [m], (*, P) >= 0 -> (*, 4, 4). Degenerate sets give some rotation that
-    attains the minimum.
+    Args:
+        source: (*, P, 3) points [m].
+        target: (*, P, 3) corresponding points [m].
+        weights: (*, P) >= 0.
+
+    Returns:
+        target_from_source (*, 4, 4); for degenerate sets one of the minimizers.
     """
     w = (weights / weights.sum(-1, keepdim=True).clamp_min(1e-12))[..., None]
     mean_s = (w * source).sum(-2, keepdim=True)
@@ -82,7 +91,7 @@ def fit_rigid(source: Tensor, target: Tensor, weights: Tensor) -> Tensor:
 
 
 def is_rigid(pose: Tensor, tolerance: float = 1e-3) -> bool:
-    """Tell whether every matrix is a proper rigid transform, within `tolerance` per entry."""
+    """Return whether every matrix is a proper rigid transform, within `tolerance` per entry."""
     R = rotation_of(pose)
     eye = torch.eye(3, dtype=pose.dtype, device=pose.device)
     orthonormal = bool(((R @ R.transpose(-1, -2) - eye).abs() < tolerance).all())

@@ -1,21 +1,21 @@
-"""How far poses put an object's points from where they belong."""
+"""Differentiable pose errors: mean distances of the object's points, for losses and labels."""
 
 import torch
 from torch import Tensor
 
-from posefilter.geometry.lookup import least
+from posefilter.geometry.lookup import argmin
 from posefilter.geometry.pose import rotation_of, transform, translation_of
 
 
-def thin(points: Tensor, most: int) -> Tensor:
-    """Take an even selection of at most `most` points.  (P, 3) -> (<= most, 3)."""
+def subsample(points: Tensor, most: int) -> Tensor:
+    """Return an even selection of at most `most` points.  (P, 3) -> (<= most, 3)."""
     if len(points) <= most:
         return points
     return points[torch.linspace(0, len(points) - 1, most, device=points.device).long()]
 
 
-def deviation(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
-    """Return the mean distance of corresponding points (ADD; the paper, eq. 1).
+def add_distance(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
+    """Return ADD, the mean distance of corresponding points (the paper, eq. 1).
 
     (B, N, 4, 4), (B, 4, 4) camera_from_object [m], (P, 3) [m] -> (B, N) [m].
     """
@@ -26,15 +26,14 @@ def deviation(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
     return (offset.square().sum(-1) + 1e-12).sqrt().mean(-1)
 
 
-def nearest_pose_error(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
-    """Return the mean distance of each estimated point to the nearest true one (ADD-S; the paper,
-    eq. 2).
+def add_s_distance(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
+    """Return ADD-S, the mean distance of each estimated point to the nearest true one (eq. 2).
 
     (B, N, 4, 4), (B, 4, 4) camera_from_object [m], (P, 3) [m] -> (B, N) [m].
     """
     guess = transform(poses, points)
     true = transform(truth, points)
     with torch.no_grad():
-        nearest = least(torch.cdist(guess.flatten(1, 2), true))
+        nearest = argmin(torch.cdist(guess.flatten(1, 2), true))
     partner = true.gather(1, nearest[..., None].expand(-1, -1, 3)).unflatten(1, guess.shape[1:3])
     return ((guess - partner).square().sum(-1) + 1e-12).sqrt().mean(-1)

@@ -1,8 +1,6 @@
-"""Rotations: matrices (*, 3, 3) are the one form the code computes with; every other form is
-converted here.
+"""Rotations as matrices (*, 3, 3), and conversions from and to other parametrizations.
 
-Conventions: active rotations, column vectors (x' = R x), radians, quaternions as (x, y, z, w) with
-unit norm.
+Conventions: active rotations, column vectors (x' = R x), radians, unit quaternions (x, y, z, w).
 """
 
 import math
@@ -64,7 +62,7 @@ def matrix_from_quat_xyzw(quat_xyzw: Tensor) -> Tensor:
 
 
 def quat_xyzw_from_matrix(R: Tensor) -> Tensor:
-    """Convert matrices to unit quaternions, whichever of the four forms is best conditioned.
+    """Convert matrices to unit quaternions by the best conditioned of the four formulas.
 
     (*, 3, 3) -> (*, 4).
     """
@@ -105,16 +103,17 @@ def random_rotation(
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
     """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*) in [0, pi] [rad].
 
-    Through the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which stays exact where the arc cosine
-    does not.
+    Computed from the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles
+    where the arc cosine of the trace is not.
     """
     chord = torch.linalg.matrix_norm(a - b)
     return 2 * torch.asin((chord / (2 * math.sqrt(2))).clamp(max=1.0))
 
 
 class _Procrustes(torch.autograd.Function):
-    """The nearest rotation, with its own derivative: autograd's for the SVD is NaN where singular
-    values are alike.
+    """The nearest rotation, with its own derivative.
+
+    Autograd's derivative of the SVD is NaN at equal singular values.
     """
 
     @staticmethod

@@ -1,6 +1,6 @@
-"""The two spaces that particles live in.
+"""The two state spaces of particles: pixels and poses.
 
-A space knows how to perturb, average and measure its states.
+A space perturbs, averages and compares states.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from posefilter.geometry.rotation import angle_between, project_to_so3
 
 @dataclass(frozen=True)
 class PixelSpace:
-    """Particles are pixels (2,) [px]."""
+    """States are pixels (2,) [px]."""
 
     dimensions: int = 2
 
@@ -23,7 +23,7 @@ class PixelSpace:
         return state + tangent
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
-        """Return the spread an axis of a move whose size is sigma.  (*) -> (*, 2) [px]."""
+        """Return the standard deviation along each axis.  (*) -> (*, 2) [px]."""
         return sigma[..., None].expand(*sigma.shape, 2)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
@@ -37,10 +37,15 @@ class PixelSpace:
 
 @dataclass(frozen=True)
 class PoseSpace:
-    """Particles are poses (4, 4), perturbed about the object's center; a turn counts as the shift
-    it gives at the radius.
+    """States are poses (4, 4) camera_from_object, perturbed about the object's center.
 
-    center: the object's center in its own frame [m]; radius: of its bounding sphere [m].
+    Rotations are measured by the shift that they cause at the object's radius.
+
+    Args:
+        center: The object's center in its own frame [m].
+        radius: Radius of its bounding sphere [m].
+        dimensions: Width of a tangent vector.
+        max_turn: Largest standard deviation of a rotation [rad].
     """
 
     center: tuple[float, float, float]
@@ -53,7 +58,7 @@ class PoseSpace:
         return move_about(state, tangent, state.new_tensor(self.center))
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
-        """Return the spread an axis of a move whose size is sigma [m].
+        """Return the standard deviation along each axis of a perturbation of size sigma [m].
 
         (*) -> (*, 6) as [m, m, m, rad, rad, rad].
         """
@@ -61,9 +66,9 @@ class PoseSpace:
         return torch.stack([sigma] * 3 + [turn] * 3, dim=-1)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:
-        """Return the weighted mean: of the centers, and the chordal mean of the rotations.
+        """Return the weighted mean of the centers, with the chordal mean of the rotations.
 
-        (*, N, 4, 4) -> (*, 4, 4).
+        (*, N, 4, 4), (*, N) -> (*, 4, 4).
         """
         c = state.new_tensor(self.center)
         w = weights[..., None]
@@ -72,7 +77,7 @@ class PoseSpace:
         return pose_about(R, center, c)
 
     def distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return shift [m] and turn x radius [m], added in quadrature.
+        """Return the root of the summed squares of shift [m] and angle x radius [m].
 
         (*, 4, 4) x 2 -> (*) [m].
         """

@@ -1,1 +1,1 @@
-"""Labels: what the truth asks of each particle at each step."""
+"""Labels: training targets of each particle at each step."""

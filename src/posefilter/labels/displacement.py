@@ -1,20 +1,24 @@
-"""Which way should the particle go?"""
+"""Target displacements."""
 
 import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
-from posefilter.geometry.lookup import center_of, nearest_true, shrink
+from posefilter.geometry.lookup import centroid, erode, nearest_mask_pixel
 from posefilter.types import Batch, ObjectModel, Trace
 
 
 class TowardsObject:
-    """The displacement that would bring each particle onto the object.
+    """The displacement from each particle to the object.
 
-    target: nearest (the mask's nearest pixel: zero for a particle that is on it) or center (the
-    mask's centroid). margin_px: how far inside the mask's rim `nearest` aims, where the mask is
-    wide enough. reach: the longest displacement asked for in one step, in frame widths; a farther
-    target is approached along the straight line.
+    Args:
+        target: "nearest" for the nearest mask pixel (zero on the mask), or "center" for the mask's
+            centroid.
+        margin_px: Erosion of the mask for `nearest` [px], where the mask is wide enough.
+        reach: Maximum length, in frame widths; longer displacements keep their direction.
+
+    Raises:
+        UserError: `target` is unknown.
     """
 
     def __init__(
@@ -31,10 +35,10 @@ class TowardsObject:
         """Return (T, B, N, 2) [px], without gradient."""
         states = torch.stack([particles.state for particles in trace.particles])
         if self.target == "center":
-            goal = center_of(batch.mask)[:, None].expand_as(states)
+            goal = centroid(batch.mask)[:, None].expand_as(states)
         else:
             flat = states.transpose(0, 1).flatten(1, 2)
-            goal = nearest_true(shrink(batch.mask, self.margin_px), flat)
+            goal = nearest_mask_pixel(erode(batch.mask, self.margin_px), flat)
             goal = goal.unflatten(1, (len(states), -1)).transpose(0, 1)
         way = goal - states
         length = way.norm(dim=-1, keepdim=True).clamp_min(1e-9)

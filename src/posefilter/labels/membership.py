@@ -1,15 +1,19 @@
-"""Is the particle on the object, and how good is what it stands for?"""
+"""Labels of membership: is the particle on the object, and how accurate is its pose?"""
 
 import torch
 from torch import Tensor
 
-from posefilter.geometry.lookup import touches
-from posefilter.geometry.pose_error import deviation, thin
+from posefilter.geometry.lookup import overlaps_mask
+from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
 
 
 class OnObject:
-    """1 where the particle's size x size patch meets the object's mask, else 0 (the paper, eq. 4)."""
+    """1 where the particle's patch overlaps the object's mask, else 0 (the paper, eq. 4).
+
+    Args:
+        size: Side of the patch [px].
+    """
 
     def __init__(self, size: int = 1) -> None:
         self.size = size
@@ -17,20 +21,21 @@ class OnObject:
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N) in {0, 1}."""
         counts = [particles.state.shape[1] for particles in trace.particles]
-        met = touches(
-            batch.mask,
-            torch.cat([particles.state for particles in trace.particles], dim=1),
-            self.size,
-        ).float()
-        return torch.stack(met.split(counts, dim=1))
+        states = torch.cat([particles.state for particles in trace.particles], dim=1)
+        labels = overlaps_mask(batch.mask, states, self.size).float()
+        return torch.stack(labels.split(counts, dim=1))
 
 
 class Quality:
-    """exp(-ADD / scale) on the object, 0 off it: a likelihood trained on it is the confidence in
-    the particle's pose too.
+    """exp(-ADD / scale) on the object, 0 off it: the likelihood becomes a confidence in the pose.
 
-    scale: in object diameters. The idea: a detection's score that is trained to be its quality (Li
-    et al. 2020).
+    As in the quality focal loss, where a detection's score is its localization quality (Li et al.
+    2020).
+
+    Args:
+        size: Side of the patch that must overlap the mask [px].
+        scale: ADD at which the label is 1 / e, in diameters.
+        points: Number of points of ADD.
     """
 
     def __init__(self, size: int = 1, scale: float = 0.1, points: int = 64) -> None:
@@ -41,8 +46,7 @@ class Quality:
     @torch.no_grad()
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (T, B, N) in [0, 1], without gradient."""
-        points = thin(model.points, self.points).to(batch.rgb)
-        off = torch.stack(
-            [deviation(output.pose, batch.camera_from_object, points) for output in trace.outputs]
-        )
-        return self.on_object(trace, batch, model) * torch.exp(-off / (self.scale * model.diameter))
+        points = subsample(model.points, self.points).to(batch.rgb)
+        truth, scale = batch.camera_from_object, self.scale * model.diameter
+        error = torch.stack([add_distance(out.pose, truth, points) for out in trace.outputs])
+        return self.on_object(trace, batch, model) * torch.exp(-error / scale)

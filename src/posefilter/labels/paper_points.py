@@ -1,4 +1,4 @@
-"""The paper's labels for points along the rays of the object's pixels (section 5)."""
+"""The paper's labels of points along the rays of the object's pixels (section 5)."""
 
 import torch
 from torch import Tensor
@@ -8,18 +8,27 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 class PaperPoints:
-    """+100 on the surface in its own color, 0 for possible occluders and foreign colors, -100
-    behind the surface.
+    """+100 on the surface with its own color, -100 behind the surface, 0 otherwise.
 
-    Reads a cloud of samples (B, N, 4): pixel u, v, offset behind the observed surface [m], and 1
-    where the sample kept the pixel's color, 0 where its color is random.
+    The value 0 stands for possible occluders and foreign colors. States are samples (B, N, 4):
+    pixel u, v; offset behind the observed surface [m]; 1 for the pixel's own color, 0 for a random
+    color.
+
+    Args:
+        tolerance: Offset up to which a sample is on the surface [m].
+        on: Label on the surface.
+        behind: Label behind the surface.
     """
 
     def __init__(self, tolerance: float = 0.01, on: float = 100.0, behind: float = -100.0) -> None:
         self.tolerance, self.on, self.behind = tolerance, on, behind
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return labels (1, B, N)."""
+        """Return labels (1, B, N).
+
+        Raises:
+            UserError: The trace's particles are not samples along rays.
+        """
         if trace.particles[-1].state.dim() != 3:
             raise UserError(
                 "loss=regression judges points along rays, not poses: choose "

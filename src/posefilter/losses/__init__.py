@@ -1,1 +1,1 @@
-"""Losses: each judges a run of the filter, one value an image."""
+"""Losses of a filter's trace, one value for each image."""

@@ -1,38 +1,48 @@
-"""Contrast: the true pose must outscore the others of the same image, as far as the noise level can
-tell them apart.
-"""
+"""Contrastive loss: the true pose must score higher than other poses of the same image."""
 
 import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
-from posefilter.geometry.pose_error import deviation, thin
+from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
 
 
 def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int = 64) -> Tensor:
-    """Return the mean distance of corresponding points, least over the object's symmetries.
+    """Return the least mean distance of corresponding points over the object's symmetries.
 
-    (B, N, 4, 4), (B, 4, 4) -> (B, N) [m]. ADD (Hinterstoisser et al. 2012) on a thinned set of
-    points; for symmetric objects MSSD's way of taking the minimum over equivalent truths (Hodan et
-    al. 2020) with ADD's mean.
+    ADD (Hinterstoisser et al. 2012) on a subset of the points. As in MSSD (Hodan et al. 2020), the
+    minimum is taken over equivalent true poses.
+
+    Args:
+        poses: (B, N, 4, 4) camera_from_object.
+        truth: (B, 4, 4) camera_from_object.
+        model: The object with its symmetries.
+        points: Number of points.
+
+    Returns:
+        Distances (B, N) [m].
     """
-    few = thin(model.points, points).to(poses.device)
+    few = subsample(model.points, points).to(poses.device)
     options = [
-        deviation(poses, truth @ symmetry, few) for symmetry in model.symmetries.to(poses.device)
+        add_distance(poses, truth @ symmetry, few) for symmetry in model.symmetries.to(poses.device)
     ]
     return torch.stack(options).amin(0)
 
 
 class Contrast:
-    """KL(target || softmax(score)) over one image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
+    """KL(target || softmax(score)) over an image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
 
-    With it exp(score) learns to be the posterior smoothed by sigma, the noise level that the
-    candidates were read at. Images in which the object is not seen teach nothing and count zero.
+    At its minimum exp(score) is proportional to the posterior smoothed by sigma, the noise level of
+    the scores. The loss is zero for images in which the object is not visible.
     """
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the divergence an image, (B,) >= 0."""
+        """Return the divergence of each image, (B,) >= 0.
+
+        Raises:
+            UserError: The trace's particles are not poses.
+        """
         if trace.particles[-1].state.dim() != 4:
             raise UserError(
                 "loss=contrast judges candidate poses, not points: choose "

@@ -1,6 +1,6 @@
-"""Losses on the particle's likelihood.
+"""Losses of the particles' likelihood.
 
-`log_likelihood` is the log probability that the particle is on the object.
+Here `log_likelihood` is the log-probability that the particle is on the object.
 """
 
 import torch
@@ -11,17 +11,20 @@ from posefilter.protocols import Label
 from posefilter.types import Batch, ObjectModel, Trace
 
 
-def log_not(log_p: Tensor) -> Tensor:
-    """Return log(1 - p) from log p = logsigmoid(logit), exact at both ends, its slope in the logit
-    too, up to a logit of 80.
+def log1mexp(log_p: Tensor) -> Tensor:
+    """Return log(1 - exp(log_p)) for log_p = logsigmoid(logit), accurate for logits up to 80.
 
-    Beyond, where even log p is all but denormal, it stays finite and has no slope.
+    For larger logits, where log_p is subnormal, it stays finite, with zero gradient.
     """
     return torch.log(-torch.expm1(log_p.clamp(max=-1e-35)))
 
 
-def said(trace: Trace, steps: str) -> Tensor:
-    """Return the likelihoods of the last reading, or of all: (S, B, N)."""
+def stack_log_likelihoods(trace: Trace, steps: str) -> Tensor:
+    """Return the log-likelihoods of the last step, or of all steps.  -> (S, B, N).
+
+    Raises:
+        UserError: `steps` is neither "last" nor "all".
+    """
     if steps not in ("last", "all"):
         raise UserError(f"loss.steps={steps!r} is unknown: choose last or all")
     outputs = trace.outputs if steps == "all" else trace.outputs[-1:]
@@ -29,10 +32,11 @@ def said(trace: Trace, steps: str) -> Tensor:
 
 
 class Bce:
-    """Binary cross-entropy against a label in [0, 1] (the paper, eq. 3, whose minus sign is
-    restored).
+    """Binary cross-entropy with labels in [0, 1] (the paper, eq. 3, with its missing minus sign).
 
-    steps: last (the prediction that the filter ends with) or all.
+    Args:
+        label: Gives the targets.
+        steps: "last" for the last step only, or "all".
     """
 
     def __init__(self, label: Label, steps: str = "all") -> None:
@@ -41,21 +45,26 @@ class Bce:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        log_p = said(trace, self.steps)
+        log_p = stack_log_likelihoods(trace, self.steps)
         y = self.label(trace, batch, model)[-len(log_p) :]
-        return (self.weigh(log_p.detach(), y) * -(y * log_p + (1 - y) * log_not(log_p))).sum((0, 2))
+        entropy = -(y * log_p + (1 - y) * log1mexp(log_p))
+        return (self.weigh(log_p.detach(), y) * entropy).sum((0, 2))
 
     def weigh(self, log_p: Tensor, y: Tensor) -> Tensor:
-        """Return each particle's weight, summing to 1 an image.  (S, B, N) x 2 -> (S, B, N)."""
+        """Return each particle's weight; weights of an image sum to 1.  (S, B, N) x 2 -> (S, B,
+        N).
+        """
         return torch.full_like(y, 1 / (y.shape[0] * y.shape[2]))
 
 
 class BalancedBce(Bce):
-    """The same, with particles on the object and off it counting half each, however few either are."""
+    """Binary cross-entropy in which positives and negatives of an image have half the weight
+    each.
+    """
 
     def weigh(self, log_p: Tensor, y: Tensor) -> Tensor:
-        """Return weights that sum to 1/2 over y > 0 and to 1/2 over y = 0 (or to 1 over the only
-        kind there is).
+        """Return weights that sum to 1/2 over y > 0 and over y = 0; to 1 if there is one class
+        only.
         """
         on = (y > 0).to(y.dtype)
         share = on.sum((0, 2), keepdim=True)
@@ -65,11 +74,16 @@ class BalancedBce(Bce):
 
 
 class Focal(Bce):
-    """Focal loss: cross-entropy x |y - p|^gamma, and alpha on the object against 1 - alpha off it
-    (Lin et al. 2017).
+    """Focal loss: cross-entropy x |y - p|^gamma, with class weights (Lin et al. 2017).
 
-    With labels between 0 and 1 it is the quality focal loss (Li et al. 2020). The modulation takes
-    part in the gradient.
+    With labels between 0 and 1 it is the quality focal loss (Li et al. 2020). Gradients flow
+    through the modulating factor.
+
+    Args:
+        label: Gives the targets.
+        steps: "last" for the last step only, or "all".
+        gamma: Exponent of the modulating factor.
+        alpha: Weight of positives; negatives have 1 - alpha.
     """
 
     def __init__(
@@ -81,9 +95,9 @@ class Focal(Bce):
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        log_p = said(trace, self.steps)
+        log_p = stack_log_likelihoods(trace, self.steps)
         y = self.label(trace, batch, model)[-len(log_p) :]
-        entropy = -(y * log_p + (1 - y) * log_not(log_p))
+        entropy = -(y * log_p + (1 - y) * log1mexp(log_p))
         side = torch.where(y > 0, self.alpha, 1 - self.alpha)
         return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean(
             (0, 2)

@@ -1,4 +1,4 @@
-"""Regression of single points' scores to labels, as the paper trains its likelihood (section 5)."""
+"""Regression of single points' scores, the paper's training of its likelihood (section 5)."""
 
 from torch import Tensor
 
@@ -7,18 +7,21 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 class Regression:
-    """Weighted mean squared error between what the network says of each sample and its label, over
-    `scale`.
+    """Weighted mean squared error between the predicted score of each sample and its label.
 
-    The paper states neither the error (ours: squares) nor a scale; its labels of +-100 make plain
-    squares of 10^4.
+    The paper specifies neither the error nor a scale; with its labels of +-100 the errors are
+    divided by `scale` first.
+
+    Args:
+        label: Gives the targets.
+        scale: Divisor of the errors.
     """
 
     def __init__(self, label: Label, scale: float = 100.0) -> None:
         self.label, self.scale = label, scale
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the error an image, (B,)."""
+        """Return the error of each image, (B,)."""
         target = self.label(trace, batch, model)[-1]
         error = ((trace.outputs[-1].log_likelihood - target) / self.scale) ** 2
         return (error * trace.particles[-1].log_weights.exp()).sum(1)

@@ -1,3 +1,3 @@
-"""Measures of estimates and beliefs: pure functions, and torchmetrics classes that collect them
-over a test.
+"""Metrics of estimates and beliefs: pure functions, and torchmetrics classes that accumulate
+them.
 """

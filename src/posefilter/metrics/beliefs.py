@@ -1,12 +1,12 @@
-"""Measures of a belief: how sure it is, and whether it has a right to be.
+"""Metrics of a belief: its uncertainty, and its calibration.
 
-Poses (B, N, 4, 4), log weights (B, N).
+Poses are (B, N, 4, 4) camera_from_object [m], log weights (B, N), normalized.
 """
 
 import torch
 from torch import Tensor
 
-from posefilter.geometry.lookup import touches
+from posefilter.geometry.lookup import overlaps_mask
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
 from posefilter.geometry.spaces import PoseSpace
@@ -14,15 +14,15 @@ from posefilter.metrics.errors import add
 
 
 def entropy(log_weights: Tensor) -> Tensor:
-    """Return the entropy of the weights [nat]: 0 where one particle has them all, log N where all
-    are alike.  -> (B,).
-    """
+    """Return the entropy of the weights [nat], from 0 (one particle) to log N (equal).  -> (B,)."""
     return -torch.special.xlogy(log_weights.exp(), log_weights.exp()).sum(1)
 
 
 def spread(poses: Tensor, log_weights: Tensor, space: PoseSpace) -> tuple[Tensor, Tensor]:
-    """Return the weighted root mean square distance from the mean pose: of centers (B,) [m], of
-    rotations (B,) [rad].
+    """Return the weighted root mean square distance from the mean pose.
+
+    Returns:
+        Of the centers (B,) [m], and of the rotations (B,) [rad].
     """
     center = poses.new_tensor(space.center)
     weights = log_weights.exp()
@@ -35,8 +35,17 @@ def spread(poses: Tensor, log_weights: Tensor, space: PoseSpace) -> tuple[Tensor
 def mass_within(
     poses: Tensor, log_weights: Tensor, truth: Tensor, points: Tensor, threshold: float
 ) -> Tensor:
-    """Return the share of the weight on poses whose ADD to the truth (B, 4, 4) is below `threshold`
-    [m].  -> (B,).
+    """Return the weight of the poses whose ADD to the truth is below a threshold.
+
+    Args:
+        poses: (B, N, 4, 4).
+        log_weights: (B, N).
+        truth: (B, 4, 4).
+        points: (P, 3) surface points [m].
+        threshold: Largest ADD [m].
+
+    Returns:
+        Weights (B,) in [0, 1].
     """
     return (log_weights.exp() * (add(poses, truth[:, None], points) < threshold)).sum(1)
 
@@ -44,13 +53,21 @@ def mass_within(
 def rank_of_truth(
     poses: Tensor, log_weights: Tensor, truth: Tensor, space: PoseSpace, chunk: int = 1 << 20
 ) -> Tensor:
-    """Return the share of the belief that lies deeper in the belief than the truth does.  (B, 4, 4)
-    truth -> (B,) in [0, 1].
+    """Return the share of the belief that lies deeper in the belief than the truth.
 
-    Depth is nearness to all the rest: the mean distance to the (other) particles. Were truths drawn
-    from such beliefs, ranks would be uniform on [0, 1], so a credible region of mass p would hold
-    the truth in a share p of the images; ranks near 1 tell of beliefs that are too sure, or wrong.
-    chunk: distances held at once.
+    Depth is the mean distance to the (other) particles. If truths were drawn from the beliefs,
+    ranks would be uniform on [0, 1]: a credible region of mass p would contain the truth in a share
+    p of the images. Ranks near 1 indicate overconfident or wrong beliefs.
+
+    Args:
+        poses: (B, N, 4, 4).
+        log_weights: (B, N).
+        truth: (B, 4, 4).
+        space: The space of the poses.
+        chunk: Distances held at once.
+
+    Returns:
+        Ranks (B,) in [0, 1].
     """
     weights = log_weights.exp()
     rows = max(1, chunk // log_weights.numel())
@@ -63,8 +80,8 @@ def rank_of_truth(
 
 
 def on_object(mask: Tensor, pixels: Tensor) -> Tensor:
-    """Return the share of the particles whose pixel is on the mask.
+    """Return the share of the particles that are on the mask.
 
     (B, 1, H, W) bool, (B, N, 2) [px] -> (B,).
     """
-    return touches(mask, pixels).to(pixels.dtype).mean(1)
+    return overlaps_mask(mask, pixels).to(pixels.dtype).mean(1)

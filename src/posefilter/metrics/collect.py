@@ -1,4 +1,4 @@
-"""torchmetrics classes: `update` with a batch, `compute` at the end of a test, over all processes."""
+"""torchmetrics classes: `update` with a batch, `compute` at the end, over all processes."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,22 +9,26 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from posefilter.geometry.boxes import box_iou
-from posefilter.geometry.pose_error import thin
+from posefilter.geometry.pose_error import subsample
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s
-from posefilter.metrics.scores import summary
+from posefilter.metrics.scores import summarize
 from posefilter.types import Belief, ObjectModel
 
 
-def joined(state: Any) -> Tensor:
-    """Return a list state as one tensor, empty where nothing was collected."""
+def concat_state(state: Any) -> Tensor:
+    """Return a list state as one tensor, empty if nothing was accumulated."""
     return dim_zero_cat(state) if len(state) else torch.zeros(0, dtype=torch.float64)
 
 
 class PoseErrors(Metric):
-    """ADD and ADD-S of every instance that was there; a missed one, or a pose that is not finite,
-    is infinitely wrong.
+    """ADD and ADD-S of all instances; missed ones and poses that are not finite have infinite
+    error.
+
+    Args:
+        models: The objects.
+        **kwargs: Arguments of torchmetrics.Metric.
     """
 
     full_state_update = False
@@ -46,11 +50,13 @@ class PoseErrors(Metric):
         object_id: Tensor | None = None,
         found: Tensor | None = None,
     ) -> None:
-        """Collect (B, 4, 4) estimates and truths, camera_from_object [m]; errors are kept in their
-        order.
+        """Accumulate errors, in the order of the instances.
 
-        object_id (B,): index into `models` (the only one if None); found (B,) bool: False where
-        there is no estimate.
+        Args:
+            poses: (B, 4, 4) estimates, camera_from_object [m].
+            truth: (B, 4, 4) true poses.
+            object_id: (B,) index into `models`; the only one if None.
+            found: (B,) bool, False where there is no estimate.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
         good = poses.isfinite().flatten(1).all(1)
@@ -58,28 +64,28 @@ class PoseErrors(Metric):
             good = good & found
         errors = torch.full((3, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
         for index in sorted(set(ids)):
-            here = torch.tensor([i == index for i in ids], device=truth.device)
+            selected = torch.tensor([i == index for i in ids], device=truth.device)
             model, tree = self.models[index], self.trees[index]
-            a, b = poses[here & good].double(), truth[here & good].double()
-            errors[0, here & good] = add(a, b, model.points)
-            errors[1, here & good] = add_s(a, b, tree)
-            errors[2, here] = model.diameter
+            a, b = poses[selected & good].double(), truth[selected & good].double()
+            errors[0, selected & good] = add(a, b, model.points)
+            errors[1, selected & good] = add_s(a, b, tree)
+            errors[2, selected] = model.diameter
         for state, values in zip((self.add, self.add_s, self.diameter), errors, strict=True):
             state.append(values)
 
     def compute(self) -> dict[str, Any]:
-        """Return {"instances", "missed", "add": {...}, "add_s": {...}} as metrics.json has them."""
-        errors, diameter = joined(self.add), joined(self.diameter)
+        """Return {"instances", "missed", "add": {...}, "add_s": {...}} as in metrics.json."""
+        errors, diameter = concat_state(self.add), concat_state(self.diameter)
         return {
             "instances": len(errors),
             "missed": int(errors.isinf().sum()),
-            "add": summary(errors, diameter),
-            "add_s": summary(joined(self.add_s), diameter),
+            "add": summarize(errors, diameter),
+            "add_s": summarize(concat_state(self.add_s), diameter),
         }
 
 
 class Average(Metric):
-    """Base of metrics that are the mean of one number an image."""
+    """Base of metrics that average one number of each image."""
 
     full_state_update = False
     total: Tensor
@@ -91,39 +97,45 @@ class Average(Metric):
         self.add_state("count", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
     def collect(self, values: Tensor) -> None:
-        """Take in (B,) values."""
+        """Accumulate (B,) values."""
         self.total += values.detach().double().sum()
         self.count += values.numel()
 
     def compute(self) -> Tensor:
-        """Return the mean, NaN without images."""
+        """Return the mean; NaN without images."""
         return self.total / self.count
 
 
 class BoxIoU(Average):
-    """Mean Jaccard index of bounding boxes (the paper, section 4.1)."""
+    """Mean intersection over union of bounding boxes (the paper, section 4.1)."""
 
     def update(self, boxes: Tensor, truth: Tensor) -> None:
-        """Collect (B, 4) boxes twice, (left, top, right, bottom) [px]; an empty box is a miss."""
+        """Accumulate (B, 4) boxes twice, (left, top, right, bottom) [px]; an empty box is a
+        miss.
+        """
         self.collect(box_iou(boxes, truth))
 
 
 class ParticlesOnObject(Average):
-    """Mean share of the particles whose pixel is on the object's visible mask."""
+    """Mean share of the particles on the object's visible mask."""
 
     def update(self, mask: Tensor, pixels: Tensor) -> None:
-        """Collect (B, 1, H, W) bool masks and (B, N, 2) particles [px]."""
+        """Accumulate (B, 1, H, W) bool masks and (B, N, 2) particles [px]."""
         self.collect(on_object(mask, pixels))
 
 
 class BeliefQuality(Metric):
-    """How sure the beliefs are, and whether they have a right to be.
+    """Uncertainty and calibration of beliefs.
 
-    entropy [nat] of the weights; effective_particles 1 / sum w^2; spread_m and spread_rad about the
-    mean; mass_01d and mass_2cm, the weight on poses within 0.1 diameters and 2 cm (ADD) of the
-    truth; rank, the mean share of the belief that lies deeper in it than the truth (0.5 if
-    calibrated); coverage_50 and coverage_90, in percent, the images in which that share is at most
-    0.5 and 0.9 (50 and 90 if calibrated, less if too sure).
+    entropy: of the weights [nat]. effective_particles: 1 / sum w^2. spread_m, spread_rad: about the
+    mean pose. mass_01d, mass_2cm: weight of the poses with ADD below 0.1 diameters and 2 cm. rank:
+    mean rank of the truth (0.5 if calibrated). coverage_50, coverage_90: percentage of images whose
+    rank is at most 0.5 and 0.9 (50 and 90 if calibrated, less if overconfident).
+
+    Args:
+        models: The objects.
+        points: Number of points of ADD.
+        **kwargs: Arguments of torchmetrics.Metric.
     """
 
     full_state_update = False
@@ -141,32 +153,36 @@ class BeliefQuality(Metric):
     def __init__(self, models: Sequence[ObjectModel], points: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.models = list(models)
-        self.points = [thin(model.points, points) for model in models]
+        self.points = [subsample(model.points, points) for model in models]
         self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(self, belief: Belief, truth: Tensor, object_id: Tensor | None = None) -> None:
-        """Collect beliefs and the truth (B, 4, 4); object_id (B,): index into `models`, the only
-        one if None.
+        """Accumulate beliefs.
+
+        Args:
+            belief: B beliefs.
+            truth: (B, 4, 4) true poses.
+            object_id: (B,) index into `models`; the only one if None.
         """
         ids = torch.zeros(len(truth), dtype=torch.int64) if object_id is None else object_id
         for index in ids.unique().tolist():
-            here = (ids == index).to(truth.device)
-            model = self.models[index]
+            selected = (ids == index).to(truth.device)
+            model, points = self.models[index], self.points[index]
+            distances = (0.1 * model.diameter, 0.02)
             space = PoseSpace(tuple(model.center.tolist()), model.radius)
-            poses, log_w, true = belief.poses[here], belief.log_weights[here], truth[here]
-            near = lambda threshold: mass_within(poses, log_w, true, self.points[index], threshold)  # noqa: B023, E731
+            poses, log_w = belief.poses[selected], belief.log_weights[selected]
+            target = truth[selected]
             values = [
                 entropy(log_w),
                 1 / log_w.exp().square().sum(1),
                 *spread(poses, log_w, space),
-                near(0.1 * model.diameter),
-                near(0.02),
-                rank_of_truth(poses, log_w, true, space),
+                *(mass_within(poses, log_w, target, points, d) for d in distances),
+                rank_of_truth(poses, log_w, target, space),
             ]
             self.rows.append(torch.stack(values, dim=1).double())
 
     def compute(self) -> dict[str, float]:
-        """Return each measure's mean over the images; empty without images."""
+        """Return the mean of each metric; empty without images."""
         if not len(self.rows):
             return {}
         rows = dim_zero_cat(self.rows)

@@ -1,4 +1,4 @@
-"""Errors of a pose: how far it puts the object's points from where they belong."""
+"""Pose errors of estimates: ADD and ADD-S, as benchmarks define them."""
 
 import numpy as np
 import torch
@@ -11,8 +11,7 @@ _CHUNK = 1 << 20  # points held at once
 
 
 def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
-    """Return ADD, the mean distance of corresponding points (Hinterstoisser et al. 2012; the paper,
-    eq. 1).
+    """Return ADD, the mean distance of corresponding points (Hinterstoisser et al. 2012).
 
     (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m], in the
     poses' precision.
@@ -30,9 +29,7 @@ def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
 
 
 class NearestPoint:
-    """Looks up how far places are from the nearest of an object's points: one k-d tree an object,
-    on the CPU.
-    """
+    """Distances to the nearest of an object's points, by a k-d tree on the CPU."""
 
     def __init__(self, points: Tensor) -> None:
         self.tree = cKDTree(points.detach().cpu().double().numpy(), leafsize=16)
@@ -40,19 +37,21 @@ class NearestPoint:
         # one has filled.
         self.points = torch.from_numpy(np.ascontiguousarray(self.tree.data[self.tree.indices]))
 
-    def distance(self, places: Tensor) -> Tensor:
-        """(*, 3) float64 on the CPU [m] -> (*) float64 [m]."""
-        return torch.from_numpy(self.tree.query(places.numpy(), workers=-1)[0])
+    def distance(self, queries: Tensor) -> Tensor:
+        """Return distances to the nearest point.  (*, 3) float64 on the CPU [m] -> (*) float64
+        [m].
+        """
+        return torch.from_numpy(self.tree.query(queries.numpy(), workers=-1)[0])
 
 
 def add_s(poses: Tensor, truth: Tensor, points: Tensor | NearestPoint) -> Tensor:
-    """Return ADD-S: the mean distance of each *true* point to the nearest *estimated* one (the
-    YCB-Video toolbox).
+    """Return ADD-S, the mean distance of each *true* point to the nearest *estimated* one.
 
-    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m]. Distances
-    do not change under rigid transforms, so true points are carried into the estimate's object
-    frame, where one tree serves every pose. The paper's eq. 2 goes from estimated points to true
-    ones; published figures go the way that stands here.
+    This is the direction of the YCB-Video toolbox and of published results; eq. 2 of the paper has
+    the other one. True points are mapped into the object frame of the estimate, which keeps
+    distances, so one tree serves all poses.
+
+    (*, 4, 4) camera_from_object twice, leading shapes broadcast, (P, 3) [m] -> (*) [m].
     """
     near = points if isinstance(points, NearestPoint) else NearestPoint(points)
     guess_from_true = invert(poses.detach().cpu().double()) @ truth.detach().cpu().double()

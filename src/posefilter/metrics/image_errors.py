@@ -1,4 +1,4 @@
-"""The error of each image of a test, as a table in a file."""
+"""Errors of each image of a test, as a CSV table."""
 
 import csv
 from collections.abc import Sequence
@@ -7,15 +7,13 @@ from typing import NamedTuple
 
 import torch
 
-from posefilter.metrics.scores import summary
+from posefilter.metrics.scores import summarize
 
 FILE = "errors.csv"
 
 
 class ImageError(NamedTuple):
-    """One row of errors.csv; NaN where something is not known, infinite errors where the object was
-    missed.
-    """
+    """One row of errors.csv; NaN for unknown values, infinite errors for missed objects."""
 
     scene_id: int
     im_id: int
@@ -32,9 +30,7 @@ class ImageError(NamedTuple):
 
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
-    """Write errors.csv: every digit kept, so that metrics come out of it as they are in
-    metrics.json.
-    """
+    """Write errors.csv with all digits, so that metrics.json can be recomputed from it exactly."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -53,7 +49,11 @@ def read_errors(path: Path) -> list[ImageError]:
 
 
 def parse_row(row: dict[str, str]) -> ImageError:
-    """Return one row; columns that it has beyond ours are not looked at."""
+    """Return one row; additional columns are ignored.
+
+    Raises:
+        ValueError: A column is missing, or its value is malformed.
+    """
     missing = [name for name in ImageError._fields if row.get(name) is None]
     if missing:
         raise ValueError(f"column {missing[0]} is missing")
@@ -62,10 +62,10 @@ def parse_row(row: dict[str, str]) -> ImageError:
 
 
 def summarize_errors(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:
-    """Return the blocks `add` and `add_s` of metrics.json for some images."""
+    """Return the blocks `add` and `add_s` of metrics.json for a set of images."""
     diameter = torch.tensor([row.diameter_mm for row in rows], dtype=torch.float64) / 1000
     errors = {
         "add": torch.tensor([row.add_mm for row in rows], dtype=torch.float64) / 1000,
         "add_s": torch.tensor([row.add_s_mm for row in rows], dtype=torch.float64) / 1000,
     }
-    return {name: summary(own, diameter) for name, own in errors.items()}
+    return {name: summarize(own, diameter) for name, own in errors.items()}

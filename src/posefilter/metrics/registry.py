@@ -27,7 +27,7 @@ class MetricInfo(NamedTuple):
         form: Format specification of what is shown.
         direction: HIGHER, LOWER or NEITHER: which way is better.
         factor: What is shown, over what is stored.
-        limits: Ends of a chart's axis, in units of what is shown; None where these follow the numbers.
+        limits: Ends of a chart's axis, in the shown unit; None to follow the numbers.
         short: Name where room is scarce; the label if empty.
         meaning: What it says, in a few words.
     """

@@ -1,6 +1,6 @@
-"""Summaries of many errors.
+"""Summary statistics of pose errors.
 
-Errors (N,) [m]: one for each instance that was there; a missed one is infinite.
+Errors are (N,) [m], one for each instance; a missed one is infinite.
 """
 
 from torch import Tensor
@@ -9,12 +9,11 @@ from posefilter.errors import UserError
 
 
 def auc(errors: Tensor, limit: float = 0.1) -> float:
-    """Return the area under accuracy against threshold up to `limit`, in [0, 100], as published for
-    YCB-Video.
+    """Return the area under the accuracy-threshold curve up to `limit`, in [0, 100].
 
-    The VOC way (Xiang et al. 2018, their toolbox): accuracy i / N at the i-th smallest error below
-    the limit, summed as steps of the right endpoint, and of the last accuracy from the largest of
-    them to the limit. NaN without instances.
+    As in the YCB-Video toolbox (Xiang et al. 2018), computed the VOC way: accuracy i / N at the
+    i-th smallest error below the limit, summed as steps of the right endpoint; the last accuracy
+    extends to the limit. NaN without instances.
     """
     if len(errors) == 0:
         return float("nan")
@@ -28,17 +27,19 @@ def auc(errors: Tensor, limit: float = 0.1) -> float:
 
 
 def recall(errors: Tensor, threshold: float | Tensor) -> float:
-    """Return the share of instances with an error below the threshold, one for all or one each, in
-    [0, 100].
+    """Return the percentage of instances with an error below the threshold.
+
+    Args:
+        errors: (N,) [m].
+        threshold: One for all, or (N,) [m].
     """
     return float(100 * (errors < threshold).double().mean())
 
 
 def median_mm(errors: Tensor) -> float:
-    """Return the median in millimeters; infinite where half the instances or more are missed, NaN
-    where there are none.
+    """Return the median in millimeters; of an even number, the mean of the middle two.
 
-    Of an even number, the mean of the middle two.
+    Infinite if half the instances or more are missed; NaN without instances.
     """
     if len(errors) == 0:
         return float("nan")
@@ -47,8 +48,16 @@ def median_mm(errors: Tensor) -> float:
     return float(1000 * middle.mean())
 
 
-def summary(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
-    """Return the block of metrics.json for one kind of error.  (N,) [m], () or (N,) [m]."""
+def summarize(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
+    """Return the block of metrics.json for one kind of error.
+
+    Args:
+        errors: (N,) [m].
+        diameter: () or (N,) [m].
+
+    Raises:
+        UserError: An error is NaN.
+    """
     if bool(errors.isnan().any()):
         raise UserError("an error is not a number: a pose holds NaN; count it as missed instead")
     return {
@@ -60,11 +69,10 @@ def summary(errors: Tensor, diameter: float | Tensor) -> dict[str, float]:
 
 
 def overall(add_auc: float | None, on_object: float, iou: float) -> float:
-    """Return the one figure that chooses between checkpoints and between runs, in [0, 100]; more is
-    better.
+    """Return the score that selects checkpoints and ranks runs, in [0, 100]; higher is better.
 
-    The ADD AUC where poses are told; of a detector (None) the mean of particles on the object and
-    box IoU, both shares: its particles may all be on the object long before the box that they tell
-    fits it.
+    It is the ADD AUC. For detectors, which predict no pose (None), it is the mean of the share of
+    particles on the object and the box IoU: particles can all be on the object long before the
+    predicted box is accurate.
     """
     return 50.0 * (on_object + iou) if add_auc is None else add_auc

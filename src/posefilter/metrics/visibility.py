@@ -1,14 +1,12 @@
-"""The same errors, told apart by how much of the object can be seen: an average over images hides
-what occlusion does.
-"""
+"""Pose errors by visibility: means over all images hide the effect of occlusion."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor
 
-from posefilter.metrics.collect import PoseErrors, joined
-from posefilter.metrics.scores import summary
+from posefilter.metrics.collect import PoseErrors, concat_state
+from posefilter.metrics.scores import summarize
 from posefilter.types import ObjectModel
 
 # lower end included, upper only at 1
@@ -16,8 +14,12 @@ RANGES = ((0.0, 0.3), (0.3, 0.5), (0.5, 0.8), (0.8, 1.0), (0.5, 1.0), (0.6, 1.0)
 
 
 class ErrorsByVisibility(PoseErrors):
-    """ADD and ADD-S of the instances whose visible share lies in each range; unknown shares are in
-    none.
+    """ADD and ADD-S of the instances in each range of visibility; unknown visibility is in none.
+
+    Args:
+        models: The objects.
+        ranges: Lower (inclusive) and upper ends (exclusive, except 1).
+        **kwargs: Arguments of torchmetrics.Metric.
     """
 
     visibility: list[Tensor]
@@ -33,24 +35,24 @@ class ErrorsByVisibility(PoseErrors):
         self.add_state("visibility", default=[], dist_reduce_fx="cat")
 
     def collect(self, poses: Tensor, truth: Tensor, visibility: Tensor) -> None:
-        """Collect (B, 4, 4) estimates and truths with the visible shares (B,)."""
+        """Accumulate (B, 4, 4) estimates and truths with their visible shares (B,)."""
         self.update(poses, truth)
         self.visibility.append(visibility.double())
 
     def compute(self) -> dict[str, Any]:
-        """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...}, empty ranges left
-        out.
+        """Return {"0.3-0.5": {"instances", "add": {...}, "add_s": {...}}, ...} without empty
+        ranges.
         """
-        add, add_s, diameter, seen = (
-            joined(x) for x in (self.add, self.add_s, self.diameter, self.visibility)
+        add, add_s, diameter, visible = (
+            concat_state(x) for x in (self.add, self.add_s, self.diameter, self.visibility)
         )
         out = {}
         for low, high in self.ranges:
-            here = (seen >= low) & ((seen < high) if high < 1 else (seen <= 1))
-            if bool(here.any()):
+            selected = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+            if bool(selected.any()):
                 parts = {
-                    "add": summary(add[here], diameter[here]),
-                    "add_s": summary(add_s[here], diameter[here]),
+                    "add": summarize(add[selected], diameter[selected]),
+                    "add_s": summarize(add_s[selected], diameter[selected]),
                 }
-                out[f"{low:g}-{high:g}"] = {"instances": int(here.sum()), **parts}
+                out[f"{low:g}-{high:g}"] = {"instances": int(selected.sum()), **parts}
         return out

@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
 from posefilter.geometry.camera import back_project
-from posefilter.geometry.lookup import nearest_pixel, pick
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.metrics.signs import SignsOfFailure
+from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
 from posefilter.models.checks import (
@@ -163,7 +163,7 @@ class ImageSpace(PoseEstimator):
         corner = torch.tensor([W - 1, H - 1], device=state.device)
         pixel = nearest_pixel(state)
         inside = torch.minimum(pixel.clamp_min(0), corner)
-        z, known = pick(scene.depth, inside).unbind(-1)
+        z, known = gather_pixels(scene.depth, inside).unbind(-1)
         return back_project(state.detach(), z, scene.intrinsics), (known > 0) & (
             inside == pixel
         ).all(-1)
@@ -204,16 +204,18 @@ class ImageSpace(PoseEstimator):
         """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
         super().set_object(model)
         self.pose_head.about(model)
-        self.scores["signs"] = SignsOfFailure()
+        self.scores["signs"] = FilterDiagnostics()
 
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and its signs of failure."""
         super().score(trace, batch)
-        cast(SignsOfFailure, self.scores["signs"]).update(trace, batch)
+        cast(FilterDiagnostics, self.scores["signs"]).update(trace, batch)
 
     def results(self) -> dict[str, Any]:
         """Return the metrics, and the signs of failure."""
-        return super().results() | {"signs": cast(SignsOfFailure, self.scores["signs"]).compute()}
+        return super().results() | {
+            "signs": cast(FilterDiagnostics, self.scores["signs"]).compute()
+        }
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return how the particles bound the object, (B, 4) [px]."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
-from posefilter.geometry.lookup import sample, window
+from posefilter.geometry.lookup import patch_offsets, sample
 from posefilter.nets.encoding import UNet, geometry, grow, in_bfloat16, masked_mean_pool
 from posefilter.nets.layers import ResBlock
 
@@ -78,7 +78,7 @@ class Pyramid(nn.Module):
         """(B, N, 2) [px] -> (B, N, width)."""
         found = []
         for level, stride in zip(seen.levels, seen.strides, strict=True):
-            places = pixels[:, :, None] + window(3, pixels.device) * stride
+            places = pixels[:, :, None] + patch_offsets(3, pixels.device) * stride
             found.append(
                 sample(level, places.flatten(1, 2), stride)
                 .unflatten(1, places.shape[1:3])

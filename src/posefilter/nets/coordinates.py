@@ -15,9 +15,9 @@ from torch import Tensor
 
 from posefilter.geometry.fragments import (
     fragment_errors,
-    may_be_object,
+    gather_fragment,
     nearest_fragment,
-    pick_fragment,
+    within_bounds,
 )
 
 STRIDE = 8  # pixels a cell
@@ -30,7 +30,7 @@ class Coordinates(NamedTuple):
     log_share: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
     # (B, h, w, K, 3) the object's point if it is that fragment, over the radius, from the object's
     # center
-    place: Tensor
+    position: Tensor
     centers: Tensor  # (B, K, 3) the fragments' middles, over the radius, from the object's center
     features: Tensor  # (B, h, w, C) told to a likelihood that reads context; C = 0 where none does
 
@@ -39,7 +39,7 @@ class Coordinates(NamedTuple):
         """Return the likeliest object point of each cell, over the radius, from the object's
         center, (B, h, w, 3).
         """
-        return pick_fragment(self.place, self.log_share.argmax(-1))
+        return gather_fragment(self.position, self.log_share.argmax(-1))
 
     def first(self, count: int) -> "Coordinates":
         """Return the first so many images."""
@@ -83,11 +83,11 @@ def true_coordinates(
     on = whole_cells(mask)[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
     truth = ((cells.point - t) @ R - center) / radius
-    return truth, on, on & cells.valid & may_be_object(truth)
+    return truth, on, on & cells.valid & within_bounds(truth)
 
 
 def coordinate_loss(
-    said: Coordinates,
+    coordinates: Coordinates,
     cells: Cells,
     mask: Tensor,
     camera_from_object: Tensor,
@@ -106,9 +106,13 @@ def coordinate_loss(
     inside = usable.float()
     count = inside.sum((1, 2)).clamp_min(1.0)
     mean = lambda x: (x * inside).sum((1, 2)) / count  # noqa: E731
-    bce = F.binary_cross_entropy_with_logits(said.logit, on.float(), reduction="none").mean((1, 2))
-    surprise, error = fragment_errors(said.log_share, said.place, said.centers, reach, truth)
-    distance = (said.coordinate - truth).norm(dim=-1).detach() * radius
+    bce = F.binary_cross_entropy_with_logits(coordinates.logit, on.float(), reduction="none").mean(
+        (1, 2)
+    )
+    surprise, error = fragment_errors(
+        coordinates.log_share, coordinates.position, coordinates.centers, reach, truth
+    )
+    distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
     return 5 * bce + mean(surprise + 0.3 * error), mean(distance)
 
 
@@ -117,34 +121,41 @@ class Context(NamedTuple):
 
     smooth: Tensor  # (B, H / 2 * W / 2, 1 + C) logit and features, interpolated
     share: Tensor  # (B, h * w * K)
-    place: Tensor  # (B, h * w * K, 3)
+    position: Tensor  # (B, h * w * K, 3)
     centers: Tensor  # (B, K, 3)
     grid: tuple[int, int]  # h, w
     columns: int  # W / 2
 
     def first(self, count: int) -> "Context":
         """Return the first so many images."""
-        smooth, share, place, centers = (x[:count] for x in self[:4])
-        return Context(smooth, share, place, centers, self.grid, self.columns)
+        smooth, share, position, centers = (x[:count] for x in self[:4])
+        return Context(smooth, share, position, centers, self.grid, self.columns)
 
 
-def lay_out_context(said: Coordinates, height: int, width: int) -> Context:
-    """Lay out what is said of H x W images.
+def lay_out_context(coordinates: Coordinates, height: int, width: int) -> Context:
+    """Lay out what is coordinates of H x W images.
 
     Gradients reach the features alone: the rest has a lesson of its own.
     """
     rows, columns = -(-height // 2), -(-width // 2)
-    grid = torch.cat([said.logit.detach()[..., None], said.features], dim=-1).permute(0, 3, 1, 2)
+    grid = torch.cat([coordinates.logit.detach()[..., None], coordinates.features], dim=-1).permute(
+        0, 3, 1, 2
+    )
     grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[
         ..., :rows, :columns
     ]
-    share, place = said.log_share.detach().exp().flatten(1), said.place.detach().flatten(1, 3)
-    shape = (said.logit.shape[1], said.logit.shape[2])
-    return Context(grid.flatten(2).transpose(1, 2), share, place, said.centers, shape, columns)
+    share, position = (
+        coordinates.log_share.detach().exp().flatten(1),
+        coordinates.position.detach().flatten(1, 3),
+    )
+    shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])
+    return Context(
+        grid.flatten(2).transpose(1, 2), share, position, coordinates.centers, shape, columns
+    )
 
 
 def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
-    """Ask what is said at pixels of the object's points that a hypothesis sees there.
+    """Ask what is coordinates at pixels of the object's points that a hypothesis sees there.
 
     u, v: (B, *) [px]; position: (B, *, 3) over the radius, from the object's center. -> (B, *, 5 +
     C): log of the share of the fragment that the point lies in, where in it the network sees the
@@ -157,19 +168,19 @@ def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
     x = ((u.flatten(1) + 0.5) / STRIDE - 0.5).clamp(0, w - 1)
     y = ((v.flatten(1) + 0.5) / STRIDE - 0.5).clamp(0, h - 1)
     left, top = x.floor(), y.floor()
-    total, place = torch.zeros_like(x), torch.zeros(*x.shape, 3, dtype=x.dtype, device=x.device)
+    total, predicted = torch.zeros_like(x), torch.zeros(*x.shape, 3, dtype=x.dtype, device=x.device)
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
         near = (1 - (x - left - right).abs()) * (1 - (y - top - down).abs())
         column, row = (left + right).clamp_max(w - 1).long(), (top + down).clamp_max(h - 1).long()
         index = (row * w + column) * K + fragment
         part = near * context.share.gather(1, index) + 1e-12
         total = total + part
-        place = place + part[..., None] * context.place.gather(
+        predicted = predicted + part[..., None] * context.position.gather(
             1, index[..., None].expand(-1, -1, 3)
         )
     at = (v.flatten(1).long() // 2) * context.columns + u.flatten(1).long() // 2
     smooth = context.smooth.gather(1, at[..., None].expand(-1, -1, context.smooth.shape[-1]))
     out = torch.cat(
-        [total.clamp_min(1e-6).log()[..., None], place / total[..., None], smooth], dim=-1
+        [total.clamp_min(1e-6).log()[..., None], predicted / total[..., None], smooth], dim=-1
     )
     return out.unflatten(1, u.shape[1:])

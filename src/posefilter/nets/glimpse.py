@@ -8,7 +8,7 @@ pixels.
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.geometry.lookup import nearest_pixel, pick, sample, window
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel, patch_offsets, sample
 
 
 class IntegerCut(nn.Module):
@@ -24,8 +24,8 @@ class IntegerCut(nn.Module):
 
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
-        index = nearest_pixel(pixels)[:, :, None] + window(self.size, pixels.device)
-        seen = pick(image, index.flatten(1, 2))
+        index = nearest_pixel(pixels)[:, :, None] + patch_offsets(self.size, pixels.device)
+        seen = gather_pixels(image, index.flatten(1, 2))
         return (
             seen.unflatten(1, index.shape[1:3]).transpose(2, 3).unflatten(3, (self.size, self.size))
         )
@@ -49,7 +49,7 @@ class SmoothGlimpse(nn.Module):
 
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
-        places = pixels[:, :, None] + window(self.size, pixels.device) * self.spacing
+        places = pixels[:, :, None] + patch_offsets(self.size, pixels.device) * self.spacing
         seen = sample(image, places.flatten(1, 2))
         return (
             seen.unflatten(1, places.shape[1:3])

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.geometry.fragments import cut_once, pick_fragment
+from posefilter.geometry.fragments import gather_fragment, init_fragments
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import matrix_from_6d, matrix_from_quat_xyzw
 from posefilter.types import Fragments, ObjectModel
@@ -115,14 +115,14 @@ class _SurfacePointHead(nn.Module):
         """Take the object's center and radius as origin and unit of the object point."""
         self.center, self.radius = model.center.to(self.center), model.radius
 
-    def _pose(self, columns: Tensor, thing: Tensor, point: Tensor) -> Tensor:
+    def _pose(self, columns: Tensor, object_point: Tensor, point: Tensor) -> Tensor:
         """(B, N, 6), object points (B, N, 3) over the radius, measured ones (B, N, 3) [m] -> (B, N,
         4, 4).
         """
         # so that zeros are a rotation, not a singularity
         start = columns.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
         R = matrix_from_6d(columns + start)
-        x = self.center + self.radius * thing
+        x = self.center + self.radius * object_point
         return make_pose(R, point - (R @ x[..., None])[..., 0])
 
 
@@ -148,7 +148,7 @@ class SurfacePointFragments(_SurfacePointHead):
 
     6 + 4 K outputs. One told point answers doubt by the mean of what is possible, which lies inside
     the object and is nobody's point; shares of fragments can hold several possibilities. The pose
-    is that of the likeliest.
+    is that of the mode.
     """
 
     centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
@@ -168,20 +168,20 @@ class SurfacePointFragments(_SurfacePointHead):
         is judged by later.
         """
         super().about(model)
-        cut_once(self.centers, self.reach, model.points, model.center, model.radius)
+        init_fragments(self.centers, self.reach, model.points, model.center, model.radius)
 
     def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
         """(B, N, 6 + 4 K), (B, N, 3) [m] -> PosePrediction."""
         columns, share, offset = raw.split([6, self.fragments, 3 * self.fragments], dim=-1)
-        place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
-        likeliest = pick_fragment(place, share.argmax(-1))
-        said = Fragments(
+        position = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
+        mode = gather_fragment(position, share.argmax(-1))
+        fragments = Fragments(
             torch.log_softmax(share, dim=-1),
-            place,
+            position,
             self.centers.expand(len(raw), -1, -1),
             self.reach,
         )
-        return PosePrediction(self._pose(columns, likeliest, point), said)
+        return PosePrediction(self._pose(columns, mode, point), fragments)
 
 
 class NoPose(_AnyObject):

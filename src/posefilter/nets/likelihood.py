@@ -55,13 +55,15 @@ class Points(NamedTuple):
     context: Tensor | None = None  # (B, N, P, 5 + C), as `ask` answers
 
 
-def lay_out(rgb: Tensor, depth: Tensor, K: Tensor, said: Coordinates | None = None) -> Pixels:
+def lay_out(
+    rgb: Tensor, depth: Tensor, K: Tensor, coordinates: Coordinates | None = None
+) -> Pixels:
     """Lay images out for gathering.  (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) -> Pixels.
 
-    said: what the proposal network says of them, if it is to be read.
+    coordinates: what the proposal network says of them, if it is to be read.
     """
     H, W = rgb.shape[-2:]
-    context = None if said is None else lay_out_context(said, H, W)
+    context = None if coordinates is None else lay_out_context(coordinates, H, W)
     values = torch.cat([rgb, depth], dim=1).flatten(2).transpose(1, 2).contiguous()
     return Pixels(values, (H, W), K, context)
 
@@ -153,10 +155,10 @@ class PoseLikelihood(nn.Module):
                 "model/likelihood=contextual reads the proposal network; choose model/proposals=dense or "
                 "model/likelihood=contrastive"
             )
-        log_share, place, logit, features = points.context.split(
+        log_share, predicted, logit, features = points.context.split(
             [1, 3, 1, points.context.shape[-1] - 5], dim=-1
         )
-        error = place - points.position / radius
+        error = predicted - points.position / radius
         known = [log_share / 5, torch.sigmoid(logit), logit / 8]
         return torch.cat([*known, protocol(error), torch.asinh(10 * error), features], dim=-1)
 

@@ -41,7 +41,7 @@ def measure_cells(depth: Tensor, K: Tensor) -> Cells:
 
 
 def draw_poses(
-    said: Coordinates,
+    coordinates: Coordinates,
     cells: Cells,
     center: Tensor,
     radius: float,
@@ -54,8 +54,8 @@ def draw_poses(
 
     Where no cell of an image has a known depth the poses mean nothing.
     """
-    share, place = said.log_share.exp().flatten(1, 2), said.place.flatten(1, 2)
-    weight = (torch.sigmoid(said.logit).flatten(1) + 1e-4) * cells.valid.flatten(1)
+    share, position = coordinates.log_share.exp().flatten(1, 2), coordinates.position.flatten(1, 2)
+    weight = (torch.sigmoid(coordinates.logit).flatten(1) + 1e-4) * cells.valid.flatten(1)
     return draw_votes(
-        cells.point.flatten(1, 2), weight, share, place, center, radius, count, generator, votes
+        cells.point.flatten(1, 2), weight, share, position, center, radius, count, generator, votes
     )

@@ -5,7 +5,7 @@ point of it.
 import torch
 from torch import Tensor, nn
 
-from posefilter.geometry.fragments import cut_once
+from posefilter.geometry.fragments import init_fragments
 from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.encoding import UNet, geometry, in_bfloat16
 from posefilter.nets.layers import ResBlock
@@ -37,7 +37,7 @@ class ObjectCoordinateNet(UNet):
         self.up8 = nn.Sequential(ResBlock(b), ResBlock(b))
         self.parts = [1, fragments, 3 * fragments, features]
         self.out = nn.Conv2d(b, 1 + 4 * fragments + features, 1)
-        # at first, every fragment is as likely, and its middle is the place
+        # at first, every fragment is as likely, and its middle is the position
         nn.init.normal_(self.out.weight, std=0.01)
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> Coordinates:
@@ -48,10 +48,10 @@ class ObjectCoordinateNet(UNet):
         with in_bfloat16(rgb):
             y = self.out(self.encode(rgb, shape)[1]).float()
         logit, share, offset, features = y.permute(0, 2, 3, 1).split(self.parts, dim=-1)
-        place = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
+        position = self.centers + self.reach * offset.unflatten(-1, (self.fragments, 3))
         centers = self.centers.expand(len(y), -1, -1)
         return Coordinates(
-            logit[..., 0], torch.log_softmax(share, dim=-1), place, centers, features
+            logit[..., 0], torch.log_softmax(share, dim=-1), position, centers, features
         )
 
     def set_object(self, points: Tensor, center: Tensor, radius: float) -> None:
@@ -60,4 +60,4 @@ class ObjectCoordinateNet(UNet):
 
         (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m].
         """
-        cut_once(self.centers, self.reach, points, center, radius)
+        init_fragments(self.centers, self.reach, points, center, radius)

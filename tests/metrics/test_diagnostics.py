@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from posefilter.metrics.signs import (
-    SignsOfFailure,
+from posefilter.metrics.diagnostics import (
+    FilterDiagnostics,
     auroc,
     distinct,
-    explained,
     heading,
     near_edge,
     off_frame,
     pairwise_cosine,
+    r2_score,
 )
 from posefilter.types import Batch, Belief, ParticleOutput, Particles, Step, Trace
 
@@ -34,9 +34,9 @@ def test_pairwise_cosine_equals_the_double_loop() -> None:
 
 def test_explained_is_one_for_the_truth_nought_for_the_mean_and_negative_for_drift() -> None:
     true = torch.randn(200, 2, generator=torch.Generator().manual_seed(0))
-    assert explained(true, true) == 1
-    assert explained(true.mean(0).expand(200, 2), true).item() == pytest.approx(0.0, abs=1e-5)
-    assert explained(true + 3, true) < -1
+    assert r2_score(true, true) == 1
+    assert r2_score(true.mean(0).expand(200, 2), true).item() == pytest.approx(0.0, abs=1e-5)
+    assert r2_score(true + 3, true) < -1
 
 
 def test_heading_ignores_particles_that_are_there() -> None:
@@ -85,7 +85,7 @@ def test_to_tell_who_left_the_frame_is_no_skill() -> None:
         (seen, 0.5),
         (torch.where(state[..., 0] > 60, -1.0, seen), 0.75),
     ):
-        signs = SignsOfFailure()
+        signs = FilterDiagnostics()
         signs.update(
             make_trace(state, log_likelihood), Batch(mask, mask, mask, *[torch.zeros(1)] * 5)
         )
