@@ -86,7 +86,7 @@ def test_right_camera_stands_six_centimeters_to_the_right(tmp_path):
     records = reader.records()
     assert {record.group for record in records} == {"kitchen_0"}  # stereo pairs are never split
     assert len({(r.scene_id, r.im_id, r.obj_id) for r in records}) == 2
-    assert [r.name for r in FatReader(tmp_path, eyes=("left",)).records()] == [
+    assert [r.name for r in FatReader(tmp_path, cameras=("left",)).records()] == [
         "single/toy_16k/kitchen_0/000007.left"
     ]
 

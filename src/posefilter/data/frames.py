@@ -108,6 +108,18 @@ class NotShown(BadData):
         return NotShown, (self.path, self.cause, self.detail)
 
 
+class Implausible(BadData):
+    """A frame was read, but a camera cannot have seen what it says; it carries the sample."""
+
+    def __init__(self, path: Path, cause: str, detail: str, sample: Sample) -> None:
+        super().__init__(path, cause, detail)
+        self.sample = sample
+
+    def __reduce__(self) -> tuple[type, tuple[Path, str, str, Sample]]:  # type: ignore[override]
+        """Survive the way from one process to another."""
+        return Implausible, (self.path, self.cause, self.detail, self.sample)
+
+
 def tight_box(mask: np.ndarray) -> tuple[int, int, int, int]:
     """Return (left, top, right, bottom) of the mask's pixels, right and bottom exclusive; all 0 for
     an empty mask.

@@ -23,6 +23,7 @@ from posefilter.data.frames import FrameRecord, Reader, Sample
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
+from posefilter.data.ranges import check_ranges
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
@@ -95,19 +96,40 @@ class PoseDataModule(LightningDataModule):
     ) -> None:
         """Say what to read; nothing is opened before `setup`.
 
-        source: "scenes", "fat", "ycb_video" or "bop". object: a class, several, or None for all.
-        meshes: "builtin", a folder or a mesh store; mesh_scale: meters a unit of its files (0.001
-        for BOP's models, else 1). image_width alone keeps the aspect. split: what part of the
-        scenes train, val and test get, see `splits.split_records`; by default 0.8, 0.1, 0.1;
-        split_seed shuffles the scenes. workers: loader processes; None: see `spare_cores`.
-        min_visibility: of training frames; min_visibility_test: of val and test frames (unknown
-        visibility passes). cache: "memory", "none", or "disk" (in `cache_dir`, by default the
-        dataset's own `.cache`). on_error: "raise", or "skip" broken frames and count them. limit_*:
-        the first so many frames of a fixed shuffle. points: surface points for ADD; model_points: a
-        folder with <class>/points.xyz in the dataset's own frame instead. generate: called with the
-        root where scenes are yet to be rendered. options: the reader's own.
+        Args:
+            source: "scenes", "fat", "ycb_video" or "bop".
+            root: The dataset's folder.
+            object: A class, several, or None for all.
+            meshes: "builtin", a folder or a mesh store.
+            mesh_scale: Meters a unit of the mesh files; None: 0.001 for BOP's models, else 1.
+            image_width: Of the images that methods see [px]; alone it keeps the aspect.
+            image_height: Likewise.
+            split: What train, val and test get, see `split_records`; by default 0.8, 0.1, 0.1.
+            split_seed: Shuffles the scenes.
+            min_visibility: Least visible share of training frames; unknown passes.
+            min_visibility_test: Least visible share of val and test frames.
+            batch_size: Frames of a training batch.
+            batch_size_test: Frames of a val or test batch; None: as many.
+            workers: Loader processes; None: see `spare_cores`.
+            seed: Decides order and augmentation.
+            augment: Changes training frames.
+            cache: "memory", "disk" or "none".
+            cache_dir: Where `disk` keeps frames; None: the dataset's own `.cache`.
+            on_error: "raise", or "skip" broken frames and count them.
+            limit_train: The first so many training frames of a fixed shuffle.
+            limit_val: Likewise of val.
+            limit_test: Likewise of test.
+            points: Surface points for ADD.
+            model_points: A folder with <class>/points.xyz in the dataset's own frame instead.
+            generate: Called with the root where scenes are yet to be rendered.
+            options: The reader's own.
+            progress: Draw bars.
+
+        Raises:
+            UserError: A value makes no sense.
         """
         super().__init__()
+        check_ranges(locals())
         if cache not in CACHES:
             raise UserError(f"data.cache={cache}: choose {', '.join(CACHES)}")
         if root is None:

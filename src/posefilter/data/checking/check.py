@@ -15,7 +15,8 @@ from rich.table import Table
 
 from posefilter.data.checking.compare import Fit, View, compare, half_pixel, likely_causes
 from posefilter.data.checking.contact_figure import tile, write_sheet
-from posefilter.data.frames import NotShown, Reader
+from posefilter.data.checking.frames import Suspect, describe_suspects, is_suspect
+from posefilter.data.frames import Implausible, NotShown, Reader
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
 from posefilter.meshes.store import MeshStore
@@ -24,6 +25,7 @@ from posefilter.progress import watched
 LEAST_IOU = 0.95
 # a depth error is a problem above 5 mm and above 0.8 % of the distance
 _DEPTH_MM, _DEPTH_SHARE = 5.0, 0.008
+_LISTED = 20  # single frames of an object
 _TRIED = 5  # frames on which causes are tried
 _TILES = 12  # on the contact sheet
 
@@ -31,18 +33,28 @@ _TILES = 12  # on the contact sheet
 def check_dataset(
     reader: Reader,
     meshes: MeshStore,
-    limit: int = 50,
+    limit: int | None = 50,
     out: Path | str | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
-    """Compare up to `limit` frames of each of a reader's objects with its mesh.
+    """Compare frames of each of a reader's objects with its mesh.
 
-    Returns `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm",
-    "visible_share"}], "problems": [...]}`, medians all; None stands for what could not be measured.
-    Problems are sentences that name the likely cause. `out` gets data_report.json and
-    contact_sheet.png. Broken files are reported, not raised; open the reader with on_error="skip".
+    Args:
+        reader: The dataset, opened with on_error="skip": broken files are reported, not raised.
+        meshes: The meshes.
+        limit: Frames of each object at most, spread evenly; None: all.
+        out: Gets data_report.json and contact_sheet.png.
+        progress: Draw a bar.
+
+    Returns:
+        `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}],
+        "problems": [...]}`, medians all; None stands for what could not be measured. Problems are
+        sentences that name the likely cause: of most frames of an object, or of a single one.
+
+    Raises:
+        UserError: The limit is not positive.
     """
-    if limit < 1:
+    if limit is not None and limit < 1:
         raise UserError(f"limit={limit}: compare at least one frame of each object")
     geometry = Geometry(meshes)
     problems = [
@@ -85,7 +97,7 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _check_object(
-    reader: Reader, geometry: Geometry, name: str, limit: int, drawn: int, progress: bool
+    reader: Reader, geometry: Geometry, name: str, limit: int | None, drawn: int, progress: bool
 ) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
     """Return an object's row, its problems and its tiles."""
     mine = [i for i, record in enumerate(reader.records()) if record.object == name]
@@ -96,7 +108,9 @@ def _check_object(
     chosen = (
         [
             mine[k]
-            for k in np.unique(np.linspace(0, len(mine) - 1, min(limit, len(mine))).astype(int))
+            for k in np.unique(
+                np.linspace(0, len(mine) - 1, min(limit or len(mine), len(mine))).astype(int)
+            )
         ]
         if mine
         else []
@@ -106,9 +120,15 @@ def _check_object(
     views: list[View] = []
     fits: list[Fit] = []
     tiles: list[np.ndarray] = []
+    suspects: list[Suspect] = []
     for i in watched(chosen, name, progress):
+        flaw = ""
         try:
-            view = View(reader.read(i), reader.others(i), mesh, native)
+            try:
+                sample = reader.read(i)
+            except Implausible as error:
+                sample, flaw = error.sample, str(error)
+            view = View(sample, reader.others(i), mesh, native)
         except NotShown:
             continue
         except BadData as error:
@@ -117,6 +137,8 @@ def _check_object(
             continue
         fit = compare(view, geometry)
         fits.append(fit)
+        if (flaw or is_suspect(view, fit)) and len(suspects) < _LISTED:
+            suspects.append(Suspect(f"{reader.records()[i].name} {name}", view, fit, flaw))
         if len(views) < _TRIED:
             views.append(view)
         if len(tiles) < drawn:
@@ -126,9 +148,15 @@ def _check_object(
         for cause, count in broken.items()
     ]
     row = _row(name, len(fits), fits)
+    if not fits:
+        return row, [*problems, f"{name}: no frame shows it"], tiles
+    general = _judge(row, views, fits, geometry)
+    # what is wrong with most frames is told once
+    single = [one for one in suspects if one.flaw] if general else suspects
+    explained = any("no cause" not in problem for problem in general)
     return (
         row,
-        problems + (_judge(row, views, fits, geometry) if fits else [f"{name}: no frame shows it"]),
+        [*problems, *general, *([] if explained else describe_suspects(single, geometry))],
         tiles,
     )
 

@@ -1,5 +1,6 @@
 """Read datasets in BOP's format: millimeters, objects by number, one mask an instance."""
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,9 @@ from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import (
     expect_size,
+    list_folder,
     need,
+    need_list,
     numbers,
     read_color,
     read_depth,
@@ -20,6 +23,7 @@ from posefilter.data.readers.decode import (
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.plausible import check_camera, check_sample, check_units
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.meshes import ycb
@@ -27,6 +31,7 @@ from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside
 
 MM = 0.001  # meters a millimeter
+_IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
 # Center of the bounding box of YCB-Video's models [m]: the origin of BOP's YCB-V models, which are
 # not turned.
 _YCBV_CENTERS = {
@@ -80,9 +85,18 @@ class BopReader(BaseReader):
     ) -> None:
         """List the frames.
 
-        objects: `obj_000002` as the models are named, or YCB's names for YCB-V. mesh_frame: "bop"
-        where meshes are the dataset's own (the default for obj_...; the mesh store wants
-        scale=0.001), "original" where they are google_16k (the default for YCB's names).
+        Args:
+            root: The folder of a split, or of the dataset.
+            objects: `obj_000002` as the models are named, or YCB's names for YCB-V; None: all.
+            meshes: For visibility.
+            part: The split, where `root` is the dataset's folder.
+            mesh_frame: "bop" where meshes are the dataset's own (the default for obj_...; the mesh
+                store wants scale=0.001), "original" where they are google_16k (the default for
+                YCB's names).
+            on_error: "raise", or "skip" broken frames and count them.
+
+        Raises:
+            UserError: There are no scenes, no such class, or a file is broken.
         """
         super().__init__(root, meshes, on_error)
         base = self.root / part if part else self.root
@@ -99,10 +113,7 @@ class BopReader(BaseReader):
         if self._mesh_frame not in ("bop", "original"):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose bop or original")
         numbers_seen = {
-            int(one.get("obj_id", 0))
-            for _, scene in scenes
-            for gt in scene[0].values()
-            for one in gt
+            int(one["obj_id"]) for _, scene in scenes for gt in scene[0].values() for one in gt
         }
         self.objects = choose_objects(
             wanted, sorted(self._name(n) for n in numbers_seen if n > 0), base
@@ -136,12 +147,12 @@ class BopReader(BaseReader):
         Raises BadData.
         """
         entry = self._entries[i]
-        color_path, depth_path, mask_path = self._files(entry.record)[:3]
-        rgb, depth, mask = (
-            read_color(color_path),
-            read_depth(depth_path, entry.units),
-            read_label(mask_path) > 0,
-        )
+        color_path, depth_path, mask_path, gt_path, camera_path = self._files(entry.record)
+        check_camera(entry.K, camera_path)
+        label = read_label(mask_path)
+        if ((label != 0) & (label != label.max())).any():
+            raise BadData(mask_path, "no mask", "more than two values; is it the depth?")
+        rgb, depth, mask = read_color(color_path), read_depth(depth_path, entry.units), label > 0
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(mask_path, mask, height, width, color_path.name)
@@ -149,7 +160,9 @@ class BopReader(BaseReader):
             raise NotShown(mask_path, "listed, but not in the label", entry.record.object)
         object_id = self.objects.index(entry.record.object)
         K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
-        return Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
+        sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
+        native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
+        return check_sample(sample, native, (camera_path, gt_path, depth_path, mask_path))
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
@@ -175,10 +188,14 @@ class BopReader(BaseReader):
                 for kind in ("gt", "camera")
             )
             for name, content in (("gt", truth), ("camera", cameras)):
-                if not (isinstance(content, dict) and all(image.isdecimal() for image in content)):
+                if not (isinstance(content, dict) and all(map(_IMAGE.fullmatch, content))):
                     raise BadData(
                         folder / f"scene_{name}.json", "not records by the number of the image"
                     )
+            for image in truth:
+                path = folder / "scene_gt.json"
+                for k, one in enumerate(need_list(truth, image, path)):
+                    numbers(one, "obj_id", path, (), f"{image}[{k}].")
             return truth, cameras
         except BadData as error:
             self._leave_out(error)
@@ -207,12 +224,7 @@ class BopReader(BaseReader):
         camera = need(cameras, image, camera_path)
         K = numbers(camera, "cam_K", camera_path, (3, 3), f"{image}.")
         scale = float(numbers(camera, "depth_scale", camera_path, (), f"{image}."))
-        if scale <= 0:
-            raise BadData(
-                camera_path,
-                "depth scale is not a positive number",
-                f"{image}.depth_scale = {scale}",
-            )
+        check_units(1 / (scale * MM) if scale > 0 else scale, camera_path, f"{image}.depth_scale")
         masks = [folder / "mask_visib" / f"{stem}_{k:06d}.png" for k in range(len(truth))]
         entries = []
         for k, one in enumerate(truth):
@@ -252,9 +264,9 @@ def _color(folder: Path, stem: str) -> Path:
 def _scene_folders(base: Path) -> Iterator[Path]:
     if not base.is_dir():
         raise UserError(f"{base}: no such folder (data.root)")
-    if base.name.isdigit() and (base / "scene_camera.json").is_file():
+    if _SCENE.fullmatch(base.name) and (base / "scene_camera.json").is_file():
         yield base
         return
-    for folder in base.iterdir():
-        if folder.is_dir() and folder.name.isdigit():
-            yield folder
+    for name in list_folder(base):
+        if _SCENE.fullmatch(name) and (base / name).is_dir():
+            yield base / name

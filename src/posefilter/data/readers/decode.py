@@ -1,6 +1,8 @@
 """Decode a dataset's files, and say in one line what is wrong with them."""
 
+import io
 import json
+import math
 import struct
 import zlib
 from pathlib import Path
@@ -27,15 +29,30 @@ def read_color(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, units: float) -> np.ndarray:
-    """Read a 16-bit depth image of so many units a meter; saturated pixels count as unknown.  ->
-    (H, W) float32 [m].
+    """Read a depth image, or an array of depths (`.npy`).
+
+    Args:
+        path: A 16-bit image, or an array (H, W) of whole numbers in the same units or of floats in
+            meters.
+        units: Units of whole numbers a meter.
+
+    Returns:
+        Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that.
+
+    Raises:
+        BadData: The file is not such, or holds NaN, infinity or negative depth.
     """
-    image = _read_image(path)
+    image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         raise BadData(
             path, "depth holds NaN or infinity", "expected a 16-bit image, 0 where unknown"
         )
-    if image.dtype != np.uint16 or image.ndim != 2:
+    if path.suffix == ".npy" and image.ndim == 2 and image.dtype.kind in "fui":
+        if (image < 0).any():
+            raise BadData(path, "depth is negative", f"{image.min()}")
+        if image.dtype.kind == "f":
+            return image.astype(np.float32)
+    elif image.dtype != np.uint16 or image.ndim != 2:
         raise BadData(
             path, "depth is not a 16-bit image of one channel", f"found {image.dtype} {image.shape}"
         )
@@ -60,7 +77,7 @@ def read_json(path: Path) -> Any:
     """Parse a JSON file."""
     try:
         return json.loads(read_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
         raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
 
 
@@ -69,6 +86,22 @@ def need(record: Any, key: str, path: Path, where: str = "") -> Any:
     if not isinstance(record, dict) or key not in record:
         raise BadData(path, f"missing key '{where}{key}'")
     return record[key]
+
+
+def need_list(record: Any, key: str, path: Path, where: str = "") -> list[Any]:
+    """Return record[key].  Raises BadData where it is missing, or no list of mappings."""
+    value = need(record, key, path, where)
+    if not (isinstance(value, list) and all(isinstance(one, dict) for one in value)):
+        raise BadData(path, f"'{where}{key}' is no list of records", f"found {str(value)[:40]}")
+    return value
+
+
+def list_folder(folder: Path) -> list[str]:
+    """Return the names in a folder.  Raises BadData where it may not be read."""
+    try:
+        return [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise BadData(folder, "cannot be read", error.strerror or type(error).__name__) from error
 
 
 def numbers(
@@ -112,6 +145,25 @@ def _read_image(path: Path) -> np.ndarray:
     if image is None:
         raise BadData(path, "truncated or corrupt image", "cannot be decoded")
     return image
+
+
+def _read_array(path: Path) -> np.ndarray:
+    """Read an array of numbers of a NumPy file, no larger than the file is."""
+    data = io.BytesIO(read_bytes(path))
+    try:
+        version = np.lib.format.read_magic(data)
+        reader = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, fortran, dtype = reader(data)
+        left = data.getbuffer()[data.tell() :]
+        if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(left):
+            raise ValueError(f"{dtype} {shape} in {len(left)} bytes")
+        array = np.frombuffer(left, dtype)
+    except Exception as error:  # the header decides what breaks: its parser raises anything
+        raise BadData(path, "not readable as a NumPy array", f"truncated? {error}") from error
+    return array.reshape(shape, order="F" if fortran else "C")
 
 
 def _flaw(data: bytes) -> str:

@@ -15,7 +15,10 @@ from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import (
     expect_size,
+    list_folder,
     need,
+    need_list,
+    numbers,
     read_color,
     read_depth,
     read_json,
@@ -33,6 +36,7 @@ from posefilter.data.readers.fat_settings import (
     scene_folders,
 )
 from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.plausible import check_camera, check_sample
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
@@ -41,6 +45,7 @@ from posefilter.paths import check_inside
 DEPTH_UNITS = 10_000.0  # depth image units a meter
 # [m]; the wood block's public mesh is off by more, all others by less than 1 mm
 _CUBOID_TOLERANCE = 0.005
+_LARGEST_ID = 255  # of a segment
 _CLEARLY_VISIBLE = 0.2  # FAT's own visibility from which an empty mask contradicts the record
 
 
@@ -66,18 +71,26 @@ class FatReader(BaseReader):
         root: str | Path,
         objects: str | Sequence[str] | None = None,
         meshes: MeshStore | None = None,
-        eyes: Sequence[str] = ("left", "right"),
+        cameras: Sequence[str] = ("left", "right"),
         parts: Sequence[str] = ("single", "mixed"),
         on_error: str = "raise",
     ) -> None:
         """List the frames.
 
-        objects: classes, with or without FAT's `_16k`; None: all. meshes: for visibility, and to
-        tell two instances of a class apart (frames with two are left out without). on_error:
-        "raise", or "skip" broken frames and count.
+        Args:
+            root: The dataset's folder.
+            objects: Classes, with or without FAT's `_16k`; None: all.
+            meshes: For visibility, and to tell two instances of a class apart; without, frames
+                with two are left out.
+            cameras: "left", "right" or both.
+            parts: "single", "mixed" or both.
+            on_error: "raise", or "skip" broken frames and count them.
+
+        Raises:
+            UserError: There are no frames, or no such class.
         """
         super().__init__(root, meshes, on_error)
-        self.eyes = tuple(eyes)
+        self.cameras = tuple(cameras)
         self._native: dict[str, np.ndarray] = {}
         # a folder whose frame of the class is not the first folder's
         self._ambiguous: dict[str, Path] = {}
@@ -123,7 +136,9 @@ class FatReader(BaseReader):
         """
         entry = self._entries[i]
         record, camera = entry.record, entry.camera
-        color_path, depth_path, seg_path = self._files(record)[:3]
+        color_path, depth_path, seg_path, json_path = self._files(record)
+        camera_path = json_path.with_name("_camera_settings.json")
+        check_camera(camera.K, camera_path)
         rgb, depth, seg = (
             read_color(color_path),
             read_depth(depth_path, DEPTH_UNITS),
@@ -131,8 +146,10 @@ class FatReader(BaseReader):
         )
         for path, image in zip(record.files, (rgb, depth, seg), strict=False):
             expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
+        if int(seg.max()) > _LARGEST_ID:
+            raise BadData(seg_path, "no segment image", f"id {int(seg.max())}; is it the depth?")
         mask = self._mask(entry, seg, seg_path)
-        return Sample(
+        sample = Sample(
             rgb,
             depth,
             mask,
@@ -142,6 +159,8 @@ class FatReader(BaseReader):
             i,
             float("nan"),
         )
+        native = entry.camera_from_object @ np.linalg.inv(entry.kind.aligned_from_mesh)
+        return check_sample(sample, native, (camera_path, json_path, depth_path, seg_path))
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
@@ -183,22 +202,22 @@ class FatReader(BaseReader):
             return None
 
     def _list_folder(
-        self, number: int, folder: Path, classes: dict[str, FatClass], cameras: dict[str, FatCamera]
+        self, number: int, folder: Path, classes: dict[str, FatClass], known: dict[str, FatCamera]
     ) -> Iterator[_Entry]:
         for name in self.objects:
             if name in classes:
                 self._remember(name, classes[name], folder)
-        names = {path.name for path in folder.iterdir()}
+        names = set(list_folder(folder))
         stems = {f"{m[1]}.{m[2]}" for m in map(IMAGE.match, names) if m} | {
             n[:-5] for n in names if FRAME.match(n)
         }
         for stem in sorted(stems):
-            frame, eye = stem.split(".")
-            if eye not in self.eyes:
+            frame, camera = stem.split(".")
+            if camera not in self.cameras:
                 continue
             try:
-                if eye not in cameras:
-                    raise BadData(folder / "_camera_settings.json", f"no camera named '{eye}'")
+                if camera not in known:
+                    raise BadData(folder / "_camera_settings.json", f"no camera named '{camera}'")
                 color = (
                     f"{stem}.png"
                     if f"{stem}.png" in names and f"{stem}.jpg" not in names
@@ -209,7 +228,7 @@ class FatReader(BaseReader):
                     for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
                 )
                 yield from self._list_frame(
-                    2 * number + (eye == "right"), int(frame), files, classes, cameras[eye]
+                    2 * number + (camera == "right"), int(frame), files, classes, known[camera]
                 )
             except BadData as error:
                 self._leave_out(error)
@@ -225,7 +244,7 @@ class FatReader(BaseReader):
         path = files[3]
         content = read_json(check_inside(path, self.root))
         found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
-        for k, one in enumerate(need(content, "objects", path)):
+        for k, one in enumerate(need_list(content, "objects", path)):
             name = mesh_name(need(one, "class", path, f"objects[{k}]."), path)
             if name not in classes:
                 raise BadData(
@@ -236,7 +255,12 @@ class FatReader(BaseReader):
                     camera_from_aligned(one, path, f"objects[{k}].")
                     @ classes[name].aligned_from_mesh
                 )
-                found.setdefault(name, []).append((k, pose, float(one.get("visibility", 1.0))))
+                visibility = (
+                    float(numbers(one, "visibility", path, (), f"objects[{k}]."))
+                    if "visibility" in one
+                    else 1.0
+                )
+                found.setdefault(name, []).append((k, pose, visibility))
         entries = []
         for name, many in found.items():
             if len(many) > 1 and self._geometry is None:

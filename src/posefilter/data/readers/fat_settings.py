@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.data.readers.decode import need, numbers, read_json
+from posefilter.data.readers.decode import list_folder, need, need_list, numbers, read_json
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
+from posefilter.limits import MOST_SIDE
 from posefilter.paths import is_plain_name
 
 CM = 0.01  # meters a centimeter
 FRAME = re.compile(r"^(\d+)\.(left|right)\.json$")
 IMAGE = re.compile(r"^(\d+)\.(left|right)\.(jpg|png)$")
+_DEEPEST = 6  # folders between the dataset's and a scene's
 _NEWER = re.compile(r"\.(cs|is|depth\.16|depth\.cm\.\d+)\.png$")
 
 
@@ -32,16 +34,20 @@ class FatClass:
 
 @dataclass(frozen=True, eq=False)
 class FatCamera:
+    """A camera, as a folder's settings have it."""
+
     K: np.ndarray  # (3, 3)
     height: int
     width: int
 
 
-def scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
+def scene_folders(root: Path, parts: set[str], deep: int = 0) -> Iterator[Path]:
     """Yield the folders that hold frames, not looking below them."""
     if not root.is_dir():
         raise UserError(f"{root}: no such folder (data.root)")
-    names = [path.name for path in root.iterdir()]
+    if deep > _DEEPEST:
+        raise UserError(f"{root}: folders nested more than {_DEEPEST} deep; a link to itself?")
+    names = list_folder(root)
     if (
         any(FRAME.match(name) or IMAGE.match(name) for name in names)
         or "_object_settings.json" in names
@@ -59,7 +65,7 @@ def scene_folders(root: Path, parts: set[str]) -> Iterator[Path]:
             and not name.startswith(".")
             and (name not in {"single", "mixed"} or name in parts)
         ):
-            yield from scene_folders(root / name, parts)
+            yield from scene_folders(root / name, parts, deep + 1)
 
 
 def mesh_name(fat_class: Any, path: Path) -> str:
@@ -71,9 +77,11 @@ def mesh_name(fat_class: Any, path: Path) -> str:
 
 
 def object_settings(path: Path) -> dict[str, FatClass]:
+    """Return the classes of a folder's `_object_settings.json`, by mesh name."""
     classes = {}
-    for k, one in enumerate(need(read_json(path), "exported_objects", path)):
+    for k, one in enumerate(need_list(read_json(path), "exported_objects", path)):
         where = f"exported_objects[{k}]."
+        need(one, "fixed_model_transform", path, where)
         F = numbers(one, "fixed_model_transform", path, (4, 4), where)
         aligned = F.T.copy()  # row vectors -> columns
         aligned[:3] *= CM  # x100 in the rotation, centimeters in the translation
@@ -94,8 +102,9 @@ def object_settings(path: Path) -> dict[str, FatClass]:
 
 
 def camera_settings(path: Path) -> dict[str, FatCamera]:
+    """Return the cameras of a folder's `_camera_settings.json`, by name."""
     cameras = {}
-    for k, one in enumerate(need(read_json(path), "camera_settings", path)):
+    for k, one in enumerate(need_list(read_json(path), "camera_settings", path)):
         where = f"camera_settings[{k}]."
         inner = need(one, "intrinsic_settings", path, where)
         fx, fy, cx, cy = (
@@ -107,12 +116,22 @@ def camera_settings(path: Path) -> dict[str, FatCamera]:
             int(numbers(size, key, path, (), f"{where}captured_image_size."))
             for key in ("width", "height")
         )
-        K = np.array([[fx, float(inner.get("s", 0.0)), cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        skew = (
+            float(numbers(inner, "s", path, (), f"{where}intrinsic_settings."))
+            if "s" in inner
+            else 0.0
+        )
+        if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
+            raise BadData(
+                path, "no such image size", f"{where}captured_image_size {width}x{height}"
+            )
+        K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         cameras[str(need(one, "name", path, where))] = FatCamera(K, height, width)
     return cameras
 
 
 def camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
+    """Return an object's pose in FAT's aligned frame.  -> (4, 4) [m]."""
     quat = numbers(record, "quaternion_xyzw", path, (4,), where)
     if abs(np.linalg.norm(quat) - 1) > 0.01:  # four decimals leave it 1e-4 off
         raise BadData(

@@ -36,8 +36,12 @@ def open_reader(
         raise UserError(f"data.source={source}: unknown; choose from {', '.join(READERS)}")
     if on_error not in ("raise", "skip"):
         raise UserError(f"data.on_error={on_error}: choose raise or skip")
+    if "eyes" in options:
+        raise UserError("data.options.eyes: is now called data.options.cameras")
     try:
         return READERS[source](root, objects, meshes=meshes, on_error=on_error, **options)
+    except OSError as error:
+        raise UserError(f"{error.filename or root}: cannot be read ({error.strerror})") from error
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise

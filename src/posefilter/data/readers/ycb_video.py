@@ -3,7 +3,7 @@
 """
 
 import io
-import zlib
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,19 +12,27 @@ from typing import Any
 import numpy as np
 import scipy.io
 import torch
-from scipy.io.matlab import MatReadError
 
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
-from posefilter.data.readers.decode import expect_size, numbers, read_color, read_depth, read_label
+from posefilter.data.readers.decode import (
+    expect_size,
+    list_folder,
+    numbers,
+    read_color,
+    read_depth,
+    read_label,
+)
 from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.plausible import check_camera, check_sample, check_units
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
-from posefilter.limits import read_bytes
+from posefilter.limits import read_bytes, read_lines
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside, is_plain_name
 
+_FRAME = re.compile(r"[0-9]{1,9}")
 _KEYS = ["cls_indexes", "poses", "factor_depth", "intrinsic_matrix"]
 # bytes of a -meta.mat, of which there may be 2 MB, and of a list
 _LARGEST_META, _LONGEST_LIST = 1 << 25, 1 << 22
@@ -60,9 +68,18 @@ class YCBVideoReader(BaseReader):
     ) -> None:
         """List the frames.
 
-        parts: "data", "data_syn" or both. frames: a list such as image_sets/keyframe.txt; nothing
-        else is looked at. mesh_frame: "original" where meshes are YCB's google_16k, "ycb_video"
-        where they are YCB-Video's own models.
+        Args:
+            root: The dataset's folder, its `data` or `data_syn`, or a scene's.
+            objects: Classes; None: all.
+            meshes: For visibility, and to tell two instances of a class apart.
+            parts: "data", "data_syn" or both.
+            frames: A list such as image_sets/keyframe.txt; nothing else is looked at.
+            mesh_frame: "original" where meshes are YCB's google_16k, "ycb_video" where they are
+                YCB-Video's own models.
+            on_error: "raise", or "skip" broken frames and count them.
+
+        Raises:
+            UserError: There are no frames, no such class, or a file is broken.
         """
         super().__init__(root, meshes, on_error)
         if mesh_frame not in ("original", "ycb_video"):
@@ -111,7 +128,8 @@ class YCBVideoReader(BaseReader):
         Raises BadData.
         """
         entry = self._entries[i]
-        color_path, depth_path, label_path, _ = self._files(entry.record)
+        color_path, depth_path, label_path, meta_path = self._files(entry.record)
+        check_camera(entry.K, meta_path)
         rgb, depth, label = (
             read_color(color_path),
             read_depth(depth_path, entry.units),
@@ -122,7 +140,10 @@ class YCBVideoReader(BaseReader):
         expect_size(label_path, label, height, width, color_path.name)
         object_id = self.objects.index(entry.record.object)
         K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
-        return Sample(rgb, depth, self._mask(entry, label), K, pose, object_id, i, float("nan"))
+        mask = self._mask(entry, label)
+        sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
+        native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
+        return check_sample(sample, native, (meta_path, meta_path, depth_path, label_path))
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
@@ -170,7 +191,7 @@ class YCBVideoReader(BaseReader):
         missing = 0
         for name in names:
             scene, stem = name.rsplit("/", 1)
-            if not stem.isdigit():
+            if not _FRAME.fullmatch(stem):
                 raise UserError(
                     f"{folders.get(scene, self.root)}/{stem}: frames are named by "
                     f"numbers, such as 000001"
@@ -181,7 +202,7 @@ class YCBVideoReader(BaseReader):
             scene_id = (
                 _SYN_SCENE + int(stem) // _SYN_BLOCK
                 if scene == _SYN
-                else int("".join(filter(str.isdigit, scene)) or 0)
+                else int("".join(c for c in scene if c in "0123456789")[:9] or 0)
             )
             yield scene_id, int(stem), name, folders[scene] / stem
         if missing == len(names):
@@ -194,9 +215,15 @@ class YCBVideoReader(BaseReader):
     def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
         path = stem.with_name(f"{stem.name}-meta.mat")
         meta = _read_meta(check_inside(path, self.root))
-        indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
+        try:
+            indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
+        except (TypeError, ValueError) as error:
+            raise BadData(path, "'cls_indexes' is not numbers", str(error)) from error
+        if len(indices) == 0:
+            return []
         if (
-            (indices != np.round(indices)).any()
+            not np.isfinite(indices).all()
+            or (indices != np.round(indices)).any()
             or indices.min() < 1
             or indices.max() > len(self._classes)
         ):
@@ -211,6 +238,7 @@ class YCBVideoReader(BaseReader):
         poses = numbers(meta, "poses", path, (3, 4, len(classes))).transpose(2, 0, 1)
         K = numbers(meta, "intrinsic_matrix", path, (3, 3))
         units = float(numbers(meta, "factor_depth", path, ()))
+        check_units(units, path, "factor_depth")
         files = tuple(
             stem.with_name(f"{stem.name}-{ending}")
             for ending in ("color.png", "depth.png", "label.png", "meta.mat")
@@ -246,11 +274,7 @@ def _class_names(root: Path) -> tuple[str, ...]:
         root.parent / "classes.txt",
     ):
         if path.is_file():
-            names = tuple(
-                line.strip()
-                for line in read_bytes(path, _LONGEST_LIST).decode().splitlines()
-                if line.strip()
-            )
+            names = tuple(read_lines(path, _LONGEST_LIST))
             wrong = [name for name in names if not is_plain_name(name)]
             if wrong:
                 raise UserError(f"{path}: class with an impossible name {wrong[0][:40]!r}")
@@ -267,13 +291,14 @@ def _scene_folders(root: Path, parts: set[str]) -> Iterator[tuple[str, Path]]:
         yield _SYN, root / _SYN
     data = root / "data" if (root / "data").is_dir() else root
     if "data" in parts:
-        for folder in data.iterdir():
-            if folder.is_dir() and folder.name.isdigit():
-                yield folder.name, folder
+        for name in list_folder(data):
+            if _FRAME.fullmatch(name) and (data / name).is_dir():
+                yield name, data / name
 
 
 def _stems(folder: Path) -> list[str]:
-    return [path.name.removesuffix("-meta.mat") for path in folder.glob("*-meta.mat")]
+    names = list_folder(folder)
+    return [name.removesuffix("-meta.mat") for name in names if name.endswith("-meta.mat")]
 
 
 def _read_list(root: Path, listed: str | Path) -> list[str]:
@@ -281,7 +306,7 @@ def _read_list(root: Path, listed: str | Path) -> list[str]:
     path = next((p for p in candidates if p.is_file()), None)
     if path is None:
         raise UserError(f"{listed}: no such list of frames (data.options.frames), nor below {root}")
-    names = [line.strip() for line in path.read_text().splitlines() if line.strip()]
+    names = read_lines(path, _LONGEST_LIST)
     if not names or any("/" not in name for name in names):
         raise UserError(f"{path}: not a list of frames; expected lines such as 0048/000001")
     return names
@@ -292,16 +317,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
     data = io.BytesIO(read_bytes(path, _LARGEST_META))
     try:
         meta = scipy.io.loadmat(data, variable_names=_KEYS)
-    except (
-        MemoryError,
-        MatReadError,
-        ValueError,
-        TypeError,
-        OSError,
-        NotImplementedError,
-        EOFError,
-        zlib.error,
-    ) as error:
+    except Exception as error:  # the file decides what breaks: the parser raises anything
         raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error
     for key in _KEYS:
         if key not in meta:

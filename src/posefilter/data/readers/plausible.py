@@ -1,0 +1,90 @@
+"""Refuse what a camera cannot have seen: intrinsics, poses, depth and labels that cannot be."""
+
+from pathlib import Path
+
+import numpy as np
+
+from posefilter.data.frames import Implausible, Sample
+from posefilter.errors import BadData
+
+FARTHEST = 100.0  # [m] of an object, and of the median of what a depth image holds
+_NEAREST = 0.01  # [m] of that median
+_FOCAL = (0.1, 100.0)  # focal lengths, in widths of the image: 157 to 0.6 degrees of view
+_SQUARE = 2.0  # the focal lengths of one camera differ by this factor at most
+_SKEW = 0.1  # in focal lengths
+_UNITS = (1e-2, 1e7)  # depth image units a meter
+
+
+def check_camera(K: np.ndarray, path: Path) -> None:
+    """Refuse intrinsics that are no pinhole camera's.
+
+    Args:
+        K: Intrinsics (3, 3) [px].
+        path: The file that they are from.
+
+    Raises:
+        BadData: K is not finite, its focal lengths are not positive, or its other elements are not
+            as they must be.
+    """
+    if not np.isfinite(K).all():
+        raise BadData(path, "intrinsics hold NaN or infinity")
+    if not np.allclose(K[2], [0, 0, 1], atol=1e-6):
+        hint = "transposed?" if np.allclose(K[:, 2], [0, 0, 1], atol=1e-6) else "not [0, 0, 1]"
+        raise BadData(path, "intrinsics are no camera matrix", f"last row {K[2].tolist()}: {hint}")
+    if min(K[0, 0], K[1, 1]) <= 0 or abs(K[1, 0]) > 1e-6 * K[1, 1]:
+        raise BadData(
+            path, "intrinsics are no camera matrix", f"fx {K[0, 0]:g}, fy {K[1, 1]:g} [px]"
+        )
+    if abs(K[0, 1]) > _SKEW * K[0, 0]:
+        raise BadData(path, "intrinsics are no camera matrix", f"skew {K[0, 1]:g} px")
+
+
+def check_units(units: float, path: Path, key: str) -> None:
+    """Refuse a depth scale that no camera has.  units: of the depth image, a meter.
+
+    Raises:
+        BadData: It is not a positive number, or too small or large.
+    """
+    if units <= 0:
+        raise BadData(path, "depth scale is not a positive number", f"{key} = {units:g}")
+    if not _UNITS[0] <= units <= _UNITS[1]:  # NaN too
+        raise BadData(path, "depth scale is not plausible", f"{key}: {units:g} units a meter")
+
+
+def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Path, ...]) -> Sample:
+    """Return a sample as it is, where a camera can have seen it.
+
+    Args:
+        sample: What was read; its intrinsics have passed `check_camera`.
+        camera_from_native: Pose of the dataset's own object frame (4, 4) [m].
+        files: Where intrinsics, pose, depth and label are from.
+
+    Raises:
+        BadData: Depth is unknown everywhere, or the label covers the whole image.
+        Implausible: Anything else cannot be; it carries the sample.
+    """
+    camera, truth, depth, label = files
+    known = sample.depth[sample.depth > 0]
+    if len(known) == 0:
+        raise BadData(depth, "depth is unknown everywhere", "every pixel is 0 or saturated")
+    if sample.mask.all():
+        raise BadData(label, "the label covers the whole image")
+    K, (height, width) = sample.intrinsics, sample.mask.shape
+    fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+    low, high = _FOCAL[0] * width, _FOCAL[1] * width
+    if not (low <= min(fx, fy) and max(fx, fy) <= high and 1 / _SQUARE <= fx / fy <= _SQUARE):
+        detail = f"fx {fx:g}, fy {fy:g} px for an image {width} px wide"
+        raise Implausible(camera, "focal lengths are not plausible", detail, sample)
+    if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
+        detail = f"({cx:g}, {cy:g}) of {width}x{height}; another resolution's, or swapped with fx?"
+        raise Implausible(camera, "principal point is far outside of the image", detail, sample)
+    z = float(camera_from_native[2, 3])
+    if not (z > 0 and np.linalg.norm(camera_from_native[:3, 3]) <= FARTHEST):
+        where = "behind the camera" if z <= 0 else f"{z:.3g} m away; wrong unit?"
+        raise Implausible(truth, "the object cannot be seen where its pose is", where, sample)
+    middle = float(np.median(known))
+    if not _NEAREST <= middle <= FARTHEST:
+        raise Implausible(
+            depth, "depth is not plausible", f"median {middle:.3g} m; wrong depth scale?", sample
+        )
+    return sample
