@@ -127,7 +127,7 @@ class Estimator:
         if not methods:
             raise UserError("an estimator needs the weights of one object at least")
         for method in methods:
-            if not method.tells_pose:
+            if "pose" not in method.capabilities:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.methods = tuple(method.to(device).eval() for method in methods)

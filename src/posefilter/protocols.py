@@ -110,6 +110,15 @@ class HasSurfacePoints(Protocol):
 
 
 @runtime_checkable
+class HasImagePatches(Protocol):
+    """A method whose particles each see a patch of the image: the figure of glimpses asks for it."""
+
+    def image_patches(self, scene: Scene, state: Tensor) -> Tensor:
+        """Return what particles (B, N, 2) [px] see: (B, N, C, k, k), color in [-1, 1] first."""
+        ...
+
+
+@runtime_checkable
 class HasRelevance(Protocol):
     """A scene that tells where in its images to look: the start `from relevance` asks for it."""
 

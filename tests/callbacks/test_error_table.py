@@ -77,7 +77,7 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     data = SimpleNamespace(records=lambda split: records)
     trainer: Any = SimpleNamespace(datamodule=data, is_global_zero=True, loggers=[], global_step=3)
     method: Any = Method()
-    method.model, method.tells_pose, method.scores = object_model(), True, {"poses": errors}
+    method.model, method.capabilities, method.scores = object_model(), {"pose"}, {"poses": errors}
     method.seconds_per_image = [0.5]
     method.particle_pixels = lambda particles, batch: torch.full((len(batch.frame_id), 4, 2), 5.0)
     table = ErrorTable(tmp_path, best=2, worst=2)

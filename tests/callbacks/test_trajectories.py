@@ -45,7 +45,9 @@ def test_the_heaviest_are_followed_and_what_they_saw_is_what_is_there() -> None:
     states = follow_particles(trace, most=2)
     assert states.tolist() == [[[20.0, 8.0]]] * 2
     image = torch.rand(1, 4, 16, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    method: Any = SimpleNamespace(glimpse=IntegerCut(3))
+    method: Any = SimpleNamespace(
+        image_patches=lambda scene, state: IntegerCut(3)(scene.image, state)
+    )
     scene: Any = SimpleNamespace(image=image)
     seen = extract_glimpses(method, scene, states)
     assert seen.shape == (2, 1, 3, 3, 3)

@@ -14,11 +14,13 @@ from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices, list_choices
-from posefilter.cli.checkpoints import build_method, check_loss, recipe
+from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job, explain
 from posefilter.cli.comparing import leaves
+from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
+from posefilter.cli.trust import Scope
 from posefilter.errors import UserError
 from posefilter.models.pose_pf import PosePF
 
@@ -46,7 +48,6 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(
     model: str, variant: str, tmp_path: Path
 ) -> None:
     job = compose(tmp_path, f"model={model}", f"variant={variant}")
-    check_loss(job)
     method = build_method(recipe(job))
     assert any(p.requires_grad for p in method.parameters())
     assert method.filter.particles == job.cfg.filter.particles
@@ -112,7 +113,8 @@ def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None
     ]
     assert points
     for point in points:
-        check_loss(compose(tmp_path, f"model={model}", point))
+        job = compose(tmp_path, f"model={model}", point)
+        check_fit(job.cfg, job.choices, Scope.CONFIG)
 
 
 @pytest.mark.parametrize("group", BUILT)
@@ -143,7 +145,7 @@ MISTAKES = {
     "data=scene": ("data=scene", "scenes"),
     "trainer.max_step=3": ("trainer.max_step", "trainer.max_steps"),
     "experiment=memorise": ("experiment=memorise", "is now experiment=memorize"),
-    "loss=add": ("loss=add", "contrast, regression"),
+    "loss=add": ("loss=add", "choose loss=contrast"),
     "filter.particles=many": ("filter.particles='many'", "whole number"),
     "filter.particles=0": ("particles=0", "1 or more"),
     "optimizer.lr=fast": ("optimizer.lr='fast'", "number"),

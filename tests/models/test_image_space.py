@@ -68,7 +68,7 @@ def run_filter(
 
 
 def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
-    detects = not kind.tells_pose
+    detects = "pose" not in kind.requires
     label = OnObject(size) if detects else Quality(size)
     aux_losses = {
         "likelihood": Auxiliary(BalancedBce(label)),
@@ -104,7 +104,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
 
 
 def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> ImageSpace:
-    detects = not kind.tells_pose
+    detects = "pose" not in kind.requires
     parts: dict[str, Any] = {
         "net": PatchNet if detects else LatentNet,
         "glimpse": IntegerCut(size),
@@ -152,7 +152,7 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     assert after["iou"] > 0.7
     assert after["signs"]["auroc"] > 0.8
     assert after["signs"]["on_object"][0] < 0.4 < after["signs"]["on_object"][-1]
-    if kind.tells_pose:
+    if "pose" in kind.requires:
         assert before["add"]["median_mm"] > 60
         assert after["add"]["median_mm"] < 25
 

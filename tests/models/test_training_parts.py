@@ -105,7 +105,7 @@ def test_the_relevances_loss_and_gradient_stay_finite_however_sure_it_is() -> No
 def tiny(kind: type[ImageSpace], **changes: Any) -> ImageSpace:
     """Return a tiny method whose lessons are called as in conf/."""
     method = working(kind, 3, **changes)
-    if kind.tells_pose:
+    if "pose" in kind.requires:
         method.aux_losses["pose"] = method.aux_losses.pop("own_point")
     return method
 

@@ -5,12 +5,14 @@ Pictures are (H, W, 3) uint8; bytes are a animation, a GIF.
 """
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from posefilter.callbacks.fields import (
+    HasPointLikelihood,
     choose_levels,
     choose_pixels,
     evaluate_point_field,
@@ -19,6 +21,7 @@ from posefilter.callbacks.fields import (
 )
 from posefilter.callbacks.gallery import KeptImage, draw_gallery
 from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
+from posefilter.capabilities import Capability
 from posefilter.figures.animation import (
     Animation,
     draw_silhouettes,
@@ -34,9 +37,7 @@ from posefilter.figures.particles import draw_iterations, normalize_weights
 from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.models.image_space import ImageSpace
-from posefilter.models.pose_pf import PosePF
-from posefilter.protocols import HasRelevance
+from posefilter.protocols import HasImagePatches, HasRelevance, ProposesPoses, ScoresPoses
 from posefilter.types import Batch, Trace
 
 
@@ -52,11 +53,6 @@ class Occasion(NamedTuple):
     scene: Any  # what the method keeps of it
     when: str
 
-    @property
-    def posed(self) -> bool:
-        """Tell whether particles are poses."""
-        return isinstance(self.method.space, PoseSpace)
-
     def title(self, what: str) -> str:
         """Return a figure's title, and below it what it is of."""
         return f"{what}\n{self.one.name}, {self.when}"
@@ -67,6 +63,20 @@ class Occasion(NamedTuple):
 
 
 Drawn = np.ndarray | bytes | None
+Drawing = Callable[[Occasion], Drawn]
+
+
+def needs(*names: Capability) -> Callable[[Drawing], Drawing]:
+    """Have a figure left out for methods that do not provide what it shows."""
+
+    def guard(draw: Drawing) -> Drawing:
+        @wraps(draw)
+        def drawing(o: Occasion) -> Drawn:
+            return draw(o) if o.method.capabilities.issuperset(names) else None
+
+        return drawing
+
+    return guard
 
 
 def overlays(o: Occasion) -> Drawn:
@@ -90,29 +100,27 @@ def particles(o: Occasion) -> Drawn:
     return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
 
 
+@needs("pose")
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
-    if not o.method.tells_pose:
-        return None
     return draw_belief(
         o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief")
     )
 
 
+@needs("pose_space")
 def silhouettes(o: Occasion) -> Drawn:
     """Draw the silhouettes of particles that are poses."""
-    if not o.posed:
-        return None
     title = o.title("Silhouettes")
     return draw_silhouettes(
         o.one.rgb, o.one.intrinsics, o.trace, o.method.model.hull.cpu(), o.one.truth, title
     )
 
 
+@needs("score_poses")
 def field(o: Occasion) -> Drawn:
     """Draw slices of the score about the truth."""
-    if not isinstance(o.method, PosePF):
-        return None
+    assert isinstance(o.method, ScoresPoses)
     model = o.method.model
     found = evaluate_pose_field(
         o.method, o.scene, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps)
@@ -126,11 +134,12 @@ def field(o: Occasion) -> Drawn:
     return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
 
 
+@needs("judge_points")
 def points(o: Occasion) -> Drawn:
     """Draw slices of the likelihood of single points through the object's frame (the paper, figure
     5).
     """
-    if not isinstance(o.method, PosePF):
+    if not isinstance(o.method, HasPointLikelihood):
         return None
     model, truth = o.method.model, o.batch.camera_from_object[0]
     slices = [
@@ -155,20 +164,24 @@ def points(o: Occasion) -> Drawn:
     )
 
 
+@needs("object_coordinates")
 def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
-    found = predict_proposals(o.method, o.scene, o.batch) if isinstance(o.method, PosePF) else None
-    if found is None:
+    if not isinstance(o.method, ProposesPoses):
+        return None
+    predicted = predict_proposals(o.method, o.scene, o.batch, o.method.model)
+    if predicted is None:
         return None
     title = o.title("Proposals")
     return draw_proposals(
-        found, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
+        predicted, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
     )
 
 
+@needs("pixel_space")
 def relevance(o: Occasion) -> Drawn:
     """Draw the map of relevance beside where particles started and ended."""
-    if o.posed or not isinstance(o.scene, HasRelevance):
+    if not isinstance(o.scene, HasRelevance):
         return None
     history = [
         (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
@@ -178,19 +191,18 @@ def relevance(o: Occasion) -> Drawn:
     return draw_relevance(seen, o.one.rgb, o.mask(), history[0], history[1], o.title("Relevance"))
 
 
+@needs("pixel_space")
 def trajectories(o: Occasion) -> Drawn:
     """Draw the way of particles that are pixels (the paper, figure 4)."""
-    if o.posed:
-        return None
     return draw_trajectories(
         o.one.rgb, o.mask(), trace_lineage(o.trace.particles)[0].numpy(), o.title("Trajectories")
     )
 
 
+@needs("image_patches")
 def glimpses(o: Occasion) -> Drawn:
     """Draw what a few particles saw at each step (the paper, figure 2)."""
-    if not isinstance(o.method, ImageSpace):
-        return None
+    assert isinstance(o.method, HasImagePatches)
     states = follow_particles(o.trace)
     patches = extract_glimpses(o.method, o.scene, states)
     return draw_glimpses(o.one.rgb, o.mask(), states.numpy(), patches, o.title("Glimpses"))
@@ -228,11 +240,13 @@ def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: st
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
     images = o.kept[kind]
     return (
-        draw_gallery(images, o.shape, o.method.tells_pose, f"{title}\n{o.when}") if images else None
+        draw_gallery(images, o.shape, "pose" in o.method.capabilities, f"{title}\n{o.when}")
+        if images
+        else None
     )
 
 
-DRAWINGS: dict[str, Callable[[Occasion], Drawn]] = {
+DRAWINGS: dict[str, Drawing] = {
     drawing.__name__: drawing
     for drawing in (
         overlays, worst, best, particles, silhouettes, trajectories, glimpses,

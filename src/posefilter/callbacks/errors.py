@@ -71,7 +71,7 @@ class ErrorTable(Callback):
             kept = self._selection.kept[name]
             if kept:
                 title = f"The {len(kept)} {name} images\nof {len(self.rows)} of the test"
-                figure = draw_gallery(kept, shape, pl_module.tells_pose, title)
+                figure = draw_gallery(kept, shape, "pose" in pl_module.capabilities, title)
                 post_image(trainer, name, figure, self.folder / "figures", "test")
 
 
@@ -88,7 +88,7 @@ def measure_batch(
     """
     count = len(records)
     errors = [[math.nan] * count] * 3
-    if method.tells_pose:
+    if "pose" in method.capabilities:
         poses = method.scores["poses"]
         assert isinstance(poses, PoseErrors)
         errors = [(1000 * state[-1]).tolist() for state in (poses.add, poses.add_s, poses.diameter)]

@@ -7,11 +7,12 @@ point of the image would be worth, were it elsewhere in the object's frame.
 
 import math
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
-from torch import Tensor, nn
+from torch import Tensor
 
 from posefilter.figures.field import PLANES, PointField, PoseField
 from posefilter.figures.maps import Proposals
@@ -26,15 +27,42 @@ from posefilter.geometry.pose import (
     transform,
 )
 from posefilter.geometry.rotation import exp_so3
-from posefilter.models.pose_pf import PosePF, PoseScene
-from posefilter.nets.coordinates import ask, true_coordinates
+from posefilter.nets.coordinates import Cells, Coordinates, ask, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
-from posefilter.nets.likelihood import Pixels, Points, PoseLikelihood, look
-from posefilter.nets.paper_likelihood import PaperLikelihood
-from posefilter.protocols import Scene, ScoresPoses
+from posefilter.nets.likelihood import Pixels, Points, look
+from posefilter.protocols import ProposesPoses, Scene, ScoresPoses
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
+
+
+class JudgesPoints(Protocol):
+    """A likelihood that judges single image points."""
+
+    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+        """Judge points at a noise level [m].  Points (B, N, P) -> (B, N, P)."""
+        ...
+
+
+@runtime_checkable
+class HasPointLikelihood(Protocol):
+    """A method whose likelihood judges the points of images that it keeps as `scene.image`."""
+
+    likelihood: JudgesPoints
+
+
+class ObjectCoordinates(Protocol):
+    """What a method keeps of an image whose object coordinates it predicts."""
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """Return what is predicted, a cell."""
+        ...
+
+    @property
+    def cells(self) -> Cells:
+        """Return what was measured, a cell."""
+        ...
 
 
 def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
@@ -108,7 +136,7 @@ def turn_pose(pose: Tensor, center: Tensor, angles: Tensor) -> Tensor:
 
 
 def evaluate_point_field(
-    likelihood: nn.Module,
+    likelihood: JudgesPoints,
     image: Pixels,
     truth: Tensor,
     model: ObjectModel,
@@ -124,7 +152,7 @@ def evaluate_point_field(
     (`depthwise`) along it: it is spanned by the two object axes that lie best so.
     """
     points = make_point(pixel, image, truth, model)
-    place = points.position[0, 0, 0]
+    place, center = points.position[0, 0, 0], model.center.to(points.position)
     order = points.ray[0, 0, 0].abs().argsort().tolist()  # the axis most along the ray comes last
     plane = (min(order[1:]), max(order[1:])) if depthwise else (min(order[:2]), max(order[:2]))
     reach = 1.3 * model.radius
@@ -141,7 +169,10 @@ def evaluate_point_field(
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
         many = many._replace(context=ask(image.context, u, v, many.position / model.radius))
     found = torch.stack(
-        [judge(likelihood, many, sigma, model)[0, 0].float().cpu() for sigma in sigmas]
+        [
+            likelihood.judge_points(many, sigma, center, model.radius)[0, 0].float().cpu()
+            for sigma in sigmas
+        ]
     ).numpy()
     judged = found[:, 1:].reshape(len(sigmas), cells, cells)
     return PointField(
@@ -159,18 +190,6 @@ def make_point(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: Obje
     # what `look` will undo
     noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach
     return look(image, truth[None, None], center, model.radius, noise[None, None, None], spread=1.0)
-
-
-def judge(likelihood: nn.Module, points: Points, sigma: float, model: ObjectModel) -> Tensor:
-    """Judge points at a noise level, by our likelihood or by the paper's.  -> (B, N, P)."""
-    if isinstance(likelihood, PaperLikelihood):
-        return likelihood.judge_samples(
-            points.position + model.center.to(points.position), points.color
-        )
-    assert isinstance(likelihood, PoseLikelihood)
-    return likelihood.judge(
-        points, likelihood.level(points.position.new_tensor([sigma])), model.radius
-    )
 
 
 def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
@@ -200,14 +219,15 @@ def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int
 
 
 def predict_proposals(
-    method: PosePF, scene: PoseScene, batch: Batch, drawn: int = 24
+    method: ProposesPoses,
+    scene: ObjectCoordinates,
+    batch: Batch,
+    model: ObjectModel,
+    drawn: int = 24,
 ) -> Proposals | None:
-    """Return what the proposal network makes of one image; None where the method has none, or no
-    depth is known.
-    """
-    if scene.said is None or scene.cells is None or not bool(scene.cells.valid.any()):
+    """Return what the proposal network makes of one image; None where no depth is known."""
+    if not bool(scene.cells.valid.any()):
         return None
-    model = method.model
     center = model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
     poses = method.propose_poses(scene, drawn, generator)[0].cpu().double()
@@ -218,8 +238,8 @@ def predict_proposals(
         scene.cells, batch.mask, batch.camera_from_object, center, model.radius
     )
     true, on = truth[0], usable[0]
-    off = (scene.said.coordinate[0] - true).norm(dim=-1)[on]
+    off = (scene.coordinates.coordinate[0] - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan
-    chance, coordinate = torch.sigmoid(scene.said.logit[0]), scene.said.coordinate[0]
+    chance, coordinate = torch.sigmoid(scene.coordinates.logit[0]), scene.coordinates.coordinate[0]
     arrays = [x.detach().cpu().numpy() for x in (chance, coordinate, true, on)]
     return Proposals(arrays[0], arrays[1], arrays[2], arrays[3], axes, error)

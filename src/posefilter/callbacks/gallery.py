@@ -51,7 +51,7 @@ def compute_errors(trace: Trace, batch: Batch, method: PoseEstimator, points: Te
     """Return how wrong each image is, infinite where no number says: ADD [m], or the share of
     particles that miss.  (B,).
     """
-    if method.tells_pose:
+    if "pose" in method.capabilities:
         error = add(trace.belief.best.detach(), batch.camera_from_object, points)
     else:
         error = 1 - on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch))

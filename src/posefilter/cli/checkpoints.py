@@ -1,6 +1,5 @@
 """Build a method, from a configuration or from a checkpoint that carries its own."""
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -9,26 +8,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.archive import Bounded, check_archive, check_content
 from posefilter.cli.components import changed
-from posefilter.cli.instantiate import hint, instantiate_recipe, locate
+from posefilter.cli.fit import check_fit, typed_key
+from posefilter.cli.instantiate import instantiate_recipe
 from posefilter.cli.job import Job
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
+from posefilter.cli.trust import Scope
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
 
 _SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
-
-
-def check_loss(job: Job) -> None:
-    """Raise UserError unless the chosen loss fits the chosen method, naming those that do."""
-    method, loss = locate(str(job.cfg.model._target_), "model"), job.choices["loss"]
-    legal = getattr(method, "legal_losses", ())
-    if loss not in legal:
-        model = job.choices["model"]
-        raise UserError(
-            f"loss={loss} does not fit model={model}: choose {', '.join(legal)}{hint(loss, legal)}"
-        )
 
 
 def recipe(job: Job) -> dict[str, Any]:
@@ -51,12 +41,15 @@ def recipe(job: Job) -> dict[str, Any]:
 def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> PoseEstimator:
     """Build the method of a recipe, for an object if it is known."""
     settings = OmegaConf.create(recipe["settings"])
+    assert isinstance(settings, DictConfig)
+    check_fit(settings, recipe["choices"], Scope.RECIPE)
     try:
         method = instantiate_recipe(settings.get("model"), "model")
     except UserError as error:
         where, found, rest = str(error).partition(":")
         key, equals, value = where.partition("=")
-        raise UserError(typed_key(settings, key) + equals + value + found + rest) from error
+        typed = typed_key(recipe["settings"], key)
+        raise UserError(typed + equals + value + found + rest) from error
     if not isinstance(method, PoseEstimator):
         raise UserError(f"model: is a {type(method).__name__}, not a method")
     method.recipe = recipe
@@ -115,18 +108,3 @@ def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) 
             f"{len(foreign)} unknown)"
         )
     return method.eval()
-
-
-def typed_key(settings: DictConfig, where: str) -> str:
-    """Return a place in the model's tree as one types it: `model.filter.initialize.behind` is
-    `initialize.behind`.
-    """
-    path: list[str] = []
-    for part in where.split("."):
-        path.append(part)
-        node: Any = OmegaConf.to_container(settings, resolve=False)
-        for key in path:
-            node = node.get(key) if isinstance(node, dict) else None
-        if isinstance(node, str) and (link := re.fullmatch(r"\$\{([\w.]+)\}", node)):
-            path = link[1].split(".")
-    return ".".join(path)

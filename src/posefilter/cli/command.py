@@ -21,11 +21,12 @@ from posefilter.cli.ablations import register_ablations
 from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, settle_logging
+from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
-from posefilter.cli.trust import trust
+from posefilter.cli.trust import Scope, trust
 from posefilter.errors import ProblemsFound, Stopped, UserError
 from posefilter.paths import find_conf
 
@@ -83,10 +84,12 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
     def task(cfg: DictConfig) -> Any:
         job = job_of(cfg)
         settle_logging(job.cfg.get("console", JSON))
-        work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
         try:
             check_settings(cfg)
             use_plugins(cfg)
+            if name == "train":
+                check_fit(cfg, job.choices, Scope.CONFIG)
+            work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
             return work(job)
         except EXPECTED as error:
             if job.swept:  # the other jobs go on; Hydra raises it again at the end

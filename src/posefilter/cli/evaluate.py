@@ -86,7 +86,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
     native = data.reader.native_from_mesh
-    if method.tells_pose:
+    if "pose" in method.capabilities:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)

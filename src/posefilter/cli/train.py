@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch.utils.data import default_collate
 
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
-from posefilter.cli.checkpoints import build_method, check_loss, method_of, read_checkpoint, recipe
+from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.comparing import HANDS, comparable, differing
 from posefilter.cli.console import JSON, say, typed
 from posefilter.cli.files import WholeCheckpoints
@@ -46,7 +46,6 @@ def train(job: Job) -> float:
         sentence = f"{job.folder}: done before{other}; delete its metrics.json to run it again"
         say(job.cfg.console, "skipped", sentence, run=str(job.folder), changed=changed)
         return score_of(done)
-    check_loss(job)
     settle(job.cfg.threads, job.cfg.seed)
     # first, since they are the sooner to complain
     method, trainer = build_method(recipe(job)), build_trainer(job)

@@ -1,8 +1,11 @@
 """The pose that explains most particles' own surface points, by hypothesis and verification."""
 
+from typing import ClassVar
+
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.pose import fit_rigid, invert, transform
 from posefilter.geometry.votes import draw_votes
@@ -44,6 +47,8 @@ class Agreement:
         options: Fragments considered for each particle.
         counts: How many particles count as independent observations.
     """
+
+    requires: ClassVar[Capabilities] = ("pose", "surface_points")
 
     def __init__(
         self,

@@ -1,8 +1,11 @@
 """Resampling guided by a predicted relevance map (the paper, section 6, idea 4)."""
 
+from typing import ClassVar
+
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import HasRelevance, Resample, Scene, Space
 from posefilter.types import Batch, Particles, Resampled
@@ -47,6 +50,8 @@ class Guided:
     Raises:
         UserError: `floor` is out of range.
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space", "relevance")
 
     def __init__(self, resampler: Resample, floor: float = 0.05) -> None:
         if not 0 < floor <= 1:

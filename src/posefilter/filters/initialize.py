@@ -1,8 +1,11 @@
 """Initial distributions: states of the first particles."""
 
+from typing import ClassVar
+
 import torch
 from torch import Generator, Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
@@ -89,6 +92,8 @@ def require_pixel_space(method: Method, choice: str) -> None:
 class UniformPixels:
     """Pixels drawn uniformly over the image."""
 
+    requires: ClassVar[Capabilities] = ("pixel_space",)
+
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
@@ -105,6 +110,8 @@ class FromDepth:
     Args:
         behind: Range of the center's distance behind the surface, in radii; drawn uniformly.
     """
+
+    requires: ClassVar[Capabilities] = ("pose_space",)
 
     def __init__(self, behind: tuple[float, float] = (0.1, 0.9)) -> None:
         self.behind = (float(behind[0]), float(behind[1]))
@@ -125,6 +132,8 @@ class FromRelevance:
     Args:
         anywhere: Share of the uniform distribution mixed in, so that every pixel can be drawn.
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space", "relevance")
 
     def __init__(self, anywhere: float = 0.1) -> None:
         self.anywhere = anywhere
@@ -153,6 +162,8 @@ class FromRelevance:
 class FromProposals:
     """Poses that the method itself proposes."""
 
+    requires: ClassVar[Capabilities] = ("pose_space", "propose_poses")
+
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
@@ -176,6 +187,8 @@ class Informed(nn.Module):
         share: Share of the particles drawn around the object.
         around_px: Standard deviation of their distance from the mask's pixels [px].
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space",)
 
     def __init__(self, otherwise: Initialize, share: float = 0.5, around_px: float = 10.0) -> None:
         super().__init__()

@@ -5,10 +5,12 @@
 
 import math
 from collections.abc import Iterable
+from typing import ClassVar
 
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Propagate, Space
 from posefilter.types import Step
@@ -51,6 +53,8 @@ class Gaussian:
 class LearnedDisplacement:
     """Move each particle by the displacement that the method's network predicts."""
 
+    requires: ClassVar[Capabilities] = ("displacement",)
+
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
@@ -66,6 +70,8 @@ class HalfTurns:
     Args:
         share: Probability that a particle is rotated.
     """
+
+    requires: ClassVar[Capabilities] = ("pose_space",)
 
     def __init__(self, share: float = 0.1) -> None:
         self.share = share

@@ -1,10 +1,12 @@
 """Refinement of the estimate: rescoring particles, mean shift, gradient ascent."""
 
 from collections.abc import Iterable
+from typing import ClassVar
 
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Method, Refine, Scene, ScoresPoses
 from posefilter.types import Belief
@@ -68,6 +70,8 @@ class Rescore:
         sigma: Noise level of the likelihood [m].
     """
 
+    requires: ClassVar[Capabilities] = ("score_poses",)
+
     def __init__(self, top: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
         self.top, self.pixels, self.sigma = top, pixels, sigma
 
@@ -99,6 +103,8 @@ class MeanShift:
     Raises:
         UserError: A number is out of range.
     """
+
+    requires: ClassVar[Capabilities] = ("score_poses",)
 
     def __init__(
         self,
@@ -151,6 +157,8 @@ class Gradient:
         final_pixels: Image points for the last comparison.
         final_sigma: Noise level of the last comparison [m].
     """
+
+    requires: ClassVar[Capabilities] = ("score_poses",)
 
     def __init__(
         self,

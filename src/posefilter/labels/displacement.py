@@ -1,8 +1,11 @@
 """Target displacements."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.lookup import centroid, erode, nearest_mask_pixel
 from posefilter.types import Batch, ObjectModel, Trace
@@ -20,6 +23,8 @@ class TowardsObject:
     Raises:
         UserError: `target` is unknown.
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space",)
 
     def __init__(
         self, target: str = "nearest", margin_px: int = 0, reach: float = float("inf")

@@ -1,8 +1,11 @@
 """Labels of membership: is the particle on the object, and how accurate is its pose?"""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.geometry.lookup import overlaps_mask
 from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
@@ -14,6 +17,8 @@ class OnObject:
     Args:
         size: Side of the patch [px].
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space",)
 
     def __init__(self, size: int = 1) -> None:
         self.size = size
@@ -37,6 +42,8 @@ class Quality:
         scale: ADD at which the label is 1 / e, in diameters.
         points: Number of points of ADD.
     """
+
+    requires: ClassVar[Capabilities] = ("pixel_space", "pose")
 
     def __init__(self, size: int = 1, scale: float = 0.1, points: int = 64) -> None:
         self.on_object = OnObject(size)

@@ -1,8 +1,11 @@
 """The paper's labels of points along the rays of the object's pixels (section 5)."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -19,6 +22,8 @@ class PaperPoints:
         on: Label on the surface.
         behind: Label behind the surface.
     """
+
+    requires: ClassVar[Capabilities] = ("ray_samples",)
 
     def __init__(self, tolerance: float = 0.01, on: float = 100.0, behind: float = -100.0) -> None:
         self.tolerance, self.on, self.behind = tolerance, on, behind

@@ -1,8 +1,11 @@
 """Contrastive loss: the true pose must score higher than other poses of the same image."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
@@ -36,6 +39,8 @@ class Contrast:
     At its minimum exp(score) is proportional to the posterior smoothed by sigma, the noise level of
     the scores. The loss is zero for images in which the object is not visible.
     """
+
+    requires: ClassVar[Capabilities] = ("candidates",)
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return the divergence of each image, (B,) >= 0.

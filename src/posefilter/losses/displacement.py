@@ -3,10 +3,13 @@
 Lengths are in frame widths, so that they do not depend on the image's resolution.
 """
 
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.geometry.boxes import box_iou, box_of_pose
 from posefilter.geometry.lookup import mask_pixels, nearest_mask_pixel, patch_offsets
 from posefilter.protocols import Label
@@ -26,6 +29,8 @@ class Offset:
     Mean over all particles and steps. Gradients flow through all steps, so a displacement also
     accounts for its effect on later ones.
     """
+
+    requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
@@ -50,6 +55,8 @@ class Chamfer:
         size: Side of the patch [px].
         most: Maximum number of mask pixels, an even selection.
     """
+
+    requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
     def __init__(self, size: int = 9, most: int = 256) -> None:
         self.size = size
@@ -96,6 +103,8 @@ class DirectDisplacement:
         width: Error at which the loss becomes linear, in frame widths.
     """
 
+    requires: ClassVar[Capabilities] = ("displacement", "rollout")
+
     def __init__(self, label: Label, width: float = 0.05) -> None:
         self.label = label
         self.width = width
@@ -120,6 +129,9 @@ class Sides:
     Args:
         label: Positive for particles on the object.
     """
+
+    requires: ClassVar[Capabilities] = ("free_latent", "pixel_space", "rollout")
+    latent_width = 4  # numbers that it teaches
 
     def __init__(self, label: Label) -> None:
         self.label = label

@@ -3,9 +3,12 @@
 Here `log_likelihood` is the log-probability that the particle is on the object.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Label
 from posefilter.types import Batch, ObjectModel, Trace
@@ -38,6 +41,8 @@ class Bce:
         label: Gives the targets.
         steps: "last" for the last step only, or "all".
     """
+
+    requires: ClassVar[Capabilities] = ("rollout",)
 
     def __init__(self, label: Label, steps: str = "all") -> None:
         self.label = label

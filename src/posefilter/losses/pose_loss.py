@@ -1,8 +1,11 @@
 """Losses of the particles' poses, by the distances of the object's points."""
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.fragments import fragment_errors, within_bounds
@@ -25,6 +28,8 @@ class Add:
     Raises:
         UserError: `weighting` is unknown.
     """
+
+    requires: ClassVar[Capabilities] = ("pose", "rollout")
 
     distance = staticmethod(add_distance)
 
@@ -63,6 +68,8 @@ class Confidence:
         points: Number of points of ADD.
     """
 
+    requires: ClassVar[Capabilities] = ("pose", "rollout")
+
     def __init__(self, label: Label, weight: float = 0.5, points: int = 64) -> None:
         self.label = label
         self.weight = weight
@@ -94,6 +101,9 @@ class SurfacePointLoss:
         fragment_weight: Weight of the loss of fragments.
         within: Weight of the position in the fragment.
     """
+
+    provides: ClassVar[Capabilities] = ("surface_point_loss",)
+    requires: ClassVar[Capabilities] = ("pixel_space", "pose", "rollout")
 
     def __init__(self, fragment_weight: float = 0.25, within: float = 0.3) -> None:
         self.fragment_weight, self.within = fragment_weight, within

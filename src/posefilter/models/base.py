@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import Any, ClassVar
 
 import torch
@@ -14,6 +15,7 @@ from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.boxes import box_of_pose
@@ -23,7 +25,6 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.scores import overall
 from posefilter.metrics.visibility import ErrorsByVisibility
-from posefilter.models.checks import check_estimate
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -42,8 +43,8 @@ class PoseEstimator(LightningModule):
     tells.
     """
 
-    legal_losses: ClassVar[tuple[str, ...]] = ()
-    tells_pose: ClassVar[bool] = True
+    provides: ClassVar[Capabilities] = ("rollout",)
+    requires: ClassVar[Capabilities] = ()
 
     def __init__(
         self,
@@ -62,7 +63,11 @@ class PoseEstimator(LightningModule):
         self.seconds_per_image: list[float] = []
         self.lost = self.lost_in_a_row = 0  # steps whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
-        check_estimate(self)
+
+    @cached_property
+    def capabilities(self) -> frozenset[str]:
+        """Return what the method and its pieces provide: metrics and figures go by it."""
+        return collect_provided(self)
 
     @property
     def space(self) -> Space:
@@ -95,10 +100,15 @@ class PoseEstimator(LightningModule):
         return self._object_model
 
     def set_object(self, model: ObjectModel) -> None:
-        """Learn which object it is about, and make the metrics for it."""
+        """Learn which object it is about, and make the metrics for it.
+
+        Raises:
+            UserError: Its parts do not fit each other (see `capabilities`).
+        """
+        check_parts(self)
         self._object_model = model
         self.scores = nn.ModuleDict({"iou": BoxIoU(), "particles_on_object": ParticlesOnObject()})
-        if self.tells_pose:
+        if "pose" in self.capabilities:
             self.scores["poses"] = PoseErrors([model])
             self.scores["by_visibility"] = ErrorsByVisibility([model])
             self.scores["belief"] = BeliefQuality([model])
@@ -223,7 +233,7 @@ class PoseEstimator(LightningModule):
         self.scores["particles_on_object"].update(
             batch.mask, self.particle_pixels(trace.particles[-1], batch)
         )
-        if self.tells_pose:
+        if "poses" in self.scores:
             self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
             self.scores["by_visibility"].collect(
                 trace.belief.best, batch.camera_from_object, batch.visibility
@@ -251,7 +261,7 @@ class PoseEstimator(LightningModule):
     def results(self) -> dict[str, Any]:
         """Return what was collected since the last reset, in the form of metrics.json."""
         out: dict[str, Any] = {"instances": 0, "missed": 0, "add": None, "add_s": None}
-        if self.tells_pose:
+        if "poses" in self.scores:
             out |= self.scores["poses"].compute()
         else:
             out["instances"] = int(self.scores["iou"].count)
@@ -259,8 +269,10 @@ class PoseEstimator(LightningModule):
             out[name] = float(self.scores[name].compute())
         times = self.seconds_per_image
         out["seconds_per_image"] = sum(times) / len(times) if times else None
-        out["belief"] = self.scores["belief"].compute() if self.tells_pose else None
-        out["by_visibility"] = self.scores["by_visibility"].compute() if self.tells_pose else None
+        out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
+        out["by_visibility"] = (
+            self.scores["by_visibility"].compute() if "poses" in self.scores else None
+        )
         return out
 
     def _reset(self) -> None:

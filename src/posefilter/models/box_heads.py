@@ -2,11 +2,12 @@
 of pixels.
 """
 
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -54,6 +55,9 @@ class VotedBox:
     see losses.Sides).
     """
 
+    requires: ClassVar[Capabilities] = ("free_latent",)
+    latent_width = 4  # numbers that it reads
+
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
         particles, told = trace.particles[-1], trace.outputs[-1].latent * batch.rgb.shape[-1]
@@ -65,6 +69,8 @@ class VotedBox:
 
 class PoseBox:
     """Where the estimated pose puts the object's hull."""
+
+    requires: ClassVar[Capabilities] = ("pose",)
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""

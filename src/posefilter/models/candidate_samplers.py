@@ -4,11 +4,12 @@ A lesson returns a Trace of one step.
 """
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Generator, Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.candidates import (
     PersistentParticles,
@@ -17,18 +18,57 @@ from posefilter.filters.candidates import (
 )
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
-from posefilter.nets.paper_likelihood import PaperLikelihood
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Scene
-from posefilter.types import Batch, Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
 
-if TYPE_CHECKING:
-    from posefilter.models.pose_pf import PosePF
+
+@runtime_checkable
+class JudgesSamples(Protocol):
+    """A likelihood that judges colored points by themselves: labeled rays ask for it."""
+
+    def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
+        """Judge points (*, 3) in the object frame [m] with colors (*, 3) in [0, 1].  -> (*)."""
+        ...
+
+
+class ScoredMethod(Protocol):
+    """What a sampler asks of the method that it draws candidates for."""
+
+    likelihood: Any
+
+    @property
+    def model(self) -> ObjectModel:
+        """Return what the method knows of its object."""
+        ...
+
+    @property
+    def space(self) -> PoseSpace:
+        """Return where its particles live."""
+        ...
+
+    @property
+    def capabilities(self) -> frozenset[str]:
+        """Return what it provides."""
+        ...
+
+    def measure(
+        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        """Score every particle."""
+        ...
+
+    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+        """Return likely poses, (B, particles, 4, 4) camera_from_object."""
+        ...
 
 
 class CandidateSampler(Protocol):
     """Make one training cloud of a batch."""
 
-    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+    def __call__(
+        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+    ) -> Trace:
         """Return a trace of one step, its scores differentiable."""
         ...
 
@@ -70,6 +110,8 @@ class CandidatePoses:
     their level.
     """
 
+    provides: ClassVar[Capabilities] = ("candidates",)
+
     def __init__(
         self,
         each: int = 8,
@@ -91,14 +133,16 @@ class CandidatePoses:
             PersistentParticles(particles, levels, self.sigma[0]) if particles else None
         )
 
-    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+    def __call__(
+        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+    ) -> Trace:
         """Draw candidates, read them, and let the persistent particles take a step."""
         B, device = len(batch.rgb), batch.rgb.device
         model = method.model
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
         groups = [sample_around_truth(batch, model, method.space, self.each, self.sigma, generator)]
-        proposals = scene.said is not None
+        proposals = "propose_poses" in method.capabilities
         if self.proposed and proposals:
             groups.append(method.propose_poses(scene, self.proposed, generator))
         own = torch.zeros(B, dtype=torch.bool, device=device)
@@ -142,6 +186,9 @@ class LabeledRays:
     are random otherwise.
     """
 
+    provides: ClassVar[Capabilities] = ("ray_samples",)
+    requires: ClassVar[Capabilities] = ("judge_samples",)
+
     def __init__(
         self,
         rays: int = 64,
@@ -158,12 +205,14 @@ class LabeledRays:
             tolerance,
         )
 
-    def __call__(self, method: "PosePF", scene: Scene, batch: Batch, generator: Generator) -> Trace:
+    def __call__(
+        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+    ) -> Trace:
         """Draw samples and read each; the cloud's states are (B, N, 4): u, v, offset behind the
         surface [m], own color.
         """
         net = method.likelihood
-        if not isinstance(net, PaperLikelihood):
+        if not isinstance(net, JudgesSamples):
             raise UserError(
                 "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood only; choose "
                 "model/likelihood=paper or model/candidate_sampler=candidates"

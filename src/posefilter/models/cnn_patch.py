@@ -8,6 +8,4 @@ class CnnPatch(ImageSpace):
     likelihood, but no pose.
     """
 
-    legal_losses = ("chamfer", "offset", "bce", "balanced_bce", "focal")
-    tells_pose = False
     position_width = 0

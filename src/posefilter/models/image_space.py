@@ -10,18 +10,15 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
+from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
+from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
-from posefilter.models.checks import (
-    check_fragments,
-    check_poses,
-    check_training_clouds,
-    check_votes,
-)
 from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, factors_at
 from posefilter.nets.context import ContextMap
 from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
@@ -59,6 +56,14 @@ class ImageSpace(PoseEstimator):
     changes no value. A place still hands its own gradient on to the next, so that over a long
     roll-out this damps the growth; only 1, a cut at every step, ends it.
     """
+
+    provides: ClassVar[Capabilities] = (
+        "displacement",
+        "image_patches",
+        "pixel_space",
+        "rollout",
+        "surface_points",
+    )
 
     position_width: ClassVar[int] = 0  # numbers that tell a particle its own location
     net: Any
@@ -99,9 +104,8 @@ class ImageSpace(PoseEstimator):
         self.aux_losses = {name: aux for name, aux in (aux_losses or {}).items() if aux is not None}
         self.loss_schedule = tuple(loss_schedule or ())
         check_loss_schedule(self.loss_schedule, ["loss", "relevance", *(aux_losses or {})])
-        check_poses(self)
-        check_votes(self)
-        check_fragments(self)
+        for piece in (box_head, *(aux.loss for aux in self.aux_losses.values())):
+            check_latent_width(self.latent_width, getattr(piece, "latent_width", None))
         self.relevance_weight, self.detach_position, self.truncate = (
             relevance,
             detach_position,
@@ -142,7 +146,7 @@ class ImageSpace(PoseEstimator):
             state, latent = state.detach(), latent.detach()
         if self.detach_position:
             state = state.detach()
-        patch = self.glimpse(scene.image, state)
+        patch = self.image_patches(scene, state)
         extra = torch.cat(
             [self.encoder.look(scene.context, state), self.place(scene, state)], dim=-1
         )
@@ -168,6 +172,11 @@ class ImageSpace(PoseEstimator):
             inside == pixel
         ).all(-1)
 
+    def image_patches(self, scene: ImageScene, state: Tensor) -> Tensor:
+        """Return what particles see where they stand: (B, N, 2) [px] -> (B, N, 4, k, k), as `image`."""
+        patches: Tensor = self.glimpse(scene.image, state)
+        return patches
+
     def place(self, scene: ImageScene, state: Tensor) -> Tensor:
         """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its
         location in [-1, 1].
@@ -183,7 +192,8 @@ class ImageSpace(PoseEstimator):
         """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an
         image each, weighted.
         """
-        check_training_clouds(self)
+        own = self.train_filter is not self.filter
+        check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
         scene = self.encode(batch)
         trace: Trace = self.train_filter(batch, _Observed(self, scene), generator)
         losses = {"loss": self.loss(trace, batch, self.model)}
@@ -239,6 +249,31 @@ class _Observed:
     def encode(self, batch: Batch) -> ImageScene:
         """Return what was seen."""
         return self.scene
+
+
+def check_latent_width(width: int, read: int | None) -> None:
+    """Raise UserError unless a latent is as wide as a piece that reads it takes it to be (None: any)."""
+    if read not in (None, width):
+        raise UserError(
+            f"model.net.latent_width={width}: model/box_head=votes needs {read}, one for each of "
+            "the box's sides"
+        )
+
+
+def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
+    """Raise UserError unless a training roll-out's steps are of one size: losses judge them side by
+    side.
+
+    Args:
+        rolled: The filter that is rolled out.
+        name: What it is called in the settings.
+    """
+    if rolled.steps > 1 and rolled.first_particles != rolled.particles:
+        raise UserError(
+            f"{name}.first_particles={rolled.first_particles}: a training needs as many as "
+            f"{name}.particles={rolled.particles}; choose {name}.first_particles=null or "
+            f"model/train_rollout=truncated (evaluate.py takes any)"
+        )
 
 
 def relevance_loss(context: ContextMap, mask: Tensor) -> Tensor:

@@ -1,5 +1,8 @@
 """The paper's second method: pose from patches (section 4.3)."""
 
+from typing import ClassVar
+
+from posefilter.capabilities import Capabilities
 from posefilter.models.image_space import ImageSpace
 
 
@@ -8,14 +11,6 @@ class PatchPF(ImageSpace):
     latent.
     """
 
-    legal_losses = (
-        "bce",
-        "balanced_bce",
-        "focal",
-        "add",
-        "add_s",
-        "confidence",
-        "offset",
-        "chamfer",
-    )
+    requires: ClassVar[Capabilities] = ("pose",)
+
     position_width = 2

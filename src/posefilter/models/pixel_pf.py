@@ -1,5 +1,8 @@
 """The paper's first method: pose from pixels (section 4.2)."""
 
+from typing import ClassVar
+
+from posefilter.capabilities import Capabilities
 from posefilter.models.image_space import ImageSpace
 
 
@@ -10,14 +13,6 @@ class PixelPF(ImageSpace):
     It is not told where it stands: the paper concatenates pixel and latent, no more.
     """
 
-    legal_losses = (
-        "add",
-        "add_s",
-        "confidence",
-        "bce",
-        "balanced_bce",
-        "focal",
-        "offset",
-        "chamfer",
-    )
+    requires: ClassVar[Capabilities] = ("pose",)
+
     position_width = 0

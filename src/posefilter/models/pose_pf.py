@@ -2,12 +2,13 @@
 points it explains.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
 from torchmetrics import MeanMetric
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.errors import add
@@ -27,17 +28,17 @@ class PoseScene(NamedTuple):
     """
 
     image: Pixels
-    said: Coordinates | None
+    coordinates: Coordinates | None
     cells: Cells | None
 
     @property
     def relevance(self) -> Tensor:
         """Return where the object is likely to be, (B, 1, h, w)."""
-        if self.said is None:
+        if self.coordinates is None:
             raise UserError(
                 "filter/initialize=from_relevance needs the proposal network; choose model/proposals=dense"
             )
-        return torch.sigmoid(self.said.logit)[:, None]
+        return torch.sigmoid(self.coordinates.logit)[:, None]
 
     def first(self, count: int) -> "PoseScene":
         """Return the first so many images."""
@@ -54,7 +55,8 @@ class PosePF(PoseEstimator):
     from all; None: all); proposal_weight: of the proposal network's loss.
     """
 
-    legal_losses = ("contrast", "regression")
+    provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
+
     # for comparing the estimate with the truth: image points, noise level [m]
     judged_pixels, judged_at = 4096, 0.004
 
@@ -97,10 +99,10 @@ class PosePF(PoseEstimator):
         """Lay the image out, and run the proposal network once."""
         if self.proposals is None:
             return PoseScene(lay_out(batch.rgb, batch.depth, batch.intrinsics), None, None)
-        said = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
-        context = said if said.features.shape[-1] else None
+        coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
+        context = coordinates if coordinates.features.shape[-1] else None
         image = lay_out(batch.rgb, batch.depth, batch.intrinsics, context)
-        return PoseScene(image, said, measure_cells(batch.depth, batch.intrinsics))
+        return PoseScene(image, coordinates, measure_cells(batch.depth, batch.intrinsics))
 
     def measure(
         self, scene: PoseScene, particles: Particles, step: Step, generator: Generator
@@ -122,7 +124,7 @@ class PosePF(PoseEstimator):
 
     def propose_poses(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
-        if scene.said is None or scene.cells is None:
+        if scene.coordinates is None or scene.cells is None:
             raise UserError(
                 "filter/initialize=from_proposals needs the proposal network; choose model/proposals=dense"
             )
@@ -131,7 +133,7 @@ class PosePF(PoseEstimator):
                 "depth: not one pixel of an image has a known depth, so no pose can be proposed"
             )
         return draw_poses(
-            scene.said.detach(),
+            scene.coordinates.detach(),
             scene.cells,
             self._center(),
             self.model.radius,
@@ -151,11 +153,11 @@ class PosePF(PoseEstimator):
                 self.candidate_sampler(self, seen, part, generator), part, self.model
             )
         }
-        if scene.said is not None and scene.cells is not None:
+        if scene.coordinates is not None and scene.cells is not None:
             assert self.proposals is not None
             size = (self._center(), self.model.radius, float(self.proposals.reach))
             fit, error = coordinate_loss(
-                scene.said, scene.cells, batch.mask, batch.camera_from_object, *size
+                scene.coordinates, scene.cells, batch.mask, batch.camera_from_object, *size
             )
             losses["proposals"] = self.proposal_weight * fit
             self.watch("coordinate_error_mm", 1000 * error.mean())

@@ -7,12 +7,13 @@ features.
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.geometry.lookup import patch_offsets, sample
@@ -89,6 +90,8 @@ class Pyramid(nn.Module):
 
 class _Encoder(nn.Module):
     """One feature map, and the relevance that a 1 x 1 convolution reads off it."""
+
+    provides: ClassVar[Capabilities] = ("relevance",)
 
     def __init__(self, width: int) -> None:
         super().__init__()

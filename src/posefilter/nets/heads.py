@@ -1,11 +1,12 @@
 """What a network's plain outputs mean: a displacement over the image, and a pose."""
 
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.fragments import gather_fragment, init_fragments
 from posefilter.geometry.pose import make_pose
@@ -92,6 +93,8 @@ class _AnyObject(nn.Module):
 class AbsoluteQuaternion(_AnyObject):
     """Seven outputs: a quaternion (x, y, z, w), made unit, and the translation in the camera [m]."""
 
+    provides: ClassVar[Capabilities] = ("pose",)
+
     width = 7
 
     def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
@@ -103,6 +106,8 @@ class _SurfacePointHead(nn.Module):
     """A code that tells a rotation by two of its columns, and which object point the particle's own
     3-D point is.
     """
+
+    provides: ClassVar[Capabilities] = ("pose",)
 
     center: Tensor
 
@@ -150,6 +155,8 @@ class SurfacePointFragments(_SurfacePointHead):
     the object and is nobody's point; shares of fragments can hold several possibilities. The pose
     is that of the mode.
     """
+
+    requires: ClassVar[Capabilities] = ("surface_point_loss",)
 
     centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
     reach: Tensor  # () their mean reach, over the radius

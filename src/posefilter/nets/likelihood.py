@@ -13,12 +13,13 @@ likelihood's loss shapes.
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project, rays
 from posefilter.geometry.pose import origin_of, rotation_of
@@ -118,6 +119,8 @@ class PoseLikelihood(nn.Module):
     with what it says there; None: by itself alone.
     """
 
+    provides: ClassVar[Capabilities] = ("judge_points",)
+
     def __init__(
         self,
         width: int = 96,
@@ -175,6 +178,10 @@ class PoseLikelihood(nn.Module):
         for block in self.blocks:
             x = block(x)
         return self.leave(torch.relu(x))[..., 0]
+
+    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+        """Judge points one by one at one noise level [m].  Points (B, N, P) -> (B, N, P)."""
+        return self.judge(points, self.level(points.position.new_tensor([sigma])), radius)
 
     def forward(
         self,

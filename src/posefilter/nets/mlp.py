@@ -2,12 +2,13 @@
 convolution net over a patch.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.nets.linear import Linear
 
@@ -105,6 +106,8 @@ class PatchNet(nn.Module):
     from it. `hidden` > 0 puts two layers of that width before the outputs, for the context that
     then joins the patch's features.
     """
+
+    provides: ClassVar[Capabilities] = ("free_latent",)
 
     def __init__(
         self,

@@ -2,11 +2,14 @@
 object frame.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Generator, Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.nets.layers import ResnetFC
-from posefilter.nets.likelihood import Pixels, look
+from posefilter.nets.likelihood import Pixels, Points, look
 from posefilter.nets.linear import Linear
 
 
@@ -18,6 +21,8 @@ class PaperLikelihood(nn.Module):
     projected radius (not stated in the paper). Pixels outside the frame or without depth add
     nothing (not stated either).
     """
+
+    provides: ClassVar[Capabilities] = ("judge_points", "judge_samples")
 
     def __init__(self, width: int = 128, blocks: int = 5, spread: float = 0.6) -> None:
         super().__init__()
@@ -31,6 +36,10 @@ class PaperLikelihood(nn.Module):
         in [0, 1].  -> (*).
         """
         return self.net(torch.cat([position, color], dim=-1))[..., 0]
+
+    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+        """Judge points one by one; `sigma` and `radius` are not used.  Points (B, N, P) -> (B, N, P)."""
+        return self.judge_samples(points.position + center, points.color)
 
     def forward(
         self,

@@ -2,9 +2,12 @@
 point of it.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
+from posefilter.capabilities import Capabilities
 from posefilter.geometry.fragments import init_fragments
 from posefilter.nets.coordinates import Coordinates
 from posefilter.nets.encoding import UNet, geometry, in_bfloat16
@@ -18,6 +21,8 @@ class ObjectCoordinateNet(UNet):
     widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told
     apart by; features: of each cell, for the likelihood's use.
     """
+
+    provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "relevance")
 
     centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
     reach: Tensor  # () their mean reach, over the radius

@@ -1,0 +1,115 @@
+"""What methods and their pieces provide, and what pieces require: plain names, matched by one check.
+
+A class says so by two class attributes, `provides` and `requires`, tuples of names; a subclass that
+says nothing has its parent's. What is chosen fits together where every requirement of every piece is
+provided by the method or by one of its pieces. A new method is checked, trained and drawn by these
+names alone.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal, NamedTuple
+
+from posefilter.errors import UserError
+
+Capability = Literal[
+    "candidates",
+    "displacement",
+    "free_latent",
+    "image_patches",
+    "judge_points",
+    "judge_samples",
+    "object_coordinates",
+    "pixel_space",
+    "pose",
+    "pose_space",
+    "propose_poses",
+    "ray_samples",
+    "relevance",
+    "rollout",
+    "score_poses",
+    "surface_point_loss",
+    "surface_points",
+]
+Capabilities = tuple[Capability, ...]
+
+# what is needed where a name is required, after "needs"
+MEANINGS: Mapping[str, str] = {
+    "candidates": "scored candidate poses to judge",
+    "displacement": "particles that learn where to move",
+    "free_latent": "a latent that the network itself does not read",
+    "image_patches": "particles that see a patch of the image",
+    "judge_points": "a likelihood that judges single image points",
+    "judge_samples": "a likelihood that judges colored points by themselves",
+    "object_coordinates": "a network that predicts object coordinates",
+    "pixel_space": "particles that are pixels",
+    "pose": "particles that tell a pose",
+    "pose_space": "particles that are poses",
+    "propose_poses": "a method that proposes poses",
+    "ray_samples": "points along labeled rays to judge",
+    "relevance": "a map of where to look in the image",
+    "rollout": "a training that rolls out the filter",
+    "score_poses": "a method that scores any pose",
+    "surface_point_loss": "a loss that teaches each particle's own point of the object",
+    "surface_points": "particles that stand on a measured point of the object",
+}
+
+
+class Declared(NamedTuple):
+    """What a piece says of itself."""
+
+    provides: frozenset[str] = frozenset()
+    requires: frozenset[str] = frozenset()
+
+
+def read_declared(kind: type) -> Declared:
+    """Return what a class declares, itself or by a parent."""
+    return Declared(
+        frozenset(getattr(kind, "provides", ())), frozenset(getattr(kind, "requires", ()))
+    )
+
+
+def list_parts(thing: Any) -> list[Any]:
+    """Return an object and all that it is made of: public attributes, torch's submodules, containers."""
+    found: dict[int, Any] = {}
+    waiting = [thing]
+    while waiting:
+        one = waiting.pop(0)
+        if id(one) in found or isinstance(one, type):
+            continue
+        found[id(one)] = one
+        if isinstance(one, Mapping):
+            waiting += one.values()
+        elif isinstance(one, list | tuple):
+            waiting += one
+        elif hasattr(one, "__dict__"):
+            waiting += [v for k, v in vars(one).items() if not k.startswith("_")]
+            waiting += vars(one).get("_modules", {}).values()
+    return list(found.values())
+
+
+def collect_provided(method: Any) -> frozenset[str]:
+    """Return what a method provides, itself or by one of its parts."""
+    return frozenset().union(*(read_declared(type(part)).provides for part in list_parts(method)))
+
+
+def check_parts(method: Any) -> None:
+    """Raise UserError, naming the part, unless all of a method's parts find what they require."""
+    parts = list_parts(method)
+    for i, need in find_missing(read_declared(type(part)) for part in parts):
+        raise UserError(
+            f"{type(method).__name__}: its {type(parts[i]).__name__} needs "
+            f"{MEANINGS.get(need, need)} ({need}), which none of its parts provides"
+        )
+
+
+def find_missing(pieces: Iterable[Declared]) -> list[tuple[int, str]]:
+    """Match what pieces require with what all of them provide.
+
+    Returns:
+        (number of the piece, name) of each requirement that is not met, in the pieces' order.
+    """
+    pieces = list(pieces)
+    provided = frozenset().union(*(piece.provides for piece in pieces))
+    return [
+        (i, name) for i, piece in enumerate(pieces) for name in sorted(piece.requires - provided)
+    ]

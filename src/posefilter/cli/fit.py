@@ -1,0 +1,239 @@
+"""Whether the chosen pieces fit each other, by what their classes declare (see `capabilities`).
+
+Torch is not imported for it: pieces of posefilter are read from their source, plug-ins (imported by
+then) as they are.
+"""
+
+import ast
+import importlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
+from posefilter.cli.options import Groups, list_places, list_targets, open_groups
+from posefilter.cli.trust import Scope, check_name, is_plugin
+from posefilter.errors import UserError
+
+
+class Piece(NamedTuple):
+    """A node of the settings that names a class."""
+
+    key: str  # as one types it
+    target: str
+    declared: Declared
+
+
+def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) -> None:
+    """Match what the pieces of a model require with what all of them provide.
+
+    Args:
+        settings: The whole configuration; its `model` is what would be built.
+        choices: Which file of each group was chosen.
+        scope: Where the settings come from.
+
+    Raises:
+        UserError: One line: the choice that does not fit, what it needs, and the choices that fit.
+    """
+    model = settings.get("model")
+    if not isinstance(model, DictConfig):
+        return
+    node = OmegaConf.to_container(model, resolve=True)
+    tree = OmegaConf.to_container(settings, resolve=False)
+    pieces = [
+        Piece(key, target, declared_by(target, key, scope))
+        for place, target in list_targets(node, "model")
+        for key in [typed_key(tree, place)]
+    ]
+    missing = find_missing(piece.declared for piece in pieces)
+    if missing:
+        number, need = missing[0]
+        keys = {typed_key(tree, place) for place, _ in list_places(node, "model")}
+        tops = {key.partition(".")[0] for key in keys}
+        near = {g: name for g, name in choices.items() if g.partition("/")[0] in tops}
+        with open_groups() as groups:
+            told = _explain(pieces[number], need, pieces, keys, near, scope, groups)
+        raise UserError(told)
+
+
+def declared_by(target: str, key: str, scope: Scope) -> Declared:
+    """Return what the class that a `_target_` names declares; nothing where it is none of ours.
+
+    Args:
+        target: The dotted name.
+        key: Where it stands, for messages.
+        scope: Where the settings come from.
+
+    Raises:
+        UserError: It may not be built from there.
+    """
+    check_name(target, key, scope)
+    module, _, name = target.rpartition(".")
+    if is_plugin(target):
+        found = vars(importlib.import_module(module)).get(name)
+        return read_declared(found) if isinstance(found, type) else Declared()
+    return Declared(
+        *(frozenset(read_attribute(module, name, which) or ()) for which in Declared._fields)
+    )
+
+
+def read_attribute(module: str, name: str, attribute: str) -> tuple[str, ...] | None:
+    """Return a class attribute from the source of posefilter, where it or a parent sets one.
+
+    Args:
+        module: The class's module.
+        name: The class.
+        attribute: The attribute, whose value must be written as a literal.
+    """
+    kind = parse_module(module).get(name)
+    if isinstance(kind, ast.ImportFrom):
+        return read_attribute(kind.module or "", name, attribute)
+    if not isinstance(kind, ast.ClassDef):
+        return None
+    for line in kind.body:
+        if (
+            isinstance(line, ast.AnnAssign)
+            and isinstance(line.target, ast.Name)
+            and line.target.id == attribute
+            and line.value is not None
+        ):
+            return tuple(ast.literal_eval(line.value))
+    for base in kind.bases:
+        found = read_attribute(module, base.id, attribute) if isinstance(base, ast.Name) else None
+        if found is not None:
+            return found
+    return None
+
+
+@cache
+def parse_module(module: str) -> dict[str, ast.ClassDef | ast.ImportFrom]:
+    """Return the classes of a module of posefilter, and what it imports, by name."""
+    try:
+        spec = find_spec(module) if module.startswith("posefilter.") else None
+    except ModuleNotFoundError:  # told where it is built
+        spec = None
+    if spec is None or spec.origin is None:
+        return {}
+    out: dict[str, ast.ClassDef | ast.ImportFrom] = {}
+    for line in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        if isinstance(line, ast.ClassDef):
+            out[line.name] = line
+        elif isinstance(line, ast.ImportFrom):
+            out |= {alias.asname or alias.name: line for alias in line.names}
+    return out
+
+
+def typed_key(tree: Any, where: str) -> str:
+    """Return a place in the model's tree as one types it: `model.filter.initialize.behind` is
+    `initialize.behind`, if that is what it refers to.
+
+    Args:
+        tree: The whole configuration, plain and not resolved.
+        where: The place.
+    """
+    path: list[str] = []
+    for part in where.split("."):
+        path.append(part)
+        node: Any = tree
+        for key in path:
+            node = node.get(key) if isinstance(node, dict) else None
+        if isinstance(node, str) and (link := re.fullmatch(r"\$\{([\w.]+)\}", node)):
+            path = link[1].split(".")
+    return ".".join(path)
+
+
+def list_fitting(
+    group: str, groups: Groups, pieces: Sequence[Piece], scope: Scope, need: str | None = None
+) -> list[str]:
+    """Return the choices of a group that find all they require elsewhere, and take nothing away.
+
+    Args:
+        group: The group.
+        groups: Where its choices are read.
+        pieces: All that is chosen.
+        scope: Where the settings come from.
+        need: What the choice must provide as well; null for nothing.
+    """
+    options = groups.list_options(group)
+    places = {place for option in options for place in option.targets()}
+    others = [p.declared for p in pieces if not any(_within(p.key, place) for place in places)]
+    provided = _union(declared.provides for declared in others)
+    required = _union(declared.requires for declared in others)
+    found = {name for _, name in find_missing(piece.declared for piece in pieces)}
+    fitting = []
+    for option in options:
+        own = [declared_by(target, key, scope) for key, target in option.targets().items()]
+        offered = _union(declared.provides for declared in own)
+        fits = _union(declared.requires for declared in own) <= provided | offered
+        breaks = required - provided - offered - found
+        if fits and not breaks and (need is None or need in offered):
+            fitting.append(option.name)
+    return fitting
+
+
+def find_choice(
+    key: str, target: str, choices: Mapping[str, str], groups: Groups
+) -> tuple[str, str] | None:
+    """Return the (group, name) of the choice that puts a class at a place; None where there is none.
+
+    Args:
+        key: The place, such as `loss` or `filter.resample`.
+        target: The class's dotted name.
+        choices: Which file of each group was chosen; another may have been since.
+        groups: Where choices are read.
+    """
+    others = []
+    for option in (groups.load(group, name) for group, name in choices.items()):
+        named = option.targets()
+        if named.get(key) == target:
+            return option.group, option.name
+        if key in named:
+            others.append(option.group)
+    for group in others:
+        for option in groups.list_options(group):
+            if option.targets().get(key) == target:
+                return group, option.name
+    return None
+
+
+def _explain(
+    piece: Piece,
+    need: str,
+    pieces: Sequence[Piece],
+    keys: set[str],
+    choices: Mapping[str, str],
+    scope: Scope,
+    groups: Groups,
+) -> str:
+    """Return the line that names the piece that does not fit, what it needs, and what fits."""
+    group, name = find_choice(piece.key, piece.target, choices, groups) or (piece.key, piece.target)
+    advice = []
+    if group in choices and group != "model":
+        fitting = list_fitting(group, groups, pieces, scope)
+        advice += [f"{group}={_either(fitting)}"] if fitting else []
+    for option in (groups.load(*choice) for choice in choices.items()):
+        if option.group not in ("model", group) and keys & {
+            place for place, _ in list_places(option.settings, "")
+        }:
+            fitting = list_fitting(option.group, groups, pieces, scope, need)
+            advice += [f"{option.group}={_either(fitting)}"] if fitting else []
+    model = "" if group == "model" else f" does not fit model={choices.get('model')}, as it"
+    choose = f"; choose {', or '.join(advice)}" if advice else ""
+    return f"{group}={name}{model} needs {MEANINGS.get(need, need)} ({need}){choose}"
+
+
+def _either(names: Sequence[str]) -> str:
+    return " or ".join(([", ".join(names[:-1])] if names[1:] else []) + [names[-1]])
+
+
+def _within(key: str, place: str) -> bool:
+    return key == place or key.startswith((f"{place}.", f"{place}["))
+
+
+def _union(sets: Iterable[frozenset[str]]) -> frozenset[str]:
+    return frozenset().union(*sets)
