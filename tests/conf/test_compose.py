@@ -105,7 +105,9 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None:
     model = "cnn_patch" if "detect" in sweep else "patch_pf"
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
-        swept = hydra_compose("train", [f"sweep={sweep}"], return_hydra_config=True)
+        swept = hydra_compose(
+            "train", [f"model={model}", f"sweep={sweep}"], return_hydra_config=True
+        )
     points = [
         f"{key}={value}"
         for key, values in swept.hydra.sweeper.params.items()
