@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format smoke bench methods board report tour pictures weights clean
+.PHONY: help setup train test check format smoke bench methods board report tour pictures weights docs tables clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,8 +37,15 @@ smoke: $(STAMP) ## run every method the whole way at toy size
 bench: $(STAMP) ## measure: does training wait for the loader?
 	$(PY) bench/loader.py
 
-methods: $(STAMP) ## run (or go on with) every run behind docs/methods.md, and write its tables
+methods: $(STAMP) ## run (or go on with) every run behind docs/results, and write its tables
 	$(PY) bench/methods.py $(ARGS)
+
+tables: $(STAMP) ## write the tables of docs/ from docs/results/runs.csv
+	$(PY) bench/tables.py
+
+docs: $(STAMP) ## build the site with the reference into outputs/site
+	$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --quiet
 
 board: $(STAMP) ## show every run in TensorBoard
 	$(VENV)/bin/tensorboard --logdir outputs

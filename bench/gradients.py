@@ -1,31 +1,31 @@
-"""How the gradient of a roll-out grows with its length, before any training: the table `gradients`
-of docs/methods.md.
+"""How the gradient of a roll-out grows with its length, before any training: a table of
+docs/analysis/failures.md.
 
-    python bench/gradients.py [--into docs/methods.md] [train.py's settings ...]
+    python bench/gradients.py [train.py's settings ...]
 
-Each row is a method at a ablation of its ablation, at the ablation's size; each figure the norm of
+Each row is a method at an ablation; each figure the norm of
 its network's gradient on the first batch of `experiment=memorize`, in units of one step's.
 """
 
 import argparse
 import math
-import re
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from methods_table import fill, mark, told
 
+from posefilter.cli.ablations import ABLATIONS
 from posefilter.cli.command import compose_job
 from posefilter.cli.machine import settle
 from posefilter.cli.train import build_data, build_method, quiet, recipe
 
 HOME = Path(__file__).parents[1]
+DESCRIPTIONS = {row.name: f"`{row.name}` {row.description}" for row in ABLATIONS}
 STEPS = (1, 2, 4, 8, 16, 30)
-LADDERS = {"cnn_patch": "ablation_detect", "patch_pf": "ablation"}
-RUNGS = (
+SIZES = {"cnn_patch": "filter.particles=32", "patch_pf": "preset/size=patch_pf"}
+SHOWN = (
     "paper",
     "s1_glimpse",
     "s2_bounded",
@@ -36,18 +36,18 @@ RUNGS = (
 )
 
 
-def gradient(model: str, sweep: str, ablation: str, steps: int, more: Sequence[str]) -> float:
+def gradient(model: str, ablation: str, steps: int, more: Sequence[str]) -> float:
     """Return the norm of the network's gradient of one batch, rolled out for so many steps."""
     with tempfile.TemporaryDirectory() as folder:
-        said = [
+        chosen = [
             f"model={model}",
             "experiment=memorize",
-            f"sweep={sweep}",
             f"ablation={ablation}",
             "seed=0",
             f"filter.steps={steps}",
+            SIZES[model],
         ]
-        job = compose_job("train", HOME / "conf", [*said, *more], Path(folder))
+        job = compose_job("train", HOME / "conf", [*chosen, *more], Path(folder))
     settle(job.cfg.threads, job.cfg.seed)
     data = build_data(job.cfg.data, "json")
     data.setup("fit")
@@ -60,18 +60,18 @@ def gradient(model: str, sweep: str, ablation: str, steps: int, more: Sequence[s
 
 
 def table(more: Sequence[str]) -> str:
-    """Return all rows as Markdown, each said as soon as it is measured."""
+    """Return all rows as Markdown; each is printed to stderr as soon as it is measured."""
     lines = [
         f"| method | ablation | {' | '.join('1 step' if n == 1 else f'{n} steps' for n in STEPS)} "
         f"|",
         "| --- " * (2 + len(STEPS)) + "|",
     ]
-    for model, sweep in LADDERS.items():
-        for ablation in RUNGS:
-            norms = [gradient(model, sweep, ablation, steps, more) for steps in STEPS]
+    for model in SIZES:
+        for ablation in SHOWN:
+            norms = [gradient(model, ablation, steps, more) for steps in STEPS]
             cells = [written(norm / norms[0]) for norm in norms]
-            lines.append(f"| {model} | {told(f'ablation={ablation}')} | {' | '.join(cells)} |")
-            print(lines[-1], flush=True)
+            lines.append(f"| {model} | {DESCRIPTIONS[ablation]} | {' | '.join(cells)} |")
+            print(lines[-1], file=sys.stderr, flush=True)
     return "\n".join(lines)
 
 
@@ -88,19 +88,14 @@ def written(number: float) -> str:
 
 
 def main() -> int:
-    """Measure, and write the page."""
+    """Measure, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("more", nargs="*")
-    parser.add_argument("--into", type=Path, default=HOME / "docs" / "methods.md")
     options = parser.parse_args()
-    page = options.into.read_text()
-    if not re.search(mark("gradients"), page):
-        parser.error(f"{options.into} has no mark <!-- table: gradients -->")
     quiet()
-    rows = table(options.more)
-    options.into.write_text(fill(page, "gradients", lambda _: rows))
+    print(table(options.more))
     return 0
 
 

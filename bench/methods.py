@@ -1,4 +1,4 @@
-"""Run every run behind docs/methods.md, the most telling first, and bring its tables up to date
+"""Run every run behind docs/results, the most telling first, and bring its tables up to date
 after each line of the plan.
 
     python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]   # --only may be repeated
@@ -210,7 +210,7 @@ def main() -> int:
             worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
         )
         subprocess.run(
-            [sys.executable, "bench/methods_table.py", str(options.root)], cwd=HOME, check=False
+            [sys.executable, "bench/collect_runs.py", str(options.root)], cwd=HOME, check=False
         )
     return worst
 

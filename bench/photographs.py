@@ -190,7 +190,14 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
     words = dict(word.split("=", 1) for word in run.words.split())
     start = {CRACKER: "cracker box", DRILL: "drill"}.get(words.get("warm_start", ""), "none")
     cost = own["training"]["steps"] * own["training"]["cpu_seconds_per_step"] / 60
-    first = [run.object, f"`{run.model}`", words["augment"], start, str(run.steps), f"{cost:.1f}"]
+    first = [
+        run.object,
+        f"`{run.model}`",
+        words["data/augment"],
+        start,
+        str(run.steps),
+        f"{cost:.1f}",
+    ]
     return [*first, *_figures(tested)]
 
 

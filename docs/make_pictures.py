@@ -4,7 +4,7 @@
                                  [--methods outputs/methods]
 
 Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and
-its particles' way there.  Of docs/tour.md's commands, and of docs/methods.md's runs, where they
+its particles' way there.  Of docs/tour.md's commands, and of the runs of docs/results, where they
 were made: what they left.
 """
 
@@ -61,7 +61,7 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
     "tour_train": "run/figures/validation_overlays.jpg",
     "tour_predict": "prediction/belief.png",
 }
-# the ablations of docs/methods.md that its picture shows, and what to say of each
+# the ablations that its picture shows, and what to say of each
 ABLATIONS = {
     "paper": "The paper's",
     "c5_displacement_loss": "Told the way, and few arrive",

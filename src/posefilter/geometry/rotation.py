@@ -101,7 +101,7 @@ def random_rotation(
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
-    """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*) in [0, pi] [rad].
+    """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*), 0 to pi [rad].
 
     Computed from the chord |a - b|_F = 2 sqrt(2) sin(angle / 2), which is accurate at small angles
     where the arc cosine of the trace is not.

@@ -1,0 +1,157 @@
+"""Write down every run of outputs/methods as a row of docs/results/runs.csv, and its tables anew.
+
+    python bench/collect_runs.py [FOLDER] [--into docs/results/runs.csv]
+
+FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table,
+searched for metrics.json. The rows of a table that has runs there are replaced; those of other
+tables stay. `bench/tables.py` then fills the tables of the documents.
+"""
+
+import argparse
+import csv
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from posefilter.cli.ablations import ABLATIONS
+from posefilter.metrics.registry import find_metric, read_number
+
+HOME = Path(__file__).parents[1]
+KEYS = (
+    "particles_on_object",
+    "signs/on_object/first",
+    "iou",
+    "add/auc",
+    "add/recall_01d",
+    "add_s/auc",
+    "signs/distinct/last",
+    "signs/pairwise_cosine",
+    "signs/heading",
+    "signs/offset_r2",
+    "signs/off_frame/last",
+    "signs/near_edge/last",
+    "signs/near_corner/last",
+    "signs/auroc",
+)
+NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # have columns, or none
+# these change no result
+SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads")
+SILENT_KEYS = ("data.root", "data.meshes", "data.workers")
+ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
+Run = dict[str, Any]
+
+
+def read_column(key: str) -> Callable[[Run], float | None]:
+    """Return what reads a metric of a run, in the unit of its column."""
+
+    def read(run: Run) -> float | None:
+        value = read_number(run, key)
+        return None if value is None else find_metric(key).convert(value)
+
+    return read
+
+
+COLUMNS: dict[str, Callable[[Run], float | None]] = {
+    **{find_metric(key).column: read_column(key) for key in KEYS},
+    "CPU min": lambda run: run["training"]["steps"] * run["training"]["cpu_seconds_per_step"] / 60,
+    "s / image": read_column("seconds_per_image"),
+    "seed": lambda run: run["seed"],
+    "steps": read_column("training/steps"),
+    "tested step": read_column("training/tested_step"),
+}
+
+
+def read_runs(folder: Path) -> list[Run]:
+    """Return the metrics of every run below a folder, each with its overrides under `choices`."""
+    runs = []
+    for path in sorted(folder.rglob("metrics.json")):
+        run: Run = json.loads(path.read_text())
+        typed = [text.lstrip("+~") for text in run.get("overrides") or [] if "=" in text]
+        run["choices"] = dict(text.split("=", 1) for text in typed)
+        runs.append(run)
+    return runs
+
+
+def describe(run: Run) -> tuple[str, str, str]:
+    """Return method, variant, and what else was chosen, as it is typed, without the seed."""
+    choices = run["choices"]
+    rest = [
+        f"{key}={value}"
+        for key, value in choices.items()
+        if key not in (*NAMED, *SILENT_KEYS) and key.split(".")[0] not in SILENT
+    ]
+    method, variant = (run.get(key) or choices.get(key) or "?" for key in ("model", "variant"))
+    return method, variant, " ".join(sorted(rest))
+
+
+def order(run: Run) -> tuple[Any, ...]:
+    """Return what runs are sorted by: ablations as their table has them, numbers by their size."""
+    method, variant, rest = describe(run)
+    ablation = re.search(r"\bablation=(\w+)", rest)
+    numbers = [
+        (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", rest)
+    ]
+    step = ORDER.get(ablation[1], len(ORDER)) if ablation else -1
+    return method, step, variant, numbers, read_figure(run, COLUMNS["seed"]) or 0
+
+
+def read_figure(run: Run, read: Callable[[Run], float | None]) -> float | None:
+    """Return a figure of a run; None where it has none, or no number."""
+    try:
+        value = read(run)
+    except (KeyError, IndexError, TypeError):
+        return None
+    return float(value) if isinstance(value, int | float) and value == value else None
+
+
+def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
+    """Return a table's runs as rows: figures to six digits, empty where a run has none."""
+    rows = []
+    for run in sorted(runs, key=order):
+        figures = {name: read_figure(run, read) for name, read in COLUMNS.items()}
+        rows.append(
+            dict(
+                zip(("table", "method", "variant", "changed"), (table, *describe(run)), strict=True)
+            )
+            | {name: "" if value is None else f"{value:.6g}" for name, value in figures.items()}
+            | {"device": run.get("device") or ""}
+            | {"torch": (run.get("versions") or {}).get("torch") or ""}
+        )
+    return rows
+
+
+def main() -> int:
+    """Read the runs, replace their tables' rows, and fill the tables of the documents."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/methods"))
+    parser.add_argument("--into", type=Path, default=HOME / "docs" / "results" / "runs.csv")
+    options = parser.parse_args()
+    tables = {path.name: read_runs(path) for path in sorted(options.folder.glob("*/"))}
+    tables = {name: runs for name, runs in tables.items() if runs}
+    if not tables:
+        print(f"{options.folder}: holds no run", file=sys.stderr)
+        return 1
+    kept = []
+    if options.into.is_file():
+        with options.into.open() as file:
+            kept = [row for row in csv.DictReader(file) if row["table"] not in tables]
+    for name, runs in tables.items():
+        print(f"{name}: {len(runs)} runs")
+        kept += make_rows(name, runs)
+    kept.sort(key=lambda row: row["table"])  # stable: rows of a table keep their order
+    with options.into.open("w", newline="") as file:
+        header = ["table", "method", "variant", "changed", *COLUMNS, "device", "torch"]
+        writer = csv.DictWriter(file, header, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(kept)
+    return subprocess.run([sys.executable, "bench/tables.py"], cwd=HOME, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""Runs become rows of one CSV file, in an order that people count in."""
+
+import csv
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+
+@pytest.fixture
+def collect(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    """Return the script."""
+    return load_script("bench/collect_runs.py")
+
+
+def write_run(folder: Path, on: float, *overrides: str) -> None:
+    folder.mkdir(parents=True)
+    metrics = {
+        "particles_on_object": on,
+        "iou": 0.5,
+        "add": {"auc": 40.0},
+        "overrides": list(overrides),
+        "seed": 0,
+    }
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+
+
+def test_what_decides_no_result_is_left_out(collect: ModuleType, tmp_path: Path) -> None:
+    typed = ("model=patch_pf", "variant=paper", "seed=1", "console=json", "data.workers=2")
+    write_run(tmp_path / "a", 0.9, *typed, "filter/resample=none", "data.limit_train=6")
+    (run,) = collect.read_runs(tmp_path)
+    wanted = ("patch_pf", "paper", "data.limit_train=6 filter/resample=none")
+    assert collect.describe(run) == wanted
+
+
+def test_rows_follow_the_table_of_ablations_and_numbers_their_size(collect: ModuleType) -> None:
+    def runs(*changes: str) -> list[dict]:
+        return [{"choices": dict([change.split("=")]), "model": "m"} for change in changes]
+
+    names = ["paper", "s1_glimpse", "c2_glimpse", "c10_resample", "working", "m3_bounded"]
+    ablations = runs(*(f"ablation={name}" for name in sorted(names)))
+    ordered = [run["choices"]["ablation"] for run in sorted(ablations, key=collect.order)]
+    assert sorted(ordered, key=collect.ORDER.get) == ordered
+    assert ordered.index("c2_glimpse") < ordered.index("c10_resample")
+    counts = runs(*(f"filter.particles={n}" for n in (1000, 50, 100)))
+    ordered = [run["choices"]["filter.particles"] for run in sorted(counts, key=collect.order)]
+    assert ordered == ["50", "100", "1000"]
+
+
+def test_only_tables_with_runs_are_replaced(
+    collect: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "runs" / "memorize" / "a", 0.9, "model=patch_pf", "variant=working")
+    write_run(tmp_path / "runs" / "other" / "deep" / "b", 0.1, "model=patch_pf", "variant=paper")
+    into = tmp_path / "runs.csv"
+    monkeypatch.setattr(
+        collect.subprocess, "run", lambda *_, **__: type("Done", (), {"returncode": 0})
+    )
+    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path / "runs"), "--into", str(into)])
+    assert collect.main() == 0
+    (tmp_path / "runs" / "memorize" / "a" / "metrics.json").unlink()
+    (tmp_path / "runs" / "other" / "deep" / "b" / "metrics.json").unlink()
+    write_run(tmp_path / "runs" / "other" / "c", 0.3, "model=patch_pf", "variant=paper")
+    assert collect.main() == 0
+    rows = list(csv.DictReader(into.open()))
+    found = [(row["table"], row["variant"], row["on object %"]) for row in rows]
+    assert found == [("memorize", "working", "90"), ("other", "paper", "30")]
+    assert rows[0]["AUROC"] == "", "a figure that a run has not"
+
+
+def test_a_folder_without_runs_is_told(
+    collect: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    into = tmp_path / "runs.csv"
+    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path), "--into", str(into)])
+    assert collect.main() == 1
+    assert "holds no run" in capsys.readouterr().err
+    assert not into.exists()

@@ -1,0 +1,96 @@
+"""Tables of results: what a mark asks for is what the runs say."""
+
+import csv
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from statistics import stdev
+from types import ModuleType
+
+import pytest
+
+HOME = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def tables(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    """Return the script."""
+    return load_script("bench/tables.py")
+
+
+def make_row(changed: str = "", seed: int = 0, **figures: float) -> dict[str, str]:
+    row = {"table": "t", "method": "m", "variant": "paper", "changed": changed, "seed": str(seed)}
+    return row | {"auc": "", "iou": ""} | {name: str(value) for name, value in figures.items()}
+
+
+def test_seeds_become_one_row_with_their_standard_deviation(tables: ModuleType) -> None:
+    values = [10.0, 12.0, 17.0]
+    rows = [make_row(seed=seed, auc=value) for seed, value in enumerate(values)]
+    table = tables.make_table([*rows, make_row("x=1", auc=3.0)], ["auc", "iou"])
+    _, _, mean, single = table.splitlines()
+    assert f"13.0 ± {stdev(values):.1f}" in mean
+    assert mean.split("|")[2].strip() == "3"
+    assert "3.00" in single
+    assert "±" not in single
+    assert single.endswith("– |")
+
+
+def test_patterns_choose_rows(tables: ModuleType) -> None:
+    rows = [
+        make_row(f"ablation={name}", auc=1.0) for name in ("c1_a", "c10_b", "pose_c11_c", "m1_d")
+    ]
+    found = tables.select_runs(rows, {"table": "t", "changed": "*=c*|*=m*"})
+    assert [row["changed"] for row in found] == ["ablation=c1_a", "ablation=c10_b", "ablation=m1_d"]
+
+
+@pytest.mark.parametrize(
+    ("mark", "words"),
+    [
+        ("table=none show=auc", "no run fits"),
+        ("table=t show=speed", "no figure speed"),
+        ("table=t show=auc", "11 rows"),
+        ("table=t color=red show=auc", "a mark takes"),
+        ("table=t", "a mark takes"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(tables: ModuleType, mark: str, words: str) -> None:
+    rows = [make_row(f"x={i}", auc=1.0) for i in range(11)]
+    with pytest.raises(ValueError, match=words):
+        tables.fill_page(f"<!-- runs {mark} -->\n<!-- end -->", rows)
+
+
+def test_a_page_filled_twice_stays_as_it_is(tables: ModuleType) -> None:
+    page = "a\n\n<!-- runs table=t show=auc -->\nold\n<!-- end -->\n\nb\n"
+    once = tables.fill_page(page, [make_row(auc=5.0)])
+    assert "old" not in once
+    assert "5.0" in once
+    assert tables.fill_page(once, [make_row(auc=5.0)]) == once
+
+
+def test_every_table_of_the_documents_is_what_the_runs_say(tables: ModuleType) -> None:
+    with (HOME / "docs" / "results" / "runs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    pages = [page for page in (HOME / "docs").rglob("*.md") if "<!-- runs " in page.read_text()]
+    assert len(pages) >= 3
+    for page in pages:
+        assert tables.fill_page(page.read_text(), rows) == page.read_text(), page
+
+
+def test_a_stale_page_fails_the_check(
+    tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "docs" / "results"
+    folder.mkdir(parents=True)
+    runs = folder / "runs.csv"
+    runs.write_text("table,method,variant,changed,auc,seed\nt,m,paper,,7,0\n")
+    page = folder / "page.md"
+    page.write_text("<!-- runs table=t show=auc -->\n<!-- end -->\n")
+    monkeypatch.setattr(tables, "HOME", tmp_path)
+    monkeypatch.setattr(tables, "RUNS", runs)
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--check"])
+    assert tables.main() == 1
+    monkeypatch.setattr(sys, "argv", ["tables.py"])
+    assert tables.main() == 0
+    assert "7.0" in page.read_text()
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--check"])
+    assert tables.main() == 0
