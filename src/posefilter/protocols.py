@@ -1,8 +1,10 @@
 """Every protocol on one page.  Each verb of the filter is one injected piece; a Hydra group chooses
 which.
 
-DataModule -> Batch -> method.encode -> [read -> reweight -> resample -> move] x steps -> estimate
--> refine -> Belief The order on this page is the order in which filters/loop.py calls them.
+DataModule -> Batch -> method.encode -> [measure -> reweight -> resample -> propagate] x
+steps -> estimate -> refine -> Belief
+
+The order on this page is the order in which filters/loop.py calls them.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -68,7 +70,7 @@ class Method(Protocol):
     def measure(
         self, scene: Scene, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
-        """Judge every particle of a cloud."""
+        """Measure every particle against the image."""
         ...
 
 
@@ -137,7 +139,7 @@ class Schedule(Protocol):
 
 
 class Initialize(Protocol):
-    """Draw the first cloud's states."""
+    """Draw the first particles' states."""
 
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
@@ -154,21 +156,19 @@ class Reweight(Protocol):
         log evidence.
 
         log_weights (B, N), normalized: what the particles start the step with; log_likelihood (B,
-        N): read at this step; inherited (B, N): each one's parent's log_likelihood, read at the
+        N): measured at this step; inherited (B, N): the log_likelihood of each one's ancestor at the
         step before (zeros at the first).
         """
         ...
 
 
 class Resample(Protocol):
-    """Draw children from a weighted cloud."""
+    """Draw ancestors from weighted particles."""
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return parents **and** the weights that children start with, so that none can be
-        forgotten.
-        """
+        """Return ancestors **and** the children's weights, which each scheme must set."""
         ...
 
 
@@ -183,7 +183,7 @@ class Propagate(Protocol):
 
 
 class Estimate(Protocol):
-    """Bet on one pose."""
+    """Choose one pose of the weighted particles."""
 
     def __call__(
         self,
@@ -193,12 +193,12 @@ class Estimate(Protocol):
         method: Method,
         generator: Generator,
     ) -> Belief:
-        """Return the belief that the last cloud amounts to."""
+        """Return the belief of the last particles."""
         ...
 
 
 class Refine(Protocol):
-    """Polish an estimate."""
+    """Improve an estimate."""
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator

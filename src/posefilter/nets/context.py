@@ -1,9 +1,8 @@
-"""Global context: what a particle may know of the image beyond its own glimpse, sampled where the
-particle stands.
+"""Image context of a particle: features of the whole image, sampled at the particle's position.
 
-Every context maps images, (B, 3, H, W) in [0, 1], (B, 1, H, W) [m] and (B, 3, 3) [px], once to
-feature maps (a `ContextMap`), and is then looked up at each particle at each step, for `width`
-features.
+An encoder maps images once to feature maps (a `ContextMap`): color (B, 3, H, W) in [0, 1], depth
+(B, 1, H, W) [m] and camera matrices (B, 3, 3) [px]. Each step samples `width` features of these at
+each particle.
 """
 
 import math
@@ -26,12 +25,12 @@ class ContextMap(NamedTuple):
 
     levels: tuple[Tensor, ...]  # each (B, F, h, w)
     strides: tuple[int, ...]  # pixels a cell of each
-    # (B, h, w) logit of `this cell shows the object`, at strides[0]; None where not told
+    # (B, h, w) logit of membership of the object, at strides[0]; None without
     relevance: Tensor | None
 
 
 class NoContext(nn.Module):
-    """The paper's choice: a particle knows its own patch, and nothing else."""
+    """No context, as in the paper: a particle sees its own patch only."""
 
     width = 0
 
@@ -39,16 +38,22 @@ class NoContext(nn.Module):
         """Return an empty map."""
         return ContextMap((), (), None)
 
-    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """(B, N, 2) -> (B, N, 0), without gradient: else all that decided the place would be asked
-        for zeros.
+    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+        """Return no features.  (B, N, 2) -> (B, N, 0), without gradient.
+
+        With a gradient, the graph behind the positions would be traversed for nothing.
         """
         return pixels.detach()[..., :0]
 
 
 class Pyramid(nn.Module):
-    """Color and depth at halving resolutions, a 3 x 3 glimpse of each: a fovea without a single
-    learned weight.
+    """Color and depth at halving resolutions, a 3 x 3 patch of each; no learned weights.
+
+    Args:
+        levels: Number of resolutions, from 1/2 downwards.
+
+    Raises:
+        UserError: `levels` is below 1.
     """
 
     def __init__(self, levels: int = 5) -> None:
@@ -61,7 +66,11 @@ class Pyramid(nn.Module):
         self.width = levels * 9 * 5
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
-        """Return one map a level, of 5 channels: color, depth, share of known depth."""
+        """Return one map for each level, of 5 channels: color, depth, share of known depth.
+
+        Raises:
+            UserError: The image is smaller than a cell of the last level.
+        """
         side = min(rgb.shape[-2:])
         if self.strides[-1] > side:
             raise UserError(
@@ -75,21 +84,21 @@ class Pyramid(nn.Module):
             levels.append(torch.cat([F.avg_pool2d(rgb, stride) * 2 - 1, z, known], dim=1))
         return ContextMap(tuple(levels), self.strides, None)
 
-    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """(B, N, 2) [px] -> (B, N, width)."""
-        found = []
-        for level, stride in zip(seen.levels, seen.strides, strict=True):
-            places = pixels[:, :, None] + patch_offsets(3, pixels.device) * stride
-            found.append(
-                sample(level, places.flatten(1, 2), stride)
-                .unflatten(1, places.shape[1:3])
+    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+        """Sample features.  (B, N, 2) [px] -> (B, N, width)."""
+        features = []
+        for level, stride in zip(maps.levels, maps.strides, strict=True):
+            positions = pixels[:, :, None] + patch_offsets(3, pixels.device) * stride
+            features.append(
+                sample(level, positions.flatten(1, 2), stride)
+                .unflatten(1, positions.shape[1:3])
                 .flatten(2)
             )
-        return torch.cat(found, dim=-1)
+        return torch.cat(features, dim=-1)
 
 
 class _Encoder(nn.Module):
-    """One feature map, and the relevance that a 1 x 1 convolution reads off it."""
+    """A single feature map, and relevance logits from it by a 1 x 1 convolution."""
 
     provides: ClassVar[Capabilities] = ("relevance",)
 
@@ -102,9 +111,9 @@ class _Encoder(nn.Module):
         features = features.float()
         return ContextMap((features,), (stride,), self.relevance(features)[:, 0])
 
-    def look(self, seen: ContextMap, pixels: Tensor) -> Tensor:
-        """(B, N, 2) [px] -> (B, N, width); beyond the frame, what lies at its edge."""
-        return sample(seen.levels[0], pixels, seen.strides[0], padding="border")
+    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+        """Sample features.  (B, N, 2) [px] -> (B, N, width); off the frame, those at its edge."""
+        return sample(maps.levels[0], pixels, maps.strides[0], padding="border")
 
 
 def averaged(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,13 +128,19 @@ def averaged(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tensor
 
 
 class ConvEncoder(_Encoder, UNet):
-    """A small U-Net from nothing: strides 4 to 32 and back to 4, about a million and a half
+    """A small U-Net trained from scratch: strides 4 to 32 and back to 4, about 1.5 million
     parameters.
 
-    widths: channels at strides 4, 8, 16 and 32, multiples of 8; width: features a particle gets;
-    most_px: images that are wider are averaged down to that, by a whole number, since context is
-    about the whole (null: never). Runs in bfloat16 where the machine has it (float32 in, float32
-    out), which halves its time on processors.
+    It runs in bfloat16 where the hardware supports it (float32 in, float32 out).
+
+    Args:
+        widths: Channels at strides 4, 8, 16 and 32, multiples of 8.
+        width: Features of a particle.
+        most_px: Wider images are downsampled by the least integer factor to at most this width;
+            None for never.
+
+    Raises:
+        UserError: `most_px` is below 32.
     """
 
     def __init__(
@@ -148,7 +163,7 @@ class ConvEncoder(_Encoder, UNet):
         )
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
-        """Return one map, of 4 pixels a cell in an image as small as it is looked at."""
+        """Return one map, of 4 pixels of the downsampled image a cell."""
         factor = 1 if self.most_px is None else math.ceil(rgb.shape[-1] / self.most_px)
         if factor > 1:
             rgb, depth, K = averaged(rgb, depth, K, factor)
@@ -160,11 +175,12 @@ class ConvEncoder(_Encoder, UNet):
 
 
 class ResNetContext(_Encoder):
-    """A ResNet trunk (its weights from a file, an address, or chance) with a light top-down path to
-    stride 4.
+    """A ResNet trunk with a top-down path to stride 4 (feature pyramid network, Lin et al. 2017).
 
-    trunk: gives maps of strides 4, 8, 16 and 32 for color in [0, 1] and 7 geometry channels at half
-    resolution.
+    Args:
+        trunk: Maps color in [0, 1] and 7 geometry channels at half resolution to maps of strides 4,
+            8, 16 and 32.
+        width: Features of a particle.
     """
 
     def __init__(self, trunk: nn.Module, width: int = 64) -> None:

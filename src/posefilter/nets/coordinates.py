@@ -1,10 +1,8 @@
-"""Dense object coordinates: for each cell of an image, is it the object, and which point of the
-object?
+"""Dense object coordinates: for each cell of an image, is it the object, and which point of it?
 
-Which point is answered in two parts, a fragment of the surface (a classification) and the place
-within it (a regression), after EPOS (Hodan et al. 2020). Regression alone answers doubt by the mean
-of what is possible, which lies inside the object and is nobody's point; shares of fragments can
-hold several possibilities, so that votes drawn from them do too.
+The point is predicted by a classification of surface fragments and a regression of the position in
+each, as in EPOS (Hodan et al. 2020). Regression alone averages over ambiguous points, and the mean
+lies inside the object. A distribution over fragments keeps several modes.
 """
 
 from typing import NamedTuple
@@ -24,25 +22,24 @@ STRIDE = 8  # pixels a cell
 
 
 class Coordinates(NamedTuple):
-    """What a network says of each of the h x w cells, K fragments each."""
+    """Output of the coordinate network for h x w cells, K fragments each."""
 
-    logit: Tensor  # (B, h, w) is it the object
+    logit: Tensor  # (B, h, w) logit of membership of the object
     log_share: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
-    # (B, h, w, K, 3) the object's point if it is that fragment, over the radius, from the object's
-    # center
+    # (B, h, w, K, 3) the object point in each fragment, from the object's center, in radii
     position: Tensor
-    centers: Tensor  # (B, K, 3) the fragments' middles, over the radius, from the object's center
-    features: Tensor  # (B, h, w, C) told to a likelihood that reads context; C = 0 where none does
+    centers: Tensor  # (B, K, 3) the fragments' centers, likewise
+    features: Tensor  # (B, h, w, C) for a likelihood with context; C = 0 without
 
     @property
     def coordinate(self) -> Tensor:
-        """Return the likeliest object point of each cell, over the radius, from the object's
-        center, (B, h, w, 3).
+        """Return the most probable object point of each cell, from the center, in radii, (B, h, w,
+        3).
         """
         return gather_fragment(self.position, self.log_share.argmax(-1))
 
     def first(self, count: int) -> "Coordinates":
-        """Return the first so many images."""
+        """Return the first `count` images."""
         return Coordinates(*(x[:count] for x in self))
 
     def detach(self) -> "Coordinates":
@@ -51,21 +48,18 @@ class Coordinates(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """The measured side of each cell."""
+    """The measured point of each cell."""
 
     point: Tensor  # (B, h, w, 3) camera point [m]
     valid: Tensor  # (B, h, w) bool: depth is known there
 
     def first(self, count: int) -> "Cells":
-        """Return the first so many images."""
+        """Return the first `count` images."""
         return Cells(*(x[:count] for x in self))
 
 
 def whole_cells(image: Tensor) -> Tensor:
-    """Pad images with zeros to whole cells, as many as the network makes.
-
-    (B, C, H, W) -> the same, sides of `STRIDE`.
-    """
+    """Pad images with zeros to whole cells of `STRIDE` pixels.  (B, C, H, W) -> (B, C, H', W')."""
     H, W = image.shape[-2:]
     return F.pad(image, (0, -W % STRIDE, 0, -H % STRIDE))
 
@@ -73,12 +67,18 @@ def whole_cells(image: Tensor) -> Tensor:
 def true_coordinates(
     cells: Cells, mask: Tensor, camera_from_object: Tensor, center: Tensor, radius: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what a perfect network would say.
+    """Return the targets of the coordinate network.
 
-    mask: (B, 1, H, W) bool; camera_from_object: (B, 4, 4) [m]. -> the object point that each cell's
-    measured point is, over the radius, from the center, (B, h, w, 3); whether the cell's middle
-    pixel shows the object, (B, h, w) bool; and whether it also has a depth that can be of the
-    object, so that the point is true.
+    Args:
+        cells: Measured points.
+        mask: (B, 1, H, W) bool.
+        camera_from_object: (B, 4, 4) [m].
+        center: (3,) the object's center [m].
+        radius: The object's radius [m].
+
+    Returns:
+        The object point of each cell (B, h, w, 3), from the center, in radii; whether the cell's
+        central pixel is on the object (B, h, w) bool; and whether its depth is valid too, bool.
     """
     on = whole_cells(mask)[:, 0, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
     R, t = camera_from_object[:, None, :3, :3], camera_from_object[:, None, None, :3, 3]
@@ -95,12 +95,23 @@ def coordinate_loss(
     radius: float,
     reach: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the loss an image (B,) and the mean error of the likeliest coordinates on the object
-    (B,) [m].
+    """Return the loss of the coordinate network.
 
-    5 x binary cross-entropy for `is it the object`, and where it is and depth is known,
-    cross-entropy of the fragments and 0.3 x the true one's L1 error in units of their reach
-    [radii]. mask: (B, 1, H, W) bool.
+    5 x binary cross-entropy of object membership; on the object with valid depth also the
+    cross-entropy of the fragments, and 0.3 x the L1 error of the position in the true fragment, in
+    units of the fragments' radius.
+
+    Args:
+        coordinates: The network's output.
+        cells: Measured points.
+        mask: (B, 1, H, W) bool.
+        camera_from_object: (B, 4, 4) [m].
+        center: (3,) the object's center [m].
+        radius: The object's radius [m].
+        reach: The fragments' mean radius, in radii of the object.
+
+    Returns:
+        The loss of each image (B,), and the mean error of the most probable points (B,) [m].
     """
     truth, on, usable = true_coordinates(cells, mask, camera_from_object, center, radius)
     inside = usable.float()
@@ -117,7 +128,7 @@ def coordinate_loss(
 
 
 class Context(NamedTuple):
-    """What a network says of images, laid out for gathering."""
+    """The coordinate network's output, flattened for gathering."""
 
     smooth: Tensor  # (B, H / 2 * W / 2, 1 + C) logit and features, interpolated
     share: Tensor  # (B, h * w * K)
@@ -127,15 +138,15 @@ class Context(NamedTuple):
     columns: int  # W / 2
 
     def first(self, count: int) -> "Context":
-        """Return the first so many images."""
+        """Return the first `count` images."""
         smooth, share, position, centers = (x[:count] for x in self[:4])
         return Context(smooth, share, position, centers, self.grid, self.columns)
 
 
 def lay_out_context(coordinates: Coordinates, height: int, width: int) -> Context:
-    """Lay out what is coordinates of H x W images.
+    """Flatten the output of H x W images for gathering.
 
-    Gradients reach the features alone: the rest has a lesson of its own.
+    Gradients flow to the features only: the rest is trained by `coordinate_loss`.
     """
     rows, columns = -(-height // 2), -(-width // 2)
     grid = torch.cat([coordinates.logit.detach()[..., None], coordinates.features], dim=-1).permute(
@@ -155,11 +166,19 @@ def lay_out_context(coordinates: Coordinates, height: int, width: int) -> Contex
 
 
 def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
-    """Ask what is coordinates at pixels of the object's points that a hypothesis sees there.
+    """Sample the coordinate network's output at pixels, for the object points of a hypothesis.
 
-    u, v: (B, *) [px]; position: (B, *, 3) over the radius, from the object's center. -> (B, *, 5 +
-    C): log of the share of the fragment that the point lies in, where in it the network sees the
-    point, logit, features. Between cells the shares are interpolated, and places by their shares.
+    Cells are interpolated bilinearly, positions weighted by the probability of the fragment.
+
+    Args:
+        context: The network's output.
+        u: (B, *) [px].
+        v: (B, *) [px].
+        position: (B, *, 3) object points of the hypothesis, from the center, in radii.
+
+    Returns:
+        (B, *, 5 + C): log-probability of the point's fragment, predicted position in it (3), logit
+        of membership, features.
     """
     h, w = context.grid
     K = context.centers.shape[1]

@@ -1,6 +1,4 @@
-"""What every encoder of an image starts from: depth as geometry; and the trunk that those learned
-from nothing share.
-"""
+"""Input encoding shared by image encoders: depth as geometry channels, and the U-Net trunk."""
 
 import torch
 import torch.nn.functional as F
@@ -23,8 +21,9 @@ def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
 def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
     """Return surface normals towards the camera at half resolution, zeros where depth is missing.
 
-    (B, 1, H, W) [m], (B, 3, 3) -> (B, 3, H // 2, W // 2). Central differences of the points of a 3
-    x 3 masked mean.
+    Central differences of points that are averaged over 3 x 3 known neighbors.
+
+    (B, 1, H, W) [m], (B, 3, 3) [px] -> (B, 3, H // 2, W // 2).
     """
     B, _, H, W = depth.shape
     z, share = masked_mean_pool(depth, 2)
@@ -45,12 +44,12 @@ def normals_from_depth(depth: Tensor, K: Tensor) -> Tensor:
 
 
 def geometry(depth: Tensor, K: Tensor) -> Tensor:
-    """Return normals, depth about 1 m, share of known depth and ray, at half resolution.  (B, 1, H,
-    W) -> (B, 7, ...).
+    """Return geometry channels at half resolution: normals, depth - 1 m, share of known depth, ray.
 
-    Sides are halved upwards, as by a convolution of stride 2: beyond an odd side lies a row of
-    which nothing is known. Channels last: joined with color that is not, it would have every
-    convolution after it reorder its input.
+    Odd sides are rounded up, as by a convolution of stride 2. The result is in channels-last
+    format, so that later convolutions need not reorder their input.
+
+    (B, 1, H, W) [m], (B, 3, 3) [px] -> (B, 7, ceil(H / 2), ceil(W / 2)).
     """
     depth = F.pad(depth, (0, depth.shape[-1] % 2, 0, depth.shape[-2] % 2))
     B, _, H, W = depth.shape
@@ -68,8 +67,9 @@ def grow(x: Tensor, like: Tensor) -> Tensor:
 
 
 def in_bfloat16(rgb: Tensor) -> torch.autocast:
-    """Return the context to encode images in: bfloat16 where the machine has it, unless they come
-    in double precision.
+    """Return the autocast context of image encoders.
+
+    bfloat16 for float32 images where the hardware supports it; otherwise disabled.
     """
     return torch.autocast(
         rgb.device.type,
@@ -79,18 +79,20 @@ def in_bfloat16(rgb: Tensor) -> torch.autocast:
 
 
 class UNet(nn.Module):
-    """The trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8: color at full
-    resolution, geometry at half.
+    """Trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8.
 
-    A base class, laid by a method: checkpoints go by its parameters' names, and resumed optimizers
-    by their order too.
+    Color enters at full resolution, geometry at half. Subclasses create the layers by `lay_trunk`,
+    then `up8`: names and order of parameters are those of existing checkpoints and optimizer
+    states.
     """
 
     up8: nn.Module  # of each subclass, laid next: what follows on the way up at stride 8
 
     def lay_trunk(self, widths: tuple[int, int, int, int]) -> None:
-        """Make the layers all but `up8`.  widths: channels at strides 4, 8, 16 and 32, multiples of
-        8.
+        """Create all layers but `up8`.
+
+        Args:
+            widths: Channels at strides 4, 8, 16 and 32, multiples of 8.
         """
         a, b, c, d = widths
         self.color = conv_norm(3, 24, stride=2)
@@ -103,8 +105,14 @@ class UNet(nn.Module):
         self.to8 = nn.Conv2d(c, b, 1)
 
     def encode(self, rgb: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, 3, H, W) in [0, 1], its geometry -> maps of stride 4, on the way down, and 8, on the
-        way up.
+        """Encode images.
+
+        Args:
+            rgb: (B, 3, H, W) in [0, 1].
+            shape: Its geometry channels at half resolution.
+
+        Returns:
+            Maps of stride 4 (from the downward path) and 8 (from the upward path).
         """
         x = self.color((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
         x4 = self.down4(self.enter(torch.cat([x, shape], dim=1)))

@@ -1,8 +1,7 @@
-"""Glimpses: what a particle sees of the image where it stands.  Outside the frame is zero.
+"""Glimpses: the image patch at each particle.  Outside the frame is zero.
 
-A glimpse of size k covers the offsets of `geometry.lookup.window`, so that odd and even sizes have
-the particle's own pixel among theirs, and both kinds agree wherever the particle stands on whole
-pixels.
+A glimpse of size k covers the offsets of `geometry.lookup.patch_offsets`. Odd and even sizes
+include the particle's own pixel. Both kinds agree for particles at whole pixels.
 """
 
 from torch import Tensor, nn
@@ -12,8 +11,10 @@ from posefilter.geometry.lookup import gather_pixels, nearest_pixel, patch_offse
 
 
 class IntegerCut(nn.Module):
-    """Cut whole pixels, as one slices an array: nothing of what is seen has a gradient towards
-    where the particle stands.
+    """Crop whole pixels; no gradient with respect to the position.
+
+    Args:
+        size: Side of the patch [px].
     """
 
     def __init__(self, size: int) -> None:
@@ -25,17 +26,17 @@ class IntegerCut(nn.Module):
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
         index = nearest_pixel(pixels)[:, :, None] + patch_offsets(self.size, pixels.device)
-        seen = gather_pixels(image, index.flatten(1, 2))
-        return (
-            seen.unflatten(1, index.shape[1:3]).transpose(2, 3).unflatten(3, (self.size, self.size))
-        )
+        patch = gather_pixels(image, index.flatten(1, 2))
+        patch = patch.unflatten(1, index.shape[1:3]).transpose(2, 3)
+        return patch.unflatten(3, (self.size, self.size))
 
 
 class SmoothGlimpse(nn.Module):
-    """Interpolate bilinearly, so that what is seen has a gradient towards where the particle
-    stands.
+    """Sample bilinearly; differentiable in the position.
 
-    spacing: pixels between the glimpse's samples; above 1 the glimpse sees further, more coarsely.
+    Args:
+        size: Samples along each side.
+        spacing: Pixels between samples.
     """
 
     def __init__(self, size: int, spacing: float = 1.0) -> None:
@@ -49,10 +50,7 @@ class SmoothGlimpse(nn.Module):
 
     def forward(self, image: Tensor, pixels: Tensor) -> Tensor:
         """(B, C, H, W), (B, N, 2) [px] -> (B, N, C, size, size)."""
-        places = pixels[:, :, None] + patch_offsets(self.size, pixels.device) * self.spacing
-        seen = sample(image, places.flatten(1, 2))
-        return (
-            seen.unflatten(1, places.shape[1:3])
-            .transpose(2, 3)
-            .unflatten(3, (self.size, self.size))
-        )
+        positions = pixels[:, :, None] + patch_offsets(self.size, pixels.device) * self.spacing
+        patch = sample(image, positions.flatten(1, 2))
+        patch = patch.unflatten(1, positions.shape[1:3]).transpose(2, 3)
+        return patch.unflatten(3, (self.size, self.size))

@@ -1,4 +1,4 @@
-"""What a network's plain outputs mean: a displacement over the image, and a pose."""
+"""Output heads: a displacement over the image, and a pose."""
 
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -15,7 +15,7 @@ from posefilter.types import Fragments, ObjectModel
 
 
 class Displacement(Protocol):
-    """Turns two plain outputs into a displacement."""
+    """Turns two network outputs into a displacement."""
 
     def __call__(
         self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int
@@ -27,17 +27,15 @@ class Displacement(Protocol):
 
 
 class PosePrediction(NamedTuple):
-    """A pose a particle, and where it comes from."""
+    """The predicted pose of each particle."""
 
     pose: Tensor  # (B, N, 4, 4) camera_from_object
-    # that the particle's own point may lie in; None where the code tells one point
+    # distribution of its object point; None if a single point is predicted
     fragments: Fragments | None = None
 
 
 class Unbounded(nn.Module):
-    """The outputs are the displacement, in half frame widths; a particle may leave the frame, and
-    go on.
-    """
+    """The outputs are the displacement in half frame widths; particles may leave the frame."""
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2) -> (B, N, 2) [px]."""
@@ -45,10 +43,13 @@ class Unbounded(nn.Module):
 
 
 class Bounded(nn.Module):
-    """At most `reach` frame widths along each axis (tanh), and never out of the frame.
+    """At most `reach` frame widths along each axis (tanh), and within the frame.
 
-    The gradient passes an edge as if it were not there: else a particle that was pushed onto one
-    could not be taught back.
+    The clamp to the frame has a straight-through gradient, so that particles at an edge still get
+    one.
+
+    Args:
+        reach: Largest displacement along an axis, in frame widths.
     """
 
     def __init__(self, reach: float = 0.25) -> None:
@@ -64,11 +65,12 @@ class Bounded(nn.Module):
 
 
 class Gated(nn.Module):
-    """Another displacement, less the surer the particle is of being on the object: who is there
-    stays there.
+    """Another displacement x the probability that the particle is off the object.
 
-    A displacement that is wrong in one place in twenty throws a cloud off again, all copies of a
-    particle at once. The likelihood learns nothing through this: it has a lesson of its own.
+    Particles on the object then stay on it. The likelihood gets no gradient through the gate.
+
+    Args:
+        displacement: The displacement to gate.
     """
 
     def __init__(self, displacement: Displacement) -> None:
@@ -84,14 +86,14 @@ class Gated(nn.Module):
 
 
 class _AnyObject(nn.Module):
-    """A code that does not depend on the object."""
+    """A head that does not depend on the object."""
 
     def about(self, model: ObjectModel) -> None:
         """Need nothing of the object."""
 
 
 class AbsoluteQuaternion(_AnyObject):
-    """Seven outputs: a quaternion (x, y, z, w), made unit, and the translation in the camera [m]."""
+    """Seven outputs: a quaternion (x, y, z, w), normalized here, and the translation [m]."""
 
     provides: ClassVar[Capabilities] = ("pose",)
 
@@ -103,8 +105,8 @@ class AbsoluteQuaternion(_AnyObject):
 
 
 class _SurfacePointHead(nn.Module):
-    """A code that tells a rotation by two of its columns, and which object point the particle's own
-    3-D point is.
+    """A head that predicts two columns of the rotation, and the object point of the measured
+    point.
     """
 
     provides: ClassVar[Capabilities] = ("pose",)
@@ -117,12 +119,19 @@ class _SurfacePointHead(nn.Module):
         self.radius = 1.0
 
     def about(self, model: ObjectModel) -> None:
-        """Take the object's center and radius as origin and unit of the object point."""
+        """Use the object's center and radius as origin and unit of object points."""
         self.center, self.radius = model.center.to(self.center), model.radius
 
     def _pose(self, columns: Tensor, object_point: Tensor, point: Tensor) -> Tensor:
-        """(B, N, 6), object points (B, N, 3) over the radius, measured ones (B, N, 3) [m] -> (B, N,
-        4, 4).
+        """Return poses.
+
+        Args:
+            columns: (B, N, 6) two columns of the rotation, minus those of the identity.
+            object_point: (B, N, 3) from the center, in radii.
+            point: (B, N, 3) measured, in the camera [m].
+
+        Returns:
+            camera_from_object (B, N, 4, 4).
         """
         # so that zeros are a rotation, not a singularity
         start = columns.new_tensor([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -132,12 +141,11 @@ class _SurfacePointHead(nn.Module):
 
 
 class SurfacePointSixD(_SurfacePointHead):
-    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and which object point the
-    particle's own 3-D point is.
+    """Nine outputs: two columns of the rotation (Zhou et al. 2019), and an object point.
 
-    The translation follows: t = p - R x, p being the measured point in the camera and x the told
-    one in the object. So what is regressed is bounded by the object's size, and independent of
-    where in the room it stands.
+    The translation is t = p - R x, with p the measured point in the camera and x the predicted
+    object point. The regressed values are thus bounded by the object's size and independent of its
+    position.
     """
 
     width = 9
@@ -148,18 +156,20 @@ class SurfacePointSixD(_SurfacePointHead):
 
 
 class SurfacePointFragments(_SurfacePointHead):
-    """The same, but the object point is told as a fragment of the surface and a place in it (EPOS,
-    Hodan 2020).
+    """The same with a distribution over surface fragments (EPOS, Hodan et al. 2020): 6 + 4 K
+    outputs.
 
-    6 + 4 K outputs. One told point answers doubt by the mean of what is possible, which lies inside
-    the object and is nobody's point; shares of fragments can hold several possibilities. The pose
-    is that of the mode.
+    A single point averages over ambiguous points; a distribution over fragments keeps several
+    modes. The pose is that of the most probable fragment.
+
+    Args:
+        fragments: Number of fragments, K.
     """
 
     requires: ClassVar[Capabilities] = ("surface_point_loss",)
 
-    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
-    reach: Tensor  # () their mean reach, over the radius
+    centers: Tensor  # (K, 3) the fragments' centers, from the object's center, in radii
+    reach: Tensor  # () their mean radius, in radii of the object
 
     def __init__(self, fragments: int = 64) -> None:
         super().__init__()
@@ -171,9 +181,7 @@ class SurfacePointFragments(_SurfacePointHead):
         self.register_buffer("reach", torch.ones(()))
 
     def about(self, model: ObjectModel) -> None:
-        """Cut the object into fragments, once: what was learned is about these, whatever points it
-        is judged by later.
-        """
+        """Compute the object's fragments, unless loaded weights have theirs."""
         super().about(model)
         init_fragments(self.centers, self.reach, model.points, model.center, model.radius)
 
@@ -192,9 +200,8 @@ class SurfacePointFragments(_SurfacePointHead):
 
 
 class NoPose(_AnyObject):
-    """No outputs: a detector's particle tells where, not how.
-
-    Its `pose` is unturned, at its own point, for drawing only.
+    """No outputs, for detectors; `pose` has no rotation and lies at the measured point, for
+    figures.
     """
 
     width = 0
@@ -207,8 +214,9 @@ class NoPose(_AnyObject):
 
 
 def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
-    """Fill unknown depth with the mean of what is known near by, else the image's median (1 m where
-    nothing is known).
+    """Fill unknown depth by the mean of known depth near by, else by the image's median.
+
+    An image without depth counts as 1 m deep.
 
     (B, 1, H, W) [m], 0 where unknown -> (B, 1, H, W) [m].
     """
@@ -221,9 +229,8 @@ def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
 
 
 def _window_mean(x: Tensor, size: int) -> Tensor:
-    """Average over a square about each pixel, zeros beyond the frame, an axis at a time.
-
-    (B, C, H, W) -> the same.
+    """Average over a square around each pixel, zeros beyond the frame.  (B, C, H, W) -> the
+    same.
     """
     rows = F.avg_pool2d(x, (size, 1), 1, (size // 2, 0))
     return F.avg_pool2d(rows, (1, size), 1, (0, size // 2))

@@ -1,4 +1,4 @@
-"""Small layers that several networks share."""
+"""Layers that several networks share."""
 
 import math
 
@@ -9,8 +9,8 @@ from posefilter.nets.linear import Linear
 
 
 def fast_bfloat16(device: torch.device) -> bool:
-    """Tell whether bfloat16 is worth while on a device: where the processor only emulates it, it is
-    several times slower.
+    """Return whether the hardware computes in bfloat16 natively; emulation is several times
+    slower.
     """
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -18,7 +18,7 @@ def fast_bfloat16(device: torch.device) -> bool:
 
 
 def fourier(x: Tensor, octaves: int) -> Tensor:
-    """Append sines and cosines of doubling frequencies, the first of period 2.
+    """Append Fourier features: sines and cosines of doubling frequencies, the first of period 2.
 
     (*, D) -> (*, D (1 + 2 octaves)).
     """
@@ -27,9 +27,7 @@ def fourier(x: Tensor, octaves: int) -> Tensor:
 
 
 class ResnetFC(nn.Module):
-    """x + fc(relu(fc(relu(x)))), the last layer starting at zero (Occupancy Networks, Mescheder et
-    al. 2019).
-    """
+    """x + fc(relu(fc(relu(x)))) with a last layer of zeros at first (Mescheder et al. 2019)."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -45,8 +43,8 @@ class ResnetFC(nn.Module):
 def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     """Return a 3 x 3 convolution, batch norm and ReLU.
 
-    Batch norm, since its statistics do not hang on an image's extent: it trains on windows and
-    reads whole images.
+    Batch norm's statistics do not depend on the image's size: training uses crops, evaluation whole
+    images.
     """
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),

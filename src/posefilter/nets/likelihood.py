@@ -1,15 +1,14 @@
-"""The likelihood of a pose: a network judges single image points as the hypothesis would have them,
-and their mean decides.
+"""The likelihood of a pose: a network scores single image points under the hypothesis, and their
+mean is the log-likelihood.
 
-Each pose looks at pixels drawn around its projected origin, lifts them by their depth and carries
-them into its object frame. A point is judged by where it lies there, its color, the viewing ray in
-that frame (so that a surface seen *through* the hypothesis differs from one that hides it) and the
-noise level: one network holds a family, broad to sharp.
+For each pose, pixels are drawn around its projected center, lifted by their depth and mapped into
+its object frame. A point's inputs are its position there, its color, the viewing ray in that frame
+(which tells a surface behind the hypothesis from one in front of it) and the noise level. One
+network thus represents a family of likelihoods, from broad to sharp.
 
-A single pixel says little: red is red on every face. So a point may also be judged by its
-*context*, what the proposal network says there: whether this is the object, how likely the part of
-it that the hypothesis sees there, where exactly, and features of its own choosing that the
-likelihood's loss shapes.
+A single pixel is ambiguous. A point may therefore have *context* too, from the coordinate network
+at its pixel: membership of the object, the probability of the fragment that the hypothesis predicts
+there, the position in it, and features that are trained by the likelihood's loss.
 """
 
 import math
@@ -29,22 +28,22 @@ from posefilter.nets.linear import Linear
 
 
 class Pixels(NamedTuple):
-    """An image laid out for gathering."""
+    """Images, flattened for gathering."""
 
     values: Tensor  # (B, H * W, 4) red, green, blue in [0, 1], z-depth [m] (0 unknown)
     size: tuple[int, int]  # H, W
     intrinsics: Tensor  # (B, 3, 3) [px]
-    context: Context | None = None  # what the proposal network says
+    context: Context | None = None  # output of the coordinate network
 
     def first(self, count: int) -> "Pixels":
-        """Return the first so many images."""
+        """Return the first `count` images."""
         context = None if self.context is None else self.context.first(count)
         return Pixels(self.values[:count], self.size, self.intrinsics[:count], context)
 
 
 class Points(NamedTuple):
-    """The image points that each pose looks at, in that pose's object frame, relative to the
-    object's center.
+    """The image points of each pose, in that pose's object frame, relative to the object's
+    center.
     """
 
     # (B, N, P, 3) [m]; where depth is unknown, the ray's point nearest to the center
@@ -53,15 +52,22 @@ class Points(NamedTuple):
     ray: Tensor  # (B, N, P, 3) unit viewing ray
     known: Tensor  # (B, N, P) bool: depth is known
     inside: Tensor  # (B, N, P) bool: the pixel lies in the frame
-    context: Tensor | None = None  # (B, N, P, 5 + C), as `ask` answers
+    context: Tensor | None = None  # (B, N, P, 5 + C), as returned by `ask`
 
 
 def lay_out(
     rgb: Tensor, depth: Tensor, K: Tensor, coordinates: Coordinates | None = None
 ) -> Pixels:
-    """Lay images out for gathering.  (B, 3, H, W), (B, 1, H, W) [m], (B, 3, 3) -> Pixels.
+    """Flatten images for gathering.
 
-    coordinates: what the proposal network says of them, if it is to be read.
+    Args:
+        rgb: (B, 3, H, W) in [0, 1].
+        depth: (B, 1, H, W) [m].
+        K: (B, 3, 3) camera matrices [px].
+        coordinates: Output of the coordinate network, if points have context.
+
+    Returns:
+        The images.
     """
     H, W = rgb.shape[-2:]
     context = None if coordinates is None else lay_out_context(coordinates, H, W)
@@ -72,11 +78,21 @@ def lay_out(
 def look(
     image: Pixels, poses: Tensor, center: Tensor, radius: float, noise: Tensor, spread: float = 0.6
 ) -> Points:
-    """Gather the pixels that each pose looks at, and carry them into its object frame.
+    """Gather the pixels of each pose, and map them into its object frame.
 
-    poses (B, N, 4, 4); noise (B, 1 or N, P, 2) standard normal: pixels are the projected center +
-    spread x projected radius x noise, rounded. The same noise for every pose of an image makes
-    their scores comparable (common random numbers).
+    Pixels are the projected center + spread x projected radius x noise, rounded. With the same
+    noise for all poses of an image their scores are comparable (common random numbers).
+
+    Args:
+        image: The images.
+        poses: (B, N, 4, 4) camera_from_object [m].
+        center: (3,) the object's center [m].
+        radius: The object's radius [m].
+        noise: (B, 1 or N, P, 2) standard normal.
+        spread: Standard deviation of the pixels, in projected radii.
+
+    Returns:
+        Points (B, N, P).
     """
     H, W = image.size
     K = image.intrinsics
@@ -102,7 +118,7 @@ def look(
     return Points(position, color, F.normalize(ray, dim=-1) @ R, known[..., 0], inside, context)
 
 
-def protocol(x: Tensor) -> Tensor:
+def contract(x: Tensor) -> Tensor:
     """Contract vectors (*, 3) beyond length 2 into the ball of radius 3, as in mip-NeRF 360 (eq.
     10).
     """
@@ -111,12 +127,17 @@ def protocol(x: Tensor) -> Tensor:
 
 
 class PoseLikelihood(nn.Module):
-    """log p(image | pose) at a noise level, up to a constant an image: `scale` x the mean judgement
-    of its points.
+    """log p(image | pose) at a noise level, up to a constant for each image.
 
-    width, blocks: of the residual MLP; octaves: of the position's Fourier features; sigma: the
-    range of noise levels [m]; context: features of the proposal network that a point is judged by,
-    with what it says there; None: by itself alone.
+    It is `scale` x the mean score of the pose's points.
+
+    Args:
+        width: Width of the residual MLP.
+        blocks: Its number of residual blocks.
+        octaves: Of the position's Fourier features.
+        scale: Factor on the mean score.
+        sigma: Lowest and highest noise level [m].
+        context: Features of the coordinate network for each point; None for points without context.
     """
 
     provides: ClassVar[Capabilities] = ("judge_points",)
@@ -141,17 +162,20 @@ class PoseLikelihood(nn.Module):
         self.outside = nn.Sequential(nn.Linear(9, 16), nn.ReLU(), nn.Linear(16, 1))
 
     def level(self, sigma: Tensor) -> Tensor:
-        """Describe noise levels to the network.
-
-        (*) [m] -> (*, 9), from -1 at the sharpest to 1 at the broadest.
+        """Encode noise levels.  (*) [m] -> (*, 9); the first is -1 at the lowest and 1 at the
+        highest.
         """
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
         at = (2 * (sigma.clamp_min(1e-6).log() - low) / (high - low) - 1)[..., None]
         return torch.cat([at, fourier(at / 4, 4)[..., 1:]], dim=-1)
 
     def surroundings(self, points: Points, radius: float) -> Tensor:
-        """Compare what the hypothesis makes of points with what the proposal network says of them.
+        """Return context inputs: the hypothesis compared with the coordinate network's output.
+
         -> (B, N, P, 9 + C).
+
+        Raises:
+            UserError: The points have no context.
         """
         if points.context is None:
             raise UserError(
@@ -163,16 +187,16 @@ class PoseLikelihood(nn.Module):
         )
         error = predicted - points.position / radius
         known = [log_share / 5, torch.sigmoid(logit), logit / 8]
-        return torch.cat([*known, protocol(error), torch.asinh(10 * error), features], dim=-1)
+        return torch.cat([*known, contract(error), torch.asinh(10 * error), features], dim=-1)
 
     def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
-        """Judge points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
-        p = protocol(points.position / radius)
+        """Score points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
+        p = contract(points.position / radius)
         known = points.known[..., None].to(p.dtype)
-        seen = [fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known]
+        inputs = [fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known]
         if self.context is not None:
-            seen.append(self.surroundings(points, radius))
-        x = self.enter(torch.cat(seen, dim=-1))
+            inputs.append(self.surroundings(points, radius))
+        x = self.enter(torch.cat(inputs, dim=-1))
         gain, bias = self.modulate(level)[:, None, None].chunk(2, dim=-1)
         x = torch.addcmul(x + bias, x, gain)
         for block in self.blocks:
@@ -193,16 +217,29 @@ class PoseLikelihood(nn.Module):
         pixels: int,
         generator: Generator,
     ) -> Tensor:
-        """Score poses at noise levels.  poses (B, N, 4, 4), sigma (B,) or () [m] -> (B, N)."""
+        """Score poses at noise levels.
+
+        Args:
+            image: The images.
+            poses: (B, N, 4, 4) camera_from_object [m].
+            sigma: (B,) or () noise level [m].
+            center: (3,) the object's center [m].
+            radius: The object's radius [m].
+            pixels: Image points of each pose.
+            generator: Source of randomness.
+
+        Returns:
+            Log-likelihoods (B, N).
+        """
         B = poses.shape[0]
         noise = torch.randn(B, 1, pixels, 2, generator=generator, device=poses.device)
-        # half a millimeter is lost on a pose in half precision
+        # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
             points = look(image, poses, center, radius, noise)
         level = self.level(sigma.expand(B))
-        judged = torch.where(
+        scores = torch.where(
             points.inside, self.judge(points, level, radius), self.outside(level)[:, None]
         )
-        # [m]: nothing is seen closer than that
+        # penalize centers closer than 0.15 m
         too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])
-        return self.scale * judged.mean(-1) - 200 * too_near
+        return self.scale * scores.mean(-1) - 200 * too_near

@@ -1,6 +1,4 @@
-"""A linear layer that multiplies with oneDNN: MKL, PyTorch's choice for float32, takes twice as
-long on AMD's processors.
-"""
+"""A linear layer that uses oneDNN, which for float32 is faster than MKL on AMD's processors."""
 
 from typing import Any
 
@@ -11,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 
 def has_onednn() -> bool:
-    """Tell whether this build of PyTorch can multiply float32 matrices with oneDNN."""
+    """Return whether this build of PyTorch can multiply float32 matrices with oneDNN."""
     return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
@@ -19,8 +17,8 @@ _ONEDNN = has_onednn()
 
 
 class Linear(nn.Linear):
-    """A linear layer: the same parameters, the same function up to rounding, in less time where
-    oneDNN is there.
+    """nn.Linear computed by oneDNN where available: the same parameters and, up to rounding,
+    outputs.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -32,15 +30,13 @@ class Linear(nn.Linear):
 
 
 def takes_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Tell whether oneDNN is there for these: float32 on the processor, not empty, no autocast to
-    another type.
-    """
+    """Return whether oneDNN applies: float32 on the CPU, not empty, no autocast to another type."""
     plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32 and x.numel() > 0
     return _ONEDNN and plain and not torch.is_autocast_enabled("cpu")
 
 
 class _OneDnnLinear(torch.autograd.Function):
-    """x W^T + b and its gradients, each one product."""
+    """x W^T + b and its gradients, one matrix product each."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
@@ -51,7 +47,7 @@ class _OneDnnLinear(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
-        """Return the gradients that are asked for."""
+        """Return the gradients that are needed."""
         x, weight = ctx.saved_tensors
         of_x, of_weight, of_bias = ctx.needs_input_grad
         return (

@@ -1,6 +1,4 @@
-"""The networks that read one particle: multi-layer perceptrons over a latent, or a small
-convolution net over a patch.
-"""
+"""Networks of one particle: multi-layer perceptrons with a latent, or a small CNN on its patch."""
 
 from typing import ClassVar, NamedTuple
 
@@ -14,20 +12,23 @@ from posefilter.nets.linear import Linear
 
 
 class NetOutput(NamedTuple):
-    """What a particle's network says, before any of it is bounded or given a unit."""
+    """Raw outputs of a particle's network, before heads bound and scale them."""
 
     latent: Tensor  # (B, N, L)
     logit: Tensor  # (B, N) of the likelihood
     displacement: Tensor  # (B, N, 2)
-    pose: Tensor  # (B, N, D), D = 0 where the network tells no pose
+    pose: Tensor  # (B, N, D); D = 0 if the network predicts no pose
 
 
 class ParticleNorm(nn.Module):
-    """Normalize features over every particle of every image of the batch ("batch"), or each
-    particle by itself ("layer").
+    """Normalization of particle features.
 
-    Batch statistics mix images, particles and steps, whose distributions differ; layer statistics
-    do not.
+    "batch" normalizes over all particles of the batch, "layer" each particle by itself. Batch
+    statistics mix images and steps, whose distributions differ.
+
+    Args:
+        kind: "batch" or "layer".
+        width: Number of features.
     """
 
     def __init__(self, kind: str, width: int) -> None:
@@ -42,8 +43,9 @@ class ParticleNorm(nn.Module):
 
 
 class Mlp(nn.Sequential):
-    """Layers over rows: leading axes are folded into one, once: a ReLU in place on a view costs
-    copies of its gradient.
+    """A sequence of layers on rows: leading axes are flattened once.
+
+    An in-place ReLU on a view would copy its gradient.
     """
 
     def forward(self, x: Tensor) -> Tensor:
@@ -62,8 +64,19 @@ def mlp(inputs: int, outputs: int, width: int, layers: int, normalization: str) 
 
 
 class LatentNet(nn.Module):
-    """The paper's figure 3: sight and latent give the next latent; it gives pose and likelihood;
-    all three the displacement.
+    """The paper's figure 3: a recurrent network with a latent for each particle.
+
+    Patch and latent give the next latent; this gives pose and likelihood; all three the
+    displacement.
+
+    Args:
+        extra: Number of context features.
+        size: Side of the patch.
+        pose_width: Outputs of the pose head.
+        latent_width: L.
+        width: Width of hidden layers.
+        layers: Linear layers of each MLP.
+        normalization: "batch" or "layer".
     """
 
     def __init__(
@@ -99,12 +112,16 @@ class LatentNet(nn.Module):
 
 
 class PatchNet(nn.Module):
-    """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, shared by all particles, then
-    offset and likelihood.
+    """The paper's section 4.4: three Conv-BatchNorm-ReLU blocks, then displacement and likelihood.
 
-    With `latent_width` 4 the particle also tells, as its latent, how far the box's four sides lie
-    from it. `hidden` > 0 puts two layers of that width before the outputs, for the context that
-    then joins the patch's features.
+    Args:
+        extra: Number of context features, which join the patch's.
+        size: Side of the patch.
+        pose_width: Must be 0: this network predicts no pose.
+        width: Channels.
+        hidden: Width of two layers before the outputs; 0 for none.
+        latent_width: 4 to predict the distances to the box's four sides as the latent; 0 for none.
+        normalization: "batch" or "layer".
     """
 
     provides: ClassVar[Capabilities] = ("free_latent",)
@@ -122,7 +139,7 @@ class PatchNet(nn.Module):
         super().__init__()
         if pose_width:
             raise UserError(
-                "model/net=patch tells no pose: choose model/pose_head=none, or model/net=latent"
+                "model/net=patch predicts no pose: choose model/pose_head=none, or model/net=latent"
             )
         if width < 1 or min(hidden, latent_width) < 0:
             raise UserError(
@@ -144,7 +161,7 @@ class PatchNet(nn.Module):
         )
 
     def forward(self, patch: Tensor, extra: Tensor, latent: Tensor) -> NetOutput:
-        """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; the latent is written anew, not read."""
-        seen = self.convolve(patch.flatten(0, 1)).flatten(1).unflatten(0, patch.shape[:2])
-        out = self.tell(torch.cat([seen, extra], dim=-1))
+        """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; the previous latent is not used."""
+        features = self.convolve(patch.flatten(0, 1)).flatten(1).unflatten(0, patch.shape[:2])
+        out = self.tell(torch.cat([features, extra], dim=-1))
         return NetOutput(F.softplus(out[..., 3:] - 2), out[..., 0], out[..., 1:3], out[..., :0])

@@ -1,5 +1,5 @@
-"""The paper's likelihood network M (table 1): a scalar for each colored point in the hypothesis's
-object frame.
+"""The paper's likelihood network M (table 1): a score for each colored point in the object
+frame.
 """
 
 from typing import ClassVar
@@ -17,9 +17,13 @@ class PaperLikelihood(nn.Module):
     """The sum of M over a pose's pixels.  M: Linear 6 -> 128, five ResnetFC of 128, Linear 128 ->
     1.
 
-    Knows neither the viewing ray nor a noise level. spread: width of the pixels' Gaussian over the
-    projected radius (not stated in the paper). Pixels outside the frame or without depth add
-    nothing (not stated either).
+    It has no input for viewing ray or noise level. The paper does not specify `spread`, nor pixels
+    off the frame or without depth, which add nothing here.
+
+    Args:
+        width: Width of M.
+        blocks: Its number of residual blocks.
+        spread: Standard deviation of the pixels, in projected radii.
     """
 
     provides: ClassVar[Capabilities] = ("judge_points", "judge_samples")
@@ -32,8 +36,14 @@ class PaperLikelihood(nn.Module):
         )
 
     def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
-        """Judge points (*, 3) in the object frame [m], from the mesh's origin, with colors (*, 3)
-        in [0, 1].  -> (*).
+        """Score points.
+
+        Args:
+            position: (*, 3) in the frame of the mesh [m].
+            color: (*, 3) in [0, 1].
+
+        Returns:
+            Scores (*).
         """
         return self.net(torch.cat([position, color], dim=-1))[..., 0]
 
@@ -55,5 +65,5 @@ class PaperLikelihood(nn.Module):
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)
         with torch.autocast(poses.device.type, enabled=False):
             points = look(image, poses, center, radius, noise, self.spread)
-            judged = self.judge_samples(points.position + center, points.color)
-        return torch.where(points.inside & points.known, judged, 0.0).sum(-1)
+            scores = self.judge_samples(points.position + center, points.color)
+        return torch.where(points.inside & points.known, scores, 0.0).sum(-1)

@@ -1,4 +1,4 @@
-"""Poses that the cells of a proposal network vote for."""
+"""Pose hypotheses from the output of the coordinate network."""
 
 import torch
 from torch import Generator, Tensor
@@ -9,12 +9,10 @@ from posefilter.nets.coordinates import STRIDE, Cells, Coordinates, whole_cells
 
 
 def measure_cells(depth: Tensor, K: Tensor) -> Cells:
-    """Lift each cell's central measured depth to a camera point.  (B, 1, H, W) [m], (B, 3, 3) ->
-    Cells.
+    """Lift one depth pixel of each cell to a camera point.  (B, 1, H, W) [m], (B, 3, 3) -> Cells.
 
-    The median of the four central pixels' known depths would mix surfaces at edges; the
-    largest-depth-first pick of one pixel does not, so a cell takes the known central pixel nearest
-    to its center.
+    It is the first known one of the cell's four central pixels. Their median would mix surfaces at
+    depth edges.
     """
     depth = whole_cells(depth)
     B, _, H, W = depth.shape
@@ -49,10 +47,21 @@ def draw_poses(
     generator: Generator,
     votes: int = 3,
 ) -> Tensor:
-    """Draw poses from cells' votes, each believed as far as it is the object.  -> (B, count, 4, 4)
-    camera_from_object [m].
+    """Draw poses by rigid fits to a few cells each, weighted by the probability of the object.
 
-    Where no cell of an image has a known depth the poses mean nothing.
+    The poses of an image without valid depth are arbitrary.
+
+    Args:
+        coordinates: Output of the coordinate network.
+        cells: Measured points.
+        center: (3,) the object's center [m].
+        radius: The object's radius [m].
+        count: Number of poses.
+        generator: Source of randomness.
+        votes: Points of a fit, besides the first.
+
+    Returns:
+        Poses (B, count, 4, 4), camera_from_object [m].
     """
     share, position = coordinates.log_share.exp().flatten(1, 2), coordinates.position.flatten(1, 2)
     weight = (torch.sigmoid(coordinates.logit).flatten(1) + 1e-4) * cells.valid.flatten(1)

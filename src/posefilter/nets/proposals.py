@@ -1,6 +1,4 @@
-"""The proposal network: it tells for each cell of the image whether it shows the object, and which
-point of it.
-"""
+"""The coordinate network: for each cell, is it the object, and which point of it?"""
 
 from typing import ClassVar
 
@@ -15,17 +13,19 @@ from posefilter.nets.layers import ResBlock
 
 
 class ObjectCoordinateNet(UNet):
-    """A U-Net with residual blocks: color at full resolution, geometry (normals, depth, rays) at
-    half of it.
+    """A U-Net with residual blocks; color at full resolution, geometry (normals, depth, rays) at
+    half.
 
-    widths: channels at strides 4, 8, 16 and 32; fragments: parts of the surface that cells are told
-    apart by; features: of each cell, for the likelihood's use.
+    Args:
+        widths: Channels at strides 4, 8, 16 and 32.
+        fragments: Number of surface fragments, K.
+        features: Further features of each cell, for the likelihood.
     """
 
     provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "relevance")
 
-    centers: Tensor  # (K, 3) the fragments' middles, over the radius, from the object's center
-    reach: Tensor  # () their mean reach, over the radius
+    centers: Tensor  # (K, 3) the fragments' centers, from the object's center, in radii
+    reach: Tensor  # () their mean radius, in radii of the object
 
     def __init__(
         self,
@@ -60,9 +60,11 @@ class ObjectCoordinateNet(UNet):
         )
 
     def set_object(self, points: Tensor, center: Tensor, radius: float) -> None:
-        """Cut an object into fragments, once: what was learned is about these, whatever points it
-        is judged by later.
+        """Compute the object's fragments, unless loaded weights have theirs.
 
-        (P, 3) surface points [m], (3,) and half the diagonal of its bounding box [m].
+        Args:
+            points: (P, 3) surface points [m].
+            center: (3,) the object's center [m].
+            radius: Half the diagonal of its bounding box [m].
         """
         init_fragments(self.centers, self.reach, points, center, radius)

@@ -1,5 +1,5 @@
-"""ResNet-18 and -34 (He et al. 2016) with torchvision's parameter names, so that its weight files
-load as they are.
+"""ResNet-18 and -34 (He et al. 2016) with torchvision's parameter names, to load its weight
+files.
 """
 
 from pathlib import Path
@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from posefilter.errors import UserError
 
 DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
-# of ImageNet's colors, that published weights expect
+# statistics of ImageNet's colors, which published weights expect
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class BasicBlock(nn.Module):
-    """Two 3 x 3 convolutions and a skip."""
+    """Two 3 x 3 convolutions and a skip connection."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -36,11 +36,13 @@ class BasicBlock(nn.Module):
 
 
 class ResNet(nn.Module):
-    """The trunk of a ResNet, with a second, new stem through which geometry joins at stride 2.
+    """The trunk of a ResNet, with a second stem by which geometry enters at stride 2.
 
-    kind: resnet18 or resnet34; weights: None (chance), a file, or an address that torch.hub can
-    fetch. frozen: the trunk's own weights and statistics stay as loaded, only the geometry stem
-    learns. The classifier (`fc`) of a file is not used.
+    Args:
+        kind: "resnet18" or "resnet34".
+        weights: A state dict's file or URL, whose classifier (`fc`) is ignored; None for random
+            weights.
+        frozen: Train the geometry stem only; batch statistics stay as loaded.
     """
 
     channels = (64, 128, 256, 512)
@@ -87,7 +89,7 @@ class ResNet(nn.Module):
         return self
 
     def forward(self, rgb: Tensor, geometry: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) in [0, 1], (B, 7, H / 2, W / 2), rounded up -> maps of strides 4, 8, 16, 32."""
+        """(B, 3, H, W) in [0, 1], (B, 7, H / 2, W / 2) rounded up -> maps of strides 4 to 32."""
         x = self.conv1((rgb - self.mean) / self.std)
         x = torch.relu(self.bn1(x + self.geometry(geometry)))
         x = torch.max_pool2d(x, 3, stride=2, padding=1)
@@ -99,8 +101,10 @@ class ResNet(nn.Module):
 
 
 def load_trunk(trunk: ResNet, weights: str) -> None:
-    """Load a torchvision ResNet's state dict, from a file or an address; every trunk weight must be
-    there and fit.
+    """Load a torchvision ResNet's state dict from a file or URL.
+
+    Raises:
+        UserError: It cannot be read, or its parameters do not match the trunk.
     """
     if weights.startswith(("http://", "https://")):
         try:
@@ -120,9 +124,9 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
         state = torch.load(weights, map_location="cpu", weights_only=True)
     own = {name for name in trunk.state_dict() if not name.startswith("geometry.")}
     missing = sorted(own - state.keys())
-    strange = sorted(name for name in state.keys() - own if not name.startswith("fc."))
-    if missing or strange:
-        name = (missing or strange)[0]
+    unexpected = sorted(name for name in state.keys() - own if not name.startswith("fc."))
+    if missing or unexpected:
+        name = (missing or unexpected)[0]
         what = "lacks" if missing else "has the unexpected"
         raise UserError(
             f"model.encoder.trunk.weights={weights}: {what} {name}; is it another network "
