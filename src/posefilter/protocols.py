@@ -156,7 +156,7 @@ class Reweight(Protocol):
         log evidence.
 
         log_weights (B, N), normalized: what the particles start the step with; log_likelihood (B,
-        N): measured at this step; inherited (B, N): the log_likelihood of each one's ancestor at the
+        N): measured at this step; inherited (B, N): the log_likelihood of its ancestor at the
         step before (zeros at the first).
         """
         ...
