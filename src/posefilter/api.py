@@ -11,7 +11,6 @@ from posefilter.cli.components import changes
 from posefilter.cli.job import Job
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
-from posefilter.weights import find_weights
 
 if TYPE_CHECKING:
     from posefilter.data.module import PoseDataModule
@@ -43,7 +42,7 @@ def load(
     """
     wanted = changes(compose(overrides, "predict")) if overrides else {}
     several = [weights] if isinstance(weights, str | Path) else list(weights)
-    methods = [method_of(read_checkpoint(find_weights(one)), wanted) for one in several]
+    methods = [method_of(read_checkpoint(one), wanted) for one in several]
     return Estimator(methods, device)
 
 

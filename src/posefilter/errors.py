@@ -5,6 +5,8 @@ for a user's wish to stop.
 from pathlib import Path
 from signal import Signals
 
+MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130  # exit statuses
+
 
 class UserError(Exception):
     """A mistake in data, configuration or arguments.

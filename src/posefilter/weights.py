@@ -1,9 +1,17 @@
-"""Find trained weights by path or by name."""
+"""Find trained weights by path or by name, and fetch those that are elsewhere."""
 
+import os
 from pathlib import Path
+from urllib.parse import urlparse
 
 from posefilter.errors import UserError
+from posefilter.paths import is_plain_name
 
+# the address of a folder of weights with a registry.txt: lines of `<name>.ckpt sha256:<digest>`
+URL = "POSEFILTER_WEIGHTS_URL"
+# where what was fetched is kept; unset: the system's place for caches
+CACHE = "POSEFILTER_CACHE"
+_REGISTRY, _TIMEOUT = "registry.txt", 30  # [s]
 _HERE = Path(__file__).parent
 # of an installed wheel, and of a clone
 FOLDERS = (_HERE / "weights", _HERE.parents[1] / "weights")
@@ -12,26 +20,68 @@ FOLDERS = (_HERE / "weights", _HERE.parents[1] / "weights")
 def find_weights(weights: str | Path | None) -> Path:
     """Return the checkpoint that a path or a name stands for.
 
+    A name is looked up among the weights that ship, then in the cache and at the address in the
+    environment variable POSEFILTER_WEIGHTS_URL, if it is set.
+
     Args:
-        weights: A checkpoint, a run's folder, or the name of weights that ship with posefilter,
-            such as `003_cracker_box`.
+        weights: A checkpoint, a run's folder, or a name such as `003_cracker_box`.
 
     Raises:
-        UserError: There is no such file, and no weights of that name.
+        UserError: There is no such file, and no weights of that name; or they cannot be fetched.
     """
     if weights is None or not str(weights):
         raise UserError(
-            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or a name such as "
-            "003_cracker_box"
+            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
         )
-    path = Path(weights)
+    path, name = Path(weights), str(weights)
     if path.exists():
         return path
-    known = sorted(
-        {file.stem: file for folder in FOLDERS for file in folder.glob("*.ckpt")}.items()
-    )
-    for name, file in known:
-        if name == str(weights):
-            return file
-    names = ", ".join(name for name, _ in known) or "none"
-    raise UserError(f"checkpoint={weights}: no such file, and no weights of that name ({names})")
+    shipped = {file.stem: file for folder in FOLDERS for file in folder.glob("*.ckpt")}
+    if name in shipped:
+        return shipped[name]
+    url = os.environ.get(URL, "")
+    if url and is_plain_name(name) and not path.suffix:
+        return fetch_weights(name, url)
+    known = ", ".join(sorted(shipped)) or "none"
+    raise UserError(f"checkpoint={weights}: no such file, and no weights of that name ({known})")
+
+
+def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
+    """Return weights from the cache, or download them there and check their SHA-256.
+
+    Args:
+        name: Their name, without `.ckpt`.
+        url: The address of the folder that holds them and a `registry.txt`.
+        cache: Where to keep them; None: POSEFILTER_CACHE, else the system's place for caches.
+
+    Raises:
+        UserError: The address cannot be reached, does not list the name, or sends something else.
+    """
+    import pooch  # with requests, half a second
+    import requests
+
+    if urlparse(url).scheme not in ("http", "https"):
+        raise UserError(f"{URL}={url}: only http and https addresses can be fetched")
+    url = url.rstrip("/") + "/"
+    folder = Path(cache or os.environ.get(CACHE) or pooch.os_cache("posefilter"))
+    folder.mkdir(parents=True, exist_ok=True)
+    loader = pooch.HTTPDownloader(timeout=_TIMEOUT)
+    index = folder / _REGISTRY
+    try:
+        loader(url + _REGISTRY, str(index), None)
+        keeper = pooch.create(folder, url, retry_if_failed=2)
+        keeper.load_registry(index)
+        file = f"{name}.ckpt"
+        if file not in keeper.registry:
+            names = ", ".join(sorted(keeper.registry)) or "nothing"
+            raise UserError(f"checkpoint={name}: {url} lists {names}")
+        if not keeper.registry[file].startswith("sha256:"):
+            raise UserError(f"{url}{_REGISTRY}: gives no sha256 of {file}")
+        return Path(keeper.fetch(file, downloader=loader))
+    except (requests.RequestException, ConnectionError) as error:
+        raise UserError(
+            f"checkpoint={name}: {url} cannot be fetched ({type(error).__name__})"
+        ) from error
+    except (ValueError, OSError) as error:
+        reason = str(error).splitlines()[0][:200]
+        raise UserError(f"checkpoint={name}: {url} sent something else ({reason})") from error

@@ -26,12 +26,11 @@ ROUTES: dict[str, dict[str, Any]] = {
     "posefilter.cli.results.write_json": {"path": "{secret}/x", "content": 1},
     "posefilter.limits.read_bytes": {"path": "{secret}/file.txt"},
     "posefilter.meshes.files.trimesh.load": {"file_obj": "{secret}/file.txt"},
-    "posefilter.data.download.fetch": {
+    "posefilter.weights.fetch_weights": {
+        "name": "x",
         "url": "http://127.0.0.1:9/x",
-        "path": "{secret}/x",
-        "retries": 0,
+        "cache": "{secret}/x",
     },
-    "posefilter.data.download.unpack": {"archive": "{secret}/file.txt", "folder": "{secret}/x"},
     "posefilter.nets.resnet.torch.load": {"f": "{secret}/file.txt", "weights_only": False},
     "posefilter.nets.resnet.torch.hub.load": {
         "repo_or_dir": "{secret}",

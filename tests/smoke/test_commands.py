@@ -316,7 +316,7 @@ def test_plain_is_for_machines(
     )
     out, err = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
-    assert [line["event"] for line in lines] == ["validation", "trained"]
+    assert [line["event"] for line in lines] == ["started", "validation", "trained"]
     assert lines[-1]["iou"] == read(tmp_path / "run")["iou"]
     assert all(Path(path).exists() for path in lines[-1]["files"].values())
     assert err == ""

@@ -17,6 +17,7 @@ from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
+from posefilter.weights import find_weights
 
 _SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
 
@@ -64,11 +65,7 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
     Raises UserError where the path holds none, and where what it holds could do harm (see `archive`
     and `recipe`).
     """
-    if not path:
-        raise UserError(
-            "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
-        )
-    file = Path(path)
+    file = find_weights(path)
     if file.is_dir():
         file = file / "checkpoints" / "best.ckpt"
     if not file.is_file():

@@ -20,21 +20,28 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from posefilter.cli.ablations import register_ablations
 from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
-from posefilter.cli.console import JSON, logging_for, settle_logging
+from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
+from posefilter.cli.main import COMMANDS
+from posefilter.cli.preflight import check_files
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import Scope, trust
-from posefilter.errors import ProblemsFound, Stopped, UserError
+from posefilter.errors import (
+    FAILURE,
+    INTERRUPTED,
+    MISTAKE,
+    ProblemsFound,
+    Stopped,
+    UserError,
+)
 from posefilter.paths import find_conf
 
-COMMANDS = ("train", "evaluate", "predict", "generate", "check_data", "report", "export")
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
 _FAILED = (FloatingPointError, ProblemsFound)  # nothing is wrong with the command line
-MISTAKE, FAILURE, INTERRUPTED = 2, 1, 130
 _MULTIRUN = ("-m", "--multirun")
 
 
@@ -83,12 +90,16 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
 
     def task(cfg: DictConfig) -> Any:
         job = job_of(cfg)
-        settle_logging(job.cfg.get("console", JSON))
+        console = job.cfg.get("console", JSON)
+        settle_logging(console)
         try:
             check_settings(cfg)
             use_plugins(cfg)
+            check_files(name, cfg)
             if name == "train":
                 check_fit(cfg, job.choices, Scope.CONFIG)
+            if not job.swept:  # before torch is imported, which takes seconds
+                say(console, "started", f"{name}: starting", command=name, folder=str(job.folder))
             work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
             return work(job)
         except EXPECTED as error:

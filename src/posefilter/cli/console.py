@@ -63,12 +63,16 @@ def show_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def typed(command: str, **settings: Any) -> str:
-    """Return a command line that survives the shell and Hydra: `python train.py data.root=DIR`;
-    `__` stands for a dot.
+    """Return a command line that survives the shell and Hydra: `python train.py data.root=DIR`, or
+    `posefilter train ...` where that was typed; `__` stands for a dot.
     """
-    return " ".join(
-        [f"python {command}.py", *(setting(k.replace("__", "."), v) for k, v in settings.items())]
-    )
+    program = f"posefilter {command}" if is_installed() else f"python {command}.py"
+    return " ".join([program, *(setting(k.replace("__", "."), v) for k, v in settings.items())])
+
+
+def is_installed() -> bool:
+    """Tell whether the console command `posefilter` was typed, rather than a script of a clone."""
+    return Path(sys.argv[0]).name in ("posefilter", "posefilter.exe", "__main__.py")
 
 
 def setting(key: str, value: Any) -> str:

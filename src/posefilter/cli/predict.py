@@ -21,7 +21,6 @@ from posefilter.figures.recording import check_viewer, record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
-from posefilter.weights import find_weights
 
 VIEW = "view.rrd"
 _FRAME = (
@@ -39,13 +38,8 @@ def predict(job: Job) -> None:
     cfg, folder = job.cfg, job.folder
     settle(cfg.threads, cfg.seed)
     check_view(cfg.view)
-    method = method_of(read_checkpoint(find_weights(cfg.checkpoint)), changes(cfg))
+    method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg))
     estimator = Estimator([method])
-    for key in ("rgb", "depth", "intrinsics"):
-        if cfg[key] is None:
-            raise UserError(
-                f"{key}: is missing; predict needs rgb=, depth= and intrinsics=fx,fy,cx,cy"
-            )
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None

@@ -1,0 +1,7 @@
+"""`python -m posefilter COMMAND ...`."""
+
+import sys
+
+from posefilter.cli.main import main
+
+sys.exit(main())

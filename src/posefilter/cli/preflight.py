@@ -1,0 +1,58 @@
+"""Whether the files that a command is told to read are there; torch is not needed for it."""
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from posefilter.errors import UserError
+from posefilter.weights import find_weights
+
+# by command: settings that name a file to be read
+_FILES = {"predict": ("rgb", "depth"), "evaluate": ("estimates",)}
+# by command: settings that name a folder to be read
+_FOLDERS = {
+    "check_data": ("data.root", "meshes"),
+    "evaluate": ("data.root", "data.meshes"),
+    "generate": ("meshes",),
+    "predict": ("meshes",),
+    "report": ("run", "sweep_folder"),
+    "train": ("data.root", "data.meshes"),
+}
+_SHOWN = {"sweep_folder": "sweep"}  # as it is typed
+_NEEDED = {"predict": ("rgb", "depth", "intrinsics")}
+
+
+def check_files(command: str, cfg: DictConfig) -> None:
+    """Check what a command is to read before torch is imported, which takes seconds.
+
+    Args:
+        command: The command's name, such as `predict`.
+        cfg: Its settings.
+
+    Raises:
+        UserError: A file or folder is missing; the message names the setting.
+    """
+    if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
+        find_weights(cfg.checkpoint)
+    for key in _NEEDED.get(command, ()):
+        if cfg[key] is None:
+            raise UserError(
+                f"{key}: is missing; predict needs rgb=, depth= and intrinsics=fx,fy,cx,cy"
+            )
+    for key in _FILES.get(command, ()):
+        if cfg[key] is not None and not Path(str(cfg[key])).is_file():
+            raise UserError(f"{key}={cfg[key]}: no such file")
+    for key in _FOLDERS.get(command, ()):
+        folder = _select(cfg, key)
+        if folder is None or folder == "builtin" or Path(str(folder)).is_dir():
+            continue
+        if key == "data.root" and _select(cfg, "data.generate") is not None:
+            continue  # it is rendered
+        raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+
+
+def _select(cfg: Any, key: str) -> Any:
+    for part in key.split("."):
+        cfg = cfg.get(part) if isinstance(cfg, DictConfig) else None
+    return cfg

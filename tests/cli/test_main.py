@@ -1,0 +1,91 @@
+"""The console command: the same commands by another name; a mistake is told before torch is
+imported.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import posefilter
+from posefilter.cli.main import COMMANDS, main
+
+HOME = Path(__file__).parents[2]
+# what takes seconds to import, and is not needed to refuse a setting
+HEAVY = ("torch", "lightning", "torchmetrics", "matplotlib", "scipy", "cv2", "trimesh")
+REFUSED = {
+    "train filter.particels=5": "filter.particels: there is no such setting; did you mean",
+    "train model=pose_fp": "model=pose_fp: there is no such choice; did you mean",
+    "train data=fat data.root=nowhere": "data.root=nowhere: no such folder",
+    "train resume=nowhere": "resume=nowhere: not a run's folder",
+    "train seed=many": "seed=many: must be a whole number",
+    "train plugins=[no_such_package]": "there is no package 'no_such_package'",
+    "evaluate checkpoint=nowhere.ckpt": "checkpoint=nowhere.ckpt: no such file",
+    "evaluate estimates=nowhere.csv": "estimates=nowhere.csv: no such file",
+    "predict": "checkpoint: is missing",
+    "predict checkpoint=003_cracker_box": "rgb: is missing",
+    "predict checkpoint=003_cracker_box rgb=a.png depth=b.png intrinsics=1,1,1,1": "rgb=a.png: no",
+    "generate meshes=nowhere": "meshes=nowhere: no such folder",
+    "check_data meshes=nowhere": "meshes=nowhere: no such folder",
+    "report run=nowhere": "run=nowhere: no such folder",
+    "export checkpoint=004_sugar_box": "no weights of that name (003_cracker_box",
+    "fly": "fly: there is no such command; choose train, evaluate",
+}
+_PROGRAM = """
+import sys
+from posefilter.cli.main import main
+status = main({arguments!r}.split())
+heavy = set({heavy!r}) & set(sys.modules)
+assert status == 2, status
+assert not heavy, heavy
+"""
+
+
+@pytest.mark.parametrize("arguments", REFUSED)
+def test_a_mistake_is_one_line_before_torch_is_imported(arguments: str, tmp_path: Path) -> None:
+    program = _PROGRAM.format(arguments=arguments, heavy=HEAVY)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert REFUSED[arguments] in lines[0]
+    assert done.stdout == ""
+
+
+def test_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in ([], ["--help"]):
+        assert main(arguments) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split()[0] for line in lines[1:]] == list(COMMANDS)
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"posefilter {posefilter.__version__}\n"
+
+
+def test_each_command_has_its_script_and_its_settings() -> None:
+    for name in COMMANDS:
+        script = (HOME / f"{name}.py").read_text()
+        assert f'run_command("{name}")' in script
+        assert len(script.splitlines()) <= 12
+        assert (HOME / "conf" / f"{name}.yaml").is_file()
+
+
+def test_a_command_says_something_before_torch_is_imported(tmp_path: Path) -> None:
+    """The first line of a report, which fails later: its folder holds no run."""
+    program = (
+        "import sys\n"
+        "class Out:\n"
+        "    def write(self, text):\n"
+        "        assert 'torch' not in sys.modules or not text.startswith('report: starting')\n"
+        "        sys.stderr.write(text)\n"
+        "    def flush(self): pass\n"
+        "sys.stdout = Out()\n"
+        "from posefilter.cli.main import main\n"
+        f"main(['report', 'run={tmp_path}'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert done.stderr.splitlines()[0] == "report: starting"

@@ -1,0 +1,139 @@
+"""Weights by name: from a server on this machine that cuts connections, lies or refuses."""
+
+import hashlib
+import http.server
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.weights import FOLDERS, fetch_weights, find_weights
+
+CONTENT = np.random.default_rng(0).bytes(300_000)
+SHA = hashlib.sha256(CONTENT).hexdigest()
+
+
+class Server(http.server.ThreadingHTTPServer):
+    """Serves `registry.txt` and one file of weights."""
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.asked: list[str] = []
+        self.cuts: list[int] = []  # after how many bytes to cut each of the next files
+        self.status, self.registry = 0, f"duck.ckpt sha256:{SHA}\n"
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_address[1]}/weights"
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:
+        self.server.asked.append(self.path)
+        if self.server.status:
+            self.send_error(self.server.status)
+            return
+        index = self.path.endswith("registry.txt")
+        body = self.server.registry.encode() if index else CONTENT
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        cut = len(body) if index or not self.server.cuts else self.server.cuts.pop(0)
+        self.wfile.write(body[:cut])
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    """Return a server that runs until the test's end."""
+    server = Server()
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield server
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def test_a_path_is_taken_as_it_is_and_a_name_is_found_among_what_ships(tmp_path: Path) -> None:
+    own = tmp_path / "own.ckpt"
+    own.touch()
+    assert find_weights(own) == own
+    assert find_weights(tmp_path) == tmp_path
+    assert find_weights("003_cracker_box") in [f / "003_cracker_box.ckpt" for f in FOLDERS]
+    assert find_weights("003_cracker_box").is_file()
+
+
+def test_a_name_elsewhere_is_fetched_once(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("POSEFILTER_WEIGHTS_URL", server.url)
+    monkeypatch.setenv("POSEFILTER_CACHE", str(tmp_path))
+    path = find_weights("duck")
+    assert path == tmp_path / "duck.ckpt"
+    assert path.read_bytes() == CONTENT
+    assert find_weights("duck") == path
+    assert server.asked.count("/weights/duck.ckpt") == 1
+
+
+def test_a_cut_connection_is_tried_again_and_leaves_no_half_file(
+    server: Server, tmp_path: Path
+) -> None:
+    server.cuts = [1000]
+    assert fetch_weights("duck", server.url, tmp_path).read_bytes() == CONTENT
+    assert server.asked.count("/weights/duck.ckpt") == 2
+    server.cuts = [10] * 9
+    with pytest.raises(UserError, match="checkpoint=duck"):
+        fetch_weights("duck", server.url, tmp_path / "other")
+    assert not (tmp_path / "other" / "duck.ckpt").exists()
+
+
+def test_another_checksum_is_refused_and_nothing_is_kept(server: Server, tmp_path: Path) -> None:
+    server.registry = f"duck.ckpt sha256:{'0' * 64}\n"
+    with pytest.raises(UserError, match="sent something else") as caught:
+        fetch_weights("duck", server.url, tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("*.ckpt"))
+
+
+def test_a_damaged_file_in_the_cache_is_fetched_anew(server: Server, tmp_path: Path) -> None:
+    (tmp_path / "duck.ckpt").write_bytes(CONTENT[:-1])
+    assert fetch_weights("duck", server.url, tmp_path).read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("registry", "status", "told"),
+    [
+        ("goose.ckpt sha256:00\n", 0, "lists goose.ckpt"),
+        (f"duck.ckpt md5:{'0' * 32}\n", 0, "gives no sha256"),
+        ("a b c d\n", 0, "sent something else"),
+        ("", 404, "cannot be fetched"),
+        ("", 500, "cannot be fetched"),
+    ],
+)
+def test_what_cannot_be_fetched_is_told_in_one_line(
+    server: Server, tmp_path: Path, registry: str, status: int, told: str
+) -> None:
+    server.registry, server.status = registry, status
+    with pytest.raises(UserError, match=told) as caught:
+        fetch_weights("duck", server.url, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_the_web_is_asked_and_only_for_names(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UserError, match="only http and https"):
+        fetch_weights("duck", f"file://{tmp_path}", tmp_path)
+    monkeypatch.setenv("POSEFILTER_WEIGHTS_URL", server.url)
+    for name in ("../duck", "a/b", ".duck", "outputs/runs/x/best.ckpt"):
+        with pytest.raises(UserError, match="no such file"):
+            find_weights(name)
+    assert server.asked == []

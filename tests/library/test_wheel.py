@@ -1,0 +1,52 @@
+"""The wheel holds all that an installed copy needs; `.ci/wheel` runs it."""
+
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+HOME = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """Build the wheel from a copy of the sources, and return what is in it."""
+    pytest.importorskip("setuptools", minversion="69")
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for folder in ("src", "conf", "weights"):
+        ignored = shutil.ignore_patterns("*.egg-info", "__pycache__")
+        shutil.copytree(HOME / folder, source / folder, ignore=ignored)
+    for file in ("setup.py", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE"):
+        shutil.copy(HOME / file, source)
+    build = [sys.executable, "-m", "pip", "wheel", str(source), "--no-deps", "--quiet"]
+    subprocess.run([*build, "--no-build-isolation", "-w", str(out)], check=True)
+    (wheel,) = out.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
+def test_every_file_that_is_read_is_in_the_wheel(names: set[str]) -> None:
+    expected = {
+        f"posefilter/{file.relative_to(HOME)}"
+        for pattern in ("conf/**/*.yaml", "weights/*.ckpt")
+        for file in HOME.glob(pattern)
+    }
+    assert len(expected) > 50
+    package = HOME / "src"
+    expected |= {
+        str(file.relative_to(package))
+        for pattern in ("*.py", "py.typed", "templates/*")
+        for file in (package / "posefilter").rglob(pattern)
+    }
+    assert expected <= names
+
+
+def test_nothing_else_is_installed(names: set[str]) -> None:
+    assert {name.split("/")[0] for name in names} == {
+        "posefilter",
+        f"posefilter-{version('posefilter')}.dist-info",
+    }
