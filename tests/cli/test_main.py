@@ -2,6 +2,7 @@
 imported.
 """
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,7 @@ REFUSED = {
     "export checkpoint=004_sugar_box": "no weights of that name (003_cracker_box",
     "fly": "fly: there is no such command; choose train, evaluate",
 }
+OWN = {**os.environ, "PYTHONPATH": str(HOME / "src")}  # wherever it is started
 _PROGRAM = """
 import sys
 from posefilter.cli.main import main
@@ -46,7 +48,12 @@ assert not heavy, heavy
 def test_a_mistake_is_one_line_before_torch_is_imported(arguments: str, tmp_path: Path) -> None:
     program = _PROGRAM.format(arguments=arguments, heavy=HEAVY)
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=OWN,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()
@@ -86,6 +93,11 @@ def test_a_command_says_something_before_torch_is_imported(tmp_path: Path) -> No
         f"main(['report', 'run={tmp_path}'])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=tmp_path
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=OWN,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stderr.splitlines()[0] == "report: starting"

@@ -1,6 +1,7 @@
 """The library answers as the command does, on the weights and scenes that ship."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -185,7 +186,8 @@ def test_import_takes_neither_torch_nor_hydra_and_every_public_name_is_there() -
         "missing = [n for n in dir(posefilter) if not hasattr(posefilter, n)]; "
         "assert not missing and dir(posefilter), missing"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=HOME)
+    own = {**os.environ, "PYTHONPATH": str(HOME / "src")}
+    subprocess.run([sys.executable, "-c", program], check=True, env=own)
 
 
 def test_every_public_name_is_documented() -> None:

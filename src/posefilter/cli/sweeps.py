@@ -11,8 +11,6 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from posefilter.cli.console import JSON, ended, typed
-from posefilter.report.summary import draw_summary
-from posefilter.report.sweeps import COLUMNS, read_sweep
 
 Row = dict[str, Any]
 
@@ -40,6 +38,9 @@ def summarize(folder: Path) -> list[Row]:
     """Write the three files of a sweep's folder; returns its rows, none where no job has ended yet."""
     if not any(folder.glob("*/**/metrics.json")):
         return []
+    from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run
+    from posefilter.report.sweeps import COLUMNS
+
     rows, axes = read_rows(folder)
     names = [
         *axes,
@@ -59,6 +60,8 @@ def summarize(folder: Path) -> list[Row]:
 
 def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     """Return a row a job that has ended, and the settings in which the jobs differ."""
+    from posefilter.report.sweeps import COLUMNS, read_sweep
+
     sweep = read_sweep(folder)
     rows: list[Row] = []
     for job in sweep.jobs:

@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.comparing import HANDS, comparable, differing
-from posefilter.cli.console import JSON, say, typed
+from posefilter.cli.console import JSON, is_installed, say, typed
 from posefilter.cli.files import WholeCheckpoints
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
@@ -82,7 +82,7 @@ def train(job: Job) -> float:
         else [
             typed("report", run=job.folder),
             typed("evaluate", checkpoint=best, **places(job)),
-            "make board",
+            "tensorboard --logdir outputs" if is_installed() else "make board",
         ]
     )
     show(
