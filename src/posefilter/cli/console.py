@@ -72,7 +72,8 @@ def typed(command: str, **settings: Any) -> str:
 
 def is_installed() -> bool:
     """Tell whether the console command `posefilter` was typed, rather than a script of a clone."""
-    return Path(sys.argv[0]).name in ("posefilter", "posefilter.exe", "__main__.py")
+    typed = Path(sys.argv[0])
+    return typed.stem == "posefilter" or typed.parts[-2:] == ("posefilter", "__main__.py")
 
 
 def setting(key: str, value: Any) -> str:

@@ -2,8 +2,8 @@
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 
-from posefilter import __version__
 from posefilter.errors import MISTAKE
 
 COMMANDS = {
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_USAGE, *(f"  {name:{width}}  {what}" for name, what in COMMANDS.items()), sep="\n")
         return 0
     if given[0] == "--version":
-        print(f"posefilter {__version__}")
+        print(f"posefilter {version('posefilter')}")
         return 0
     name = given[0].removesuffix(".py").replace("-", "_")
     if name not in COMMANDS:
