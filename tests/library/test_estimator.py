@@ -162,7 +162,7 @@ def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(posefilter.UserError, match="did you mean 'particles'"):
         posefilter.load(NAME, overrides=["filter.particle=3"])
     with pytest.raises(posefilter.UserError, match="there is no such choice"):
-        posefilter.load(NAME, overrides=["refine=nothing"])
+        posefilter.load(NAME, overrides=["filter/refine=nothing"])
 
 
 def test_a_configuration_is_composed_and_built() -> None:
