@@ -64,19 +64,19 @@ def test_what_it_imports_is_not(name: str, package: str) -> None:
 def test_some_packages_cannot_be_plug_ins(name: str, package: str) -> None:
     with pytest.raises(UserError, match="plugins="):
         trust.trust(name)
-    assert trust.trusted() == trust._installed()
+    assert trust.trusted() == trust.installed()
 
 
 def test_an_installed_entry_point_is_trusted(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Point:
         value = "my_plugin"
 
-    trust._installed.cache_clear()
+    trust.installed.cache_clear()
     monkeypatch.setattr(
         trust, "entry_points", lambda group: [Point()] if group == "posefilter.plugins" else []
     )
     assert trust.is_plugin("my_plugin.pieces.Own")
-    trust._installed.cache_clear()
+    trust.installed.cache_clear()
 
 
 def test_the_command_line_names_them(

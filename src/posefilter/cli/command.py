@@ -28,7 +28,7 @@ from posefilter.cli.main import COMMANDS
 from posefilter.cli.preflight import check_files
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
-from posefilter.cli.trust import Scope, trust
+from posefilter.cli.trust import Scope, installed, trust
 from posefilter.errors import (
     FAILURE,
     INTERRUPTED,
@@ -112,19 +112,18 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
 
 
 def use_plugins(cfg: DictConfig) -> None:
-    """Trust the packages that the user names in `plugins`, and import them.
+    """Trust the packages that the user names in `plugins`; import them, and installed plug-ins.
 
     Raises UserError where one is not there.
     """
-    named = cfg.get("plugins")
-    if named is None:
-        return
+    named = cfg.get("plugins") or ListConfig([])
     if not isinstance(named, ListConfig):
         raise UserError(
             f"plugins={named}: must be a list of packages, such as plugins=[my_package]"
         )
     for package in named:
         trust(package)
+    for package in (*named, *installed()):  # they may register readers
         try:
             importlib.import_module(package)
         except ModuleNotFoundError as error:

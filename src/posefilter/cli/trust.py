@@ -113,11 +113,12 @@ def trust(package: str) -> None:
 
 def trusted() -> frozenset[str]:
     """Return the plug-ins that the user trusts, installed ones included."""
-    return frozenset(_trusted) | _installed()
+    return frozenset(_trusted) | installed()
 
 
 @cache
-def _installed() -> frozenset[str]:
+def installed() -> frozenset[str]:
+    """Return the packages of installed plug-ins."""
     return frozenset(point.value.partition(":")[0] for point in entry_points(group=ENTRY_POINTS))
 
 

@@ -19,6 +19,22 @@ READERS: dict[str, Callable[..., Reader]] = {
 }
 
 
+def register_reader(source: str, reader: Callable[..., Reader]) -> None:
+    """Make a reader known by the name that `data.source` gives, for plug-ins.
+
+    Args:
+        source: The name.
+        reader: Called with the dataset's folder, the wanted classes, `meshes`, `on_error` and the
+            settings of `data.options`.
+
+    Raises:
+        UserError: Another reader has the name.
+    """
+    if READERS.get(source, reader) is not reader:
+        raise UserError(f"data.source={source}: there is a reader of this name already")
+    READERS[source] = reader
+
+
 def open_reader(
     source: str,
     root: str | Path,
