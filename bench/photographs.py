@@ -59,10 +59,9 @@ class Run(NamedTuple):
 
 def plan() -> list[Run]:
     """Return all trainings; a warm start follows the run that it starts from."""
-    few = "data.limit_val=2 data.limit_test=10"
-    warm = f"warm_start={CRACKER}"
-    from_drill = f"data/augment=camera_whole warm_start={DRILL}"
-    pair = f"data.limit_val=4 data.limit_test=20 {warm}"
+    pair = f"data.limit_val=4 data.limit_test=20 warm_start={CRACKER}"
+    few = f"data/augment=camera data.limit_val=2 data.limit_test=2 warm_start={CRACKER}"
+    whole = "data/augment=camera_whole"
     return [
         Run(
             "mustard_pose_camera",
@@ -78,45 +77,21 @@ def plan() -> list[Run]:
             300,
             f"data/augment=strong {pair}",
         ),
+        Run("sugar_pose_camera", "004_sugar_box", "pose_pf", 300, few),
+        Run("mug_pose_camera", "025_mug", "pose_pf", 300, few),
+        Run("gelatin_pose_camera", "009_gelatin_box", "pose_pf", 250, few),
+        Run("chef_can_pose_camera", "002_master_chef_can", "pose_pf", 200, few),
+        Run("foam_pose_camera", "061_foam_brick", "pose_pf", 150, few),
+        Run("drill_pose_camera", "035_power_drill", "pose_pf", 300, few),
+        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, whole),
         Run(
-            "drill_pose_camera",
-            "035_power_drill",
-            "pose_pf",
-            400,
-            f"data/augment=camera {few} {warm}",
+            "mustard_patch_camera",
+            "006_mustard_bottle",
+            "patch_pf",
+            1000,
+            f"{whole} warm_start={DRILL}",
         ),
-        Run(
-            "sugar_pose_camera",
-            "004_sugar_box",
-            "pose_pf",
-            300,
-            f"data/augment=camera {few} {warm}",
-        ),
-        Run(
-            "gelatin_pose_camera",
-            "009_gelatin_box",
-            "pose_pf",
-            300,
-            f"data/augment=camera {few} {warm}",
-        ),
-        Run(
-            "chef_can_pose_camera",
-            "002_master_chef_can",
-            "pose_pf",
-            300,
-            f"data/augment=camera {few} {warm}",
-        ),
-        Run("mug_pose_camera", "025_mug", "pose_pf", 300, f"data/augment=camera {few} {warm}"),
-        Run(
-            "foam_pose_camera",
-            "061_foam_brick",
-            "pose_pf",
-            300,
-            f"data/augment=camera {few} {warm}",
-        ),
-        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, "data/augment=camera_whole"),
-        Run("mustard_patch_camera", "006_mustard_bottle", "patch_pf", 1000, from_drill),
-        Run("sugar_patch_camera", "004_sugar_box", "patch_pf", 1000, from_drill),
+        Run("sugar_patch_camera", "004_sugar_box", "patch_pf", 1000, f"{whole} warm_start={DRILL}"),
     ]
 
 
@@ -156,15 +131,22 @@ def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
     return ["train.py", f"model={run.model}", out, *data, *budget, *validation, *words, *more]
 
 
-def evaluate_command(run: Run, root: Path, meshes: str, frames: str) -> list[str]:
-    """Return what to run to test one filter on the photographs."""
+def evaluate_commands(run: Run, root: Path, meshes: str, frames: str) -> list[list[str]]:
+    """Return what to run to test one filter on the photographs, and on 24 of the held-out renders."""
     checkpoint = root / "runs" / run.name / "checkpoints" / "best.ckpt"
-    where = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
+    photographs = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
+    renders = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]
     return [
-        "evaluate.py",
-        f"checkpoint={checkpoint}",
-        *where,
-        f"out={root / 'evals' / run.name / 'data'}",
+        [
+            "evaluate.py",
+            f"checkpoint={checkpoint}",
+            *where,
+            f"out={root / 'evals' / run.name / name}",
+        ]
+        for name, where in (
+            ("photographs", photographs),
+            ("renders", [*renders, "data.limit_test=24"]),
+        )
     ]
 
 
@@ -183,8 +165,7 @@ def link_meshes(root: Path, meshes: Path) -> None:
 def row(run: Run, root: Path, where: str) -> list[str] | None:
     """Return a run's row of the table of renders or photographs, or None where there is none."""
     own = _read(root / "runs" / run.name / "metrics.json")
-    photos = _read(root / "evals" / run.name / "data" / "metrics.json")
-    tested = own if where == "renders" else photos
+    tested = _read(root / "evals" / run.name / where / "metrics.json")
     if own is None or not tested or not tested["instances"]:
         return None
     words = dict(word.split("=", 1) for word in run.words.split())
@@ -251,9 +232,8 @@ def main() -> int:
         commands.append(
             (train_command(run, options.root, options.more), options.root / "runs" / run.name)
         )
-        commands.append(
-            (evaluate_command(run, options.root, str(options.meshes), options.frames), None)
-        )
+        tests = evaluate_commands(run, options.root, str(options.meshes), options.frames)
+        commands += [(words, Path(words[-1].removeprefix("out="))) for words in tests]
     worst = 0
     for words, done in commands:
         print(f"$ python {shlex.join(words)}", flush=True)

@@ -69,7 +69,11 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     page = tmp_path / "page.md"
     marks = [photographs.MARK.format(where) for where in ("renders", "photographs")]
     page.write_text("Above.\n" + "".join(f"{m}\nold\n{photographs.END}\nBelow.\n" for m in marks))
-    values = {f"runs/{run.name}": metrics(88.0, 60), f"evals/{run.name}/data": metrics(77.0, 20)}
+    values = {
+        f"runs/{run.name}": metrics(99.0, 2),
+        f"evals/{run.name}/renders": metrics(88.0, 60),
+        f"evals/{run.name}/photographs": metrics(77.0, 20),
+    }
     for folder, content in values.items():
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "metrics.json").write_text(json.dumps(content))
