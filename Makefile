@@ -32,6 +32,7 @@ format: $(STAMP) ## put the code into its format
 	$(VENV)/bin/ruff check --fix .
 
 smoke: $(STAMP) ## run every method the whole way at toy size
+	rm -rf outputs/smoke
 	for model in $(MODELS); do $(PY) train.py debug=smoke model=$$model console=json out=outputs/smoke/$$model || exit 1; done
 
 bench: $(STAMP) ## measure: does training wait for the loader?

@@ -17,9 +17,10 @@ from pathlib import Path
 import torch
 
 from posefilter.cli.ablations import ABLATIONS
+from posefilter.cli.build import build_data, quiet
+from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.cli.machine import settle
-from posefilter.cli.train import build_data, build_method, quiet, recipe
 
 HOME = Path(__file__).parents[1]
 DESCRIPTIONS = {row.name: f"`{row.name}` {row.description}" for row in ABLATIONS}

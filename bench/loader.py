@@ -15,12 +15,12 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.callbacks.speed import Speed
+from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
-from posefilter.cli.train import build_data, make_trainer, quiet
 
 HOME = Path(__file__).parents[1]
 FEW = ["data.generate.frames=400"]

@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from PIL import Image
 
+from posefilter.cli.build import quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import as_batch
-from posefilter.cli.train import quiet
 from posefilter.data.frames import Sample
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError

@@ -31,6 +31,10 @@ class BadData(UserError):  # noqa: N818
         return BadData, (self.path, self.cause, self.detail)
 
 
+class Carrier(BaseException):
+    """Carries a mistake, its only argument, past those who catch every exception."""
+
+
 class Stopped(BaseException):
     """The run was told to stop, by Ctrl-C or by another process.
 

@@ -8,13 +8,14 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.comparing import differing
 from posefilter.cli.job import Job
-from posefilter.cli.train import finished
+from posefilter.cli.reuse import finished
+from posefilter.errors import UserError
 
 TYPED = ["model=downsized", "seed=1", "console=json"]
 
 
 def job(folder: Path, overrides: list[str], swept: bool = True) -> Job:
-    return Job(OmegaConf.create({}), {}, overrides, folder, "train", swept)
+    return Job(OmegaConf.create({"console": "json"}), {}, overrides, folder, "train", swept)
 
 
 @pytest.mark.parametrize(
@@ -32,8 +33,11 @@ def test_a_job_is_done_if_nothing_that_decides_its_result_differs(
     tmp_path: Path, overrides: list[str], done: bool
 ) -> None:
     (tmp_path / "metrics.json").write_text(json.dumps({"overrides": TYPED, "iou": 0.5}))
-    found = finished(job(tmp_path, overrides))
-    assert found == ({"overrides": TYPED, "iou": 0.5} if done else None)
+    if done:
+        assert finished(job(tmp_path, overrides)) == {"overrides": TYPED, "iou": 0.5}
+        return
+    with pytest.raises(UserError, match="holds results of other settings"):
+        finished(job(tmp_path, overrides))
 
 
 def test_a_default_that_has_changed_since_is_told() -> None:

@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import OmegaConf
 
-from posefilter.cli.train import make_trainer
+from posefilter.cli.build import make_trainer
 from posefilter.errors import UserError
 
 SETTINGS = {"_target_": "lightning.Trainer", "accelerator": "cpu", "max_steps": 1}

@@ -7,10 +7,10 @@ from lightning.pytorch.callbacks import Checkpoint
 from posefilter.callbacks.figures import Figures
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
 from posefilter.cli.best import Best, Last
+from posefilter.cli.build import build_trainer
 from posefilter.cli.command import compose_job
 from posefilter.cli.comparing import comparable
 from posefilter.cli.job import Job
-from posefilter.cli.train import build_trainer
 
 CONF = Path(__file__).parents[2] / "conf"
 

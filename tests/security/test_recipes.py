@@ -307,6 +307,7 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(
 ) -> None:
     from lightning import Trainer
 
+    from posefilter.cli.best import Last
     from posefilter.cli.instantiate import instantiate
 
     folder = tmp_path / "run" / "checkpoints"
@@ -317,6 +318,9 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(
     job.cfg.folder = str(tmp_path / "run")
     victims = [f"{folder}/../../secret/file.txt", str(secret / "file.txt"), "memory://x/y.ckpt"]
     for callback in instantiate(job.cfg.callbacks, "callbacks").values():
+        if isinstance(callback, Last):  # keeps no list of files
+            assert not callback.state_dict()
+            continue
         callback.setup(
             Trainer(logger=False, accelerator="cpu", enable_progress_bar=False), None, "fit"
         )  # type: ignore[arg-type]

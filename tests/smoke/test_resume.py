@@ -130,8 +130,14 @@ def test_a_run_that_is_told_to_stop_says_how_to_go_on_and_goes_on_to_the_same_en
     assert state(cut)["global_step"] == step
     assert not (cut / "metrics.json").exists()
 
+    last, before = (cut / "checkpoints" / name for name in ("last.ckpt", "last.previous.ckpt"))
+    if before.is_file():
+        last.write_bytes(last.read_bytes()[:1000])
     again = f"data.root={tiny_scenes}"  # outside of the working folder
     assert run_command("train", HOME, [f"resume={cut}", again]) == 0
+    assert (f"going on from {before}" in capfd.readouterr().out) == (
+        hook == "training" and step == 4
+    )
     a, b = state(whole), state(cut)
     assert (a["global_step"], a["epoch"]) == (b["global_step"], b["epoch"])
     assert all(torch.equal(value, b["state_dict"][key]) for key, value in a["state_dict"].items())

@@ -1,6 +1,7 @@
 """From a command line to a job, and from a mistake to one readable line."""
 
 import importlib
+import math
 import os
 import re
 import sys
@@ -22,6 +23,7 @@ from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.fit import check_fit
+from posefilter.cli.folders import FAILED, note_failure, remove_if_empty
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
@@ -33,6 +35,7 @@ from posefilter.errors import (
     FAILURE,
     INTERRUPTED,
     MISTAKE,
+    Carrier,
     ProblemsFound,
     Stopped,
     UserError,
@@ -64,6 +67,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     before = sys.argv
     try:
         check_choices(arguments, conf)
+        if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
+            raise UserError("--cfg shows the settings of one job; leave -m out")
         arguments = loosen(with_resumed(bracketed(arguments)), name) + logging_for(arguments)
         sys.argv = [sys.argv[0], *arguments]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
@@ -74,8 +79,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return INTERRUPTED
     except Stopped as stopped:
         return 128 + stopped.number
-    except (_Stop, *EXPECTED) as caught:
-        error = caught.args[0] if isinstance(caught, _Stop) else caught
+    except (Carrier, *EXPECTED) as caught:
+        error = caught.args[0] if isinstance(caught, Carrier) else caught
         if trace:
             traceback.print_exception(error)
         print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
@@ -93,6 +98,7 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
         console = job.cfg.get("console", JSON)
         settle_logging(console)
         try:
+            (job.folder / FAILED).unlink(missing_ok=True)
             check_settings(cfg)
             use_plugins(cfg)
             check_files(name, cfg)
@@ -102,11 +108,17 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
                 say(console, "started", f"{name}: starting", command=name, folder=str(job.folder))
             work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
             return work(job)
-        except EXPECTED as error:
-            if job.swept:  # the other jobs go on; Hydra raises it again at the end
+        except Exception as error:
+            if job.swept and "summary" in HydraConfig.get().callbacks:  # the other jobs go on
+                if not isinstance(error, EXPECTED):
+                    traceback.print_exception(error)
                 print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
+                note_failure(job, first_line(error))
+                return math.nan
+            if not isinstance(error, EXPECTED):
                 raise
-            raise _Stop(error) from error
+            remove_if_empty(job.folder, job.name)
+            raise Carrier(error) from error
 
     return task
 
@@ -130,10 +142,6 @@ def use_plugins(cfg: DictConfig) -> None:
             raise UserError(
                 f"plugins={package}: there is no package '{error.name}' (is it installed?)"
             ) from error
-
-
-class _Stop(BaseException):
-    """Carries a mistake past Hydra's own reporting."""
 
 
 def job_of(cfg: DictConfig) -> Job:

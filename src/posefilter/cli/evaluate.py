@@ -18,15 +18,17 @@ from posefilter.callbacks.records import (
     write_beliefs,
     write_poses_csv,
 )
+from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import typed
+from posefilter.cli.folders import holds_evaluation
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
-from posefilter.cli.train import build_data, make_trainer, quiet
+from posefilter.cli.reuse import check_same
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
@@ -50,8 +52,9 @@ def evaluate(job: Job) -> float:
     settle(job.cfg.threads, job.cfg.seed)
     if bool(job.cfg.checkpoint) == bool(job.cfg.estimates):
         raise UserError("give either checkpoint=RUN/checkpoints/best.ckpt or estimates=poses.csv")
+    check_same(job)
+    keep_training_results(job.folder)
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
-    keep_training_metrics(job.folder)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
     files = {"metrics": job.folder / "metrics.json", **files}
     following = (
@@ -236,8 +239,13 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
     )
 
 
-def keep_training_metrics(folder: Path) -> None:
-    """Set a run's own metrics aside before an evaluation in its folder writes others."""
-    path, kept = folder / "metrics.json", folder / "metrics_train.json"
-    if path.is_file() and not kept.is_file() and '"command"' not in path.read_text():
-        shutil.copy2(path, kept)
+def keep_training_results(folder: Path) -> None:
+    """Set what a run's own test has written aside, before an evaluation in its folder writes others:
+    `metrics_train.json`, `errors_train.csv`.
+    """
+    if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
+        return
+    for name in ("metrics.json", ERRORS):
+        path = folder / name
+        if path.is_file():
+            shutil.copy2(path, path.with_stem(f"{path.stem}_train"))

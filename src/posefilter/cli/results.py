@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from posefilter.cli.console import JSON, Files, ended, finite, show_table
+from posefilter.cli.files import open_whole
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
 from posefilter.metrics.registry import find_metric, read_number
@@ -47,10 +48,9 @@ def record(
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON that any parser reads: numbers that are none become null; whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.part")
-    partial.write_text(json.dumps(finite(content), indent=2, allow_nan=False) + "\n")
-    partial.replace(path)
+    text = json.dumps(finite(content), indent=2, allow_nan=False) + "\n"
+    with open_whole(path) as file:
+        file.write(text.encode())
 
 
 def show(

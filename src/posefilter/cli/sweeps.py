@@ -11,6 +11,8 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from posefilter.cli.console import JSON, ended, typed
+from posefilter.cli.folders import FAILED
+from posefilter.errors import Carrier, UserError
 
 Row = dict[str, Any]
 
@@ -24,42 +26,50 @@ class SweepSummary(Callback):
             summarize(Path(config.hydra.sweep.dir))
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Say where the summary is."""
+        """Show the summary and say where it is; the command fails where a job has."""
         folder = Path(config.hydra.sweep.dir)
-        if summarize(folder):
-            files = {"summary": folder / "summary.csv", "picture": folder / "summary.png"}
+        rows = summarize(folder)
+        failed = [row["folder"] for row in rows if row.get("error")]
+        if rows:
+            names = ("summary.csv", "summary.md", "summary.png")
+            files = {name: folder / name for name in names if (folder / name).is_file()}
             console = str(config.get("console", JSON))
             if console != JSON:
                 print((folder / "summary.md").read_text())
-            ended(console, "swept", files, [typed("report", sweep=folder)])
+            ended(console, "swept", files, [typed("report", sweep=folder)], failed=failed)
+        if failed:
+            raise Carrier(
+                UserError(f"{len(failed)} of {len(rows)} jobs failed: see {folder}/summary.md")
+            )
 
 
 def summarize(folder: Path) -> list[Row]:
-    """Write the three files of a sweep's folder; returns its rows, none where no job has ended yet."""
-    if not any(folder.glob("*/**/metrics.json")):
+    """Write the three files of a sweep's folder; return its rows, none where no job has ended yet."""
+    if not any(any(folder.glob(f"*/**/{mark}")) for mark in ("metrics.json", FAILED)):
         return []
     from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run
     from posefilter.report.sweeps import COLUMNS
 
     rows, axes = read_rows(folder)
-    names = [
-        *axes,
-        *(name for name in COLUMNS if any(row[name] is not None for row in rows)),
-        "folder",
-    ]
+    found = [name for name in COLUMNS if any(row.get(name) is not None for row in rows)]
+    names = [*axes, *found, *(["error"] if any("error" in row for row in rows) else []), "folder"]
     with (folder / "summary.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     lines = ["| " + " | ".join(names[:-1]) + " |", "|---" * (len(names) - 1) + "|"]
-    lines += ["| " + " | ".join(_cell(row[name]) for name in names[:-1]) + " |" for row in rows]
+    lines += ["| " + " | ".join(_cell(row.get(name)) for name in names[:-1]) + " |" for row in rows]
     (folder / "summary.md").write_text("\n".join(lines) + "\n")
-    draw_summary(rows, axes).savefig(folder / "summary.png", dpi=120)
+    ended = [row for row in rows if "error" not in row]
+    if ended:
+        draw_summary(ended, axes).savefig(folder / "summary.png", dpi=120)
     return rows
 
 
 def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
-    """Return a row a job that has ended, and the settings in which the jobs differ."""
+    """Return a row a job that has ended, those that failed last, and the settings in which the jobs
+    differ.
+    """
     from posefilter.report.sweeps import COLUMNS, read_sweep
 
     sweep = read_sweep(folder)
@@ -67,6 +77,7 @@ def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
     for job in sweep.jobs:
         figures = {name: job.numbers.get(figure) for name, figure in COLUMNS.items()}
         rows.append({"folder": job.folder, **figures, **job.place})
+    rows += [{"folder": job.folder, "error": job.error, **job.place} for job in sweep.failed]
     return rows, sweep.axes
 
 

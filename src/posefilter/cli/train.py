@@ -1,37 +1,43 @@
 """Train a method, test its best checkpoint, and write down what came of it."""
 
-import json
 import logging
 import time
-import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from lightning import Callback, LightningDataModule, Trainer
-from lightning.pytorch.loggers import Logger
-from omegaconf import DictConfig, OmegaConf
+from lightning import Trainer
 from torch.utils.data import default_collate
 
-from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
+from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
-from posefilter.cli.comparing import HANDS, comparable, differing
-from posefilter.cli.console import JSON, is_installed, say, typed
-from posefilter.cli.files import WholeCheckpoints
-from posefilter.cli.instantiate import instantiate
+from posefilter.cli.console import is_installed, say, typed
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
-from posefilter.cli.progress_bar import progress
 from posefilter.cli.results import record, show, write_json
-from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
-from posefilter.cli.stopping import Stop
+from posefilter.cli.resume import LAST
+from posefilter.cli.reuse import finished, learned_from, start_from, take_over
 from posefilter.cli.warm_start import warm_start
 from posefilter.data.module import PoseDataModule
-from posefilter.errors import Stopped, UserError
+from posefilter.errors import Stopped
 from posefilter.models.base import PoseEstimator, score_of
 from posefilter.paths import stays_inside
 
 log = logging.getLogger(__name__)
+
+
+class Run(NamedTuple):
+    """What a training is made of."""
+
+    job: Job
+    method: PoseEstimator
+    trainer: Trainer
+    data: PoseDataModule
+
+    @property
+    def best(self) -> Path:
+        """Return the checkpoint that is tested."""
+        return self.job.folder / "checkpoints" / "best.ckpt"
 
 
 def train(job: Job) -> float:
@@ -39,13 +45,23 @@ def train(job: Job) -> float:
 
     Returns the score that sweeps maximize.
     """
-    done = finished(job)
-    if done is not None:
-        changed = changed_since(job)
-        other = f", with other settings than now ({', '.join(changed[:5])})" if changed else ""
-        sentence = f"{job.folder}: done before{other}; delete its metrics.json to run it again"
-        say(job.cfg.console, "skipped", sentence, run=str(job.folder), changed=changed)
-        return score_of(done)
+    metrics = finished(job)
+    if metrics is None:
+        run = build(job)
+        training = take_over(job) or fit(run)
+        checkpoint = read_checkpoint(run.best)
+        training |= {"tested_step": int(checkpoint["global_step"])}
+        metrics = finish(run, training, test(run, checkpoint))
+    return score_of(metrics)
+
+
+def build(job: Job) -> Run:
+    """Build a run, and have the filter look at one image.
+
+    Raises:
+        UserError: A setting is wrong, or pieces do not fit each other: now, not after the hour that
+            it takes to the first validation.
+    """
     settle(job.cfg.threads, job.cfg.seed)
     # first, since they are the sooner to complain
     method, trainer = build_method(recipe(job)), build_trainer(job)
@@ -62,38 +78,63 @@ def train(job: Job) -> float:
         )
     rehearse(method, data)
     write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
-    start, before = start_from(job)
+    return Run(job, method, trainer, data)
+
+
+def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:
+    """Run the filter on one image before it is trained, as a validation will."""
+    was_training = method.training
+    with torch.no_grad():
+        batch = default_collate([data.val_dataset[0]])
+        method.eval().box(method.predict_step(batch, 0), batch)
+    method.train(was_training)
+
+
+def fit(run: Run) -> dict[str, Any]:
+    """Train, from where the run was cut short if it was; return what it took.
+
+    Raises:
+        Stopped: The run was told to stop; the console says how to go on.
+    """
+    start, before = start_from(run.job)
     began = time.perf_counter(), time.process_time()
     try:
-        trainer.fit(method, datamodule=data, ckpt_path=start, weights_only=True)
+        run.trainer.fit(run.method, datamodule=run.data, ckpt_path=start, weights_only=True)
     except Stopped:
-        say_stopped(job, trainer.global_step)
+        say_stopped(run)
         raise
-    best = job.folder / "checkpoints" / "best.ckpt"
-    kept = read_checkpoint(best)
-    training = cost(trainer.global_step, before, *began) | {"tested_step": int(kept["global_step"])}
-    results = test(trainer, data, kept)
-    metrics = record(results, job, data.describe(), best) | {"training": training}
-    write_json(job.folder / "metrics.json", metrics)
-    files = {"run": job.folder, "checkpoint": best, "metrics": job.folder / "metrics.json"}
-    following = (
-        []
-        if job.swept
-        else [
-            typed("report", run=job.folder),
-            typed("evaluate", checkpoint=best, **places(job)),
-            "tensorboard --logdir outputs" if is_installed() else "make board",
-        ]
-    )
+    taken = cost(run.trainer.global_step, before, *began)
+    return {**taken, "learned_from": learned_from(run.job)}
+
+
+def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
+    method = method_of(checkpoint)
+    try:
+        run.trainer.test(method, datamodule=run.data, verbose=False)
+    except Stopped:
+        say_stopped(run)
+        raise
+    return method.results()
+
+
+def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[str, Any]:
+    """Write metrics.json, print the table, and say what may be typed next; return the metrics."""
+    job, file = run.job, run.job.folder / "metrics.json"
+    metrics = record(results, job, run.data.describe(), run.best) | {"training": training}
+    write_json(file, metrics)
+    report = typed("report", run=job.folder)
+    evaluate = typed("evaluate", checkpoint=run.best, **places(job))
+    board = "tensorboard --logdir outputs" if is_installed() else "make board"
     show(
         metrics,
         f"{job.choices['model']}, loss {job.choices['loss']}",
         job.cfg.console,
         "trained",
-        files,
-        following,
+        {"run": job.folder, "checkpoint": run.best, "metrics": file},
+        [] if job.swept else [report, evaluate, board],
     )
-    return score_of(metrics)
+    return metrics
 
 
 def places(job: Job) -> dict[str, Any]:
@@ -106,19 +147,6 @@ def places(job: Job) -> dict[str, Any]:
         for key, value in named.items()
         if value and not stays_inside(str(value), Path())
     }
-
-
-def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:
-    """Run the filter on one image before it is trained, as a validation will.
-
-    Pieces that do not fit each other raise their UserError now, not after the hour that it takes to
-    the first validation.
-    """
-    was_training = method.training
-    with torch.no_grad():
-        batch = default_collate([data.val_dataset[0]])
-        method.eval().box(method.predict_step(batch, 0), batch)
-    method.train(was_training)
 
 
 def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | None]:
@@ -135,162 +163,13 @@ def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | 
     return {"steps": steps, "seconds_per_step": seconds, "cpu_seconds_per_step": cpu_seconds}
 
 
-def build_data(node: DictConfig, console: str) -> PoseDataModule:
-    """Build the data module, and have its scenes rendered where they are missing."""
-    if console == JSON:
-        node = without_bars(node)
-    data = instantiate(node, "data")
-    if not isinstance(data, PoseDataModule):
-        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
-    data.prepare_data()
-    return data
-
-
-def without_bars(node: DictConfig) -> DictConfig:
-    """Return the settings of the data with every bar switched off."""
-    out = OmegaConf.create(OmegaConf.to_container(node, resolve=True))
-    assert isinstance(out, DictConfig)
-    for section in (out, out.get("generate")):
-        if section and "progress" in section:
-            section.progress = False
-    return out
-
-
-def build_trainer(job: Job) -> Trainer:
-    """Build the trainer with its callbacks and logger; they write into the job's folder."""
-    quiet()
-    cfg = job.cfg.copy()
-    cfg.folder = str(job.folder)
-    steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
-    # else it would never be validated, and have no best checkpoint
-    if isinstance(interval, int) and 0 < steps < interval:
-        log.info(
-            "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end",
-            interval,
-            steps,
-        )
-        cfg.trainer.val_check_interval = steps
-    callbacks: list[Callback] = [
-        made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made
-    ]
-    for layout in callbacks:
-        if isinstance(layout, TensorBoardLayout):
-            layout.settings = comparable(job)
-            layout.swept = (
-                tuple(o.split("=", 1)[0].lstrip("+~") for o in job.overrides) if job.swept else ()
-            )
-    callbacks.append(progress(cfg.console))
-    loggers: list[Logger] = [
-        made for made in (instantiate(cfg.logger, "logger") or {}).values() if made
-    ]
-    return make_trainer(cfg.trainer, callbacks, loggers)
-
-
-def make_trainer(
-    node: DictConfig, callbacks: list[Callback], loggers: list[Logger] | None = None
-) -> Trainer:
-    """Build a trainer of its settings; refuse those that would blur poses."""
-    precision = node.get("precision", "32-true")
-    if str(precision) not in ("32-true", "32"):
-        raise UserError(
-            f"trainer.precision={precision}: half precision costs a pose millimeters, and double "
-            f"slows all down; "
-            "leave it at 32-true (networks take bfloat16 by themselves where that is fast and "
-            "safe)"
-        )
-    trainer = instantiate(
-        node,
-        "trainer",
-        callbacks=[*callbacks, Stop()],
-        logger=loggers or False,
-        plugins=WholeCheckpoints(),
-        enable_progress_bar=False,
-    )
-    assert isinstance(trainer, Trainer)
-    return trainer
-
-
-def test(trainer: Trainer, data: LightningDataModule, checkpoint: dict[str, Any]) -> dict[str, Any]:
-    """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
-    method = method_of(checkpoint)
-    trainer.test(method, datamodule=data, verbose=False)
-    return method.results()
-
-
-def start_from(job: Job) -> tuple[Path | None, int]:
-    """Return the checkpoint to go on from, of `resume` or of a sweep's job that was cut short, and
-    its step; (None, 0) where the training starts anew.
-
-    Where the last checkpoint is broken it is the one before, and the console says so.
-    """
-    begun = job.swept and any((job.folder / "checkpoints" / n).is_file() for n in (LAST, BEFORE))
-    source = job.cfg.resume or (job.folder if begun else None)
-    if source is None:
-        return None, 0
-    last, *before = last_checkpoints(source)
-    try:
-        return last, step_of(last)
-    except UserError as error:
-        if not before:
-            raise
-        say(job.cfg.console, "fallback", f"{error}; going on from {before[0]}", checkpoint=last)
-        return before[0], step_of(before[0])
-
-
-def step_of(checkpoint: Path) -> int:
-    """Return the step at which a checkpoint was written.  Raises UserError where it is broken."""
-    return int(read_checkpoint(checkpoint)["global_step"])
-
-
-def say_stopped(job: Job, step: int) -> None:
+def say_stopped(run: Run) -> None:
     """Say where a training was stopped, and how to go on."""
-    again = f"the same command with out={job.folder.parent}" if job.swept else ""
-    again = again or typed("train", resume=job.folder)
-    there = (job.folder / "checkpoints" / LAST).is_file()
-    sentence = (
-        f"stopped at step {step}; go on with: {again}" if there else f"stopped at step {step}"
-    )
+    job, step = run.job, run.trainer.global_step
+    sentence, again = f"stopped at step {step}", None
+    if (job.folder / "checkpoints" / LAST).is_file():
+        again = typed("train", resume=job.folder)
+        if job.swept:
+            again = f"the same command with out={job.folder.parent}"
+        sentence += f"; go on with: {again}"
     say(job.cfg.console, "stopped", sentence, step=step, next=again)
-
-
-def finished(job: Job) -> dict[str, Any] | None:
-    """Return the metrics of a sweep's job that was done before, with the same overrides where they
-    decide a result.
-    """
-    kept, path = job.folder / "metrics_train.json", job.folder / "metrics.json"
-    path = kept if kept.is_file() else path
-    if not (job.swept and path.is_file()):
-        return None
-    metrics: dict[str, Any] = json.loads(path.read_text())
-    return metrics if deciding(metrics["overrides"]) == deciding(job.overrides) else None
-
-
-def changed_since(job: Job) -> list[str]:
-    """Return the settings in which a job that is done differs from what its words mean now, as
-    defaults may change.
-    """
-    try:
-        then = read_checkpoint(job.folder / "checkpoints" / "best.ckpt")["recipe"]
-    except UserError:  # what is left of a finished job need not be whole: its results are
-        return []
-    return differing(then, recipe(job))
-
-
-def deciding(overrides: list[str]) -> list[str]:
-    """Return what was typed, in one order, less what says where and with how many hands a run is
-    done.
-    """
-    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
-
-
-def quiet() -> None:
-    """Silence advice that does not apply here."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
-    for text in (
-        ".*does not have many workers.*",
-        ".*LeafSpec.*",
-        ".*Checkpoint directory.*",
-        ".*log_every_n_steps.*",
-    ):
-        warnings.filterwarnings("ignore", text)
-    torch.set_float32_matmul_precision("highest")  # TF32 would cost a pose at 1 m half a millimeter

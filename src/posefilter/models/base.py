@@ -45,6 +45,7 @@ class PoseEstimator(LightningModule):
 
     provides: ClassVar[Capabilities] = ("rollout",)
     requires: ClassVar[Capabilities] = ()
+    tested_with: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 
     def __init__(
         self,

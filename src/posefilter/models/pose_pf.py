@@ -56,7 +56,7 @@ class PosePF(PoseEstimator):
     """
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
-
+    tested_with = ("filter", "train_filter", "pixels")  # training rolls out no filter
     # for comparing the estimate with the truth: image points, noise level [m]
     judged_pixels, judged_at = 4096, 0.004
 

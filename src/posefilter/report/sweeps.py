@@ -5,7 +5,7 @@ the seed as one.
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
 from typing import Any, NamedTuple
@@ -31,6 +31,7 @@ class Job(NamedTuple):
     place: dict[str, Value]  # its value on each axis
     numbers: dict[str, float]
     folder: str  # within the sweep's
+    error: str = ""  # why it has no result
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Sweep:
     axes: list[str]  # swept settings
     jobs: list[Job]
     unfinished: list[str]  # folders of runs without a result
+    failed: list[Job] = field(default_factory=list)  # those that say why
 
     @property
     def shown(self) -> list[str]:
@@ -70,7 +72,8 @@ def read_sweep(folder: Path) -> Sweep:
     """
     if not folder.is_dir():
         raise UserError(f"sweep={folder}: no such folder")
-    found = sorted(path.parent for path in folder.rglob("metrics.json") if path.parent != folder)
+    marks = ("metrics.json", "failed.json")
+    found = sorted({path.parent for mark in marks for path in folder.rglob(mark)} - {folder})
     if not found and not any((folder / mark).is_file() for mark in SWEEP_MARKS):
         kind = (
             "is a run's folder; give it as run=" + str(folder)
@@ -82,8 +85,11 @@ def read_sweep(folder: Path) -> Sweep:
             f"multirun.yaml, no summary.csv)"
         )
     started = sorted(path.parent.parent for path in folder.rglob(".hydra/overrides.yaml"))
+    without = {path for path in found if (path / "failed.json").is_file()}
     unfinished = [
-        str(path.relative_to(folder)) for path in started if path not in found and path != folder
+        str(path.relative_to(folder))
+        for path in started
+        if path not in {*found} - without and path != folder
     ]
     if found:
         axes, jobs = read_jobs(folder, found)
@@ -93,12 +99,15 @@ def read_sweep(folder: Path) -> Sweep:
         raise UserError(f"sweep={folder}: none of its {len(started)} runs has ended yet")
     keys = [make_sort_key(read_declared(folder).get(axis, [])) for axis in axes]
     jobs.sort(key=lambda job: [key(job.place[axis]) for axis, key in zip(axes, keys, strict=True)])
-    return Sweep(folder, axes, jobs, unfinished)
+    ended, failed = ([job for job in jobs if bool(job.error) is bad] for bad in (False, True))
+    return Sweep(folder, axes, ended, unfinished, failed)
 
 
 def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]]:
     """Return the settings in which runs differ, and the runs."""
-    metrics = [read_json(path / "metrics.json") for path in found]
+    metrics = [
+        read_json(path / "failed.json") or read_json(path / "metrics.json") for path in found
+    ]
     settings = [
         dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o)
         for own in metrics
@@ -112,6 +121,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
             {axis: parse_number(pairs.get(axis, "default")) for axis in axes},
             flatten(own),
             str(path.relative_to(folder)),
+            str(own.get("error") or ""),
         )
         for path, own, pairs in zip(found, metrics, settings, strict=True)
     ]
@@ -122,7 +132,8 @@ def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    axes = [name for name in (rows[0] if rows else {}) if name not in COLUMNS and name != "folder"]
+    others = (*COLUMNS, "folder", "error")
+    axes = [name for name in (rows[0] if rows else {}) if name not in others]
     if not rows:
         raise UserError(f"{path}: has no row")
     jobs = []
@@ -202,7 +213,12 @@ def rank(jobs: Sequence[Job]) -> tuple[float, float]:
 
 
 def find_best_job(sweep: Sweep) -> Job:
-    """Return the run with the highest score; of those that tie, the one with the least median ADD."""
+    """Return the run with the highest score; of those that tie, the one with the least median ADD.
+
+    Raises UserError where every run has failed.
+    """
+    if not sweep.jobs:
+        raise UserError(f"sweep={sweep.folder}: all of its {len(sweep.failed)} runs failed")
     return max(sweep.jobs, key=lambda job: rank([job]))
 
 

@@ -1,0 +1,110 @@
+"""Build what a training or a test runs on: the data, and the trainer with its callbacks."""
+
+import logging
+import warnings
+
+import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
+from posefilter.cli.comparing import comparable
+from posefilter.cli.console import JSON
+from posefilter.cli.files import WholeCheckpoints
+from posefilter.cli.instantiate import instantiate
+from posefilter.cli.job import Job
+from posefilter.cli.progress_bar import progress
+from posefilter.cli.stopping import Stop
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+
+log = logging.getLogger(__name__)
+
+
+def build_data(node: DictConfig, console: str) -> PoseDataModule:
+    """Build the data module, and have its scenes rendered where they are missing."""
+    if console == JSON:
+        node = without_bars(node)
+    data = instantiate(node, "data")
+    if not isinstance(data, PoseDataModule):
+        raise UserError(f"data._target_={node.get('_target_')}: is no data module")
+    data.prepare_data()
+    return data
+
+
+def without_bars(node: DictConfig) -> DictConfig:
+    """Return the settings of the data with every bar switched off."""
+    out = OmegaConf.create(OmegaConf.to_container(node, resolve=True))
+    assert isinstance(out, DictConfig)
+    for section in (out, out.get("generate")):
+        if section and "progress" in section:
+            section.progress = False
+    return out
+
+
+def build_trainer(job: Job) -> Trainer:
+    """Build the trainer with its callbacks and logger; they write into the job's folder."""
+    quiet()
+    cfg = job.cfg.copy()
+    cfg.folder = str(job.folder)
+    steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
+    # else it would never be validated, and have no best checkpoint
+    if isinstance(interval, int) and 0 < steps < interval:
+        log.info(
+            "trainer.val_check_interval=%d is more than max_steps=%d: validated at the end",
+            interval,
+            steps,
+        )
+        cfg.trainer.val_check_interval = steps
+    callbacks: list[Callback] = [
+        made for made in (instantiate(cfg.callbacks, "callbacks") or {}).values() if made
+    ]
+    for layout in callbacks:
+        if isinstance(layout, TensorBoardLayout):
+            layout.settings = comparable(job)
+            layout.swept = (
+                tuple(o.split("=", 1)[0].lstrip("+~") for o in job.overrides) if job.swept else ()
+            )
+    callbacks.append(progress(cfg.console))
+    loggers: list[Logger] = [
+        made for made in (instantiate(cfg.logger, "logger") or {}).values() if made
+    ]
+    return make_trainer(cfg.trainer, callbacks, loggers)
+
+
+def make_trainer(
+    node: DictConfig, callbacks: list[Callback], loggers: list[Logger] | None = None
+) -> Trainer:
+    """Build a trainer of its settings; refuse those that would blur poses."""
+    precision = node.get("precision", "32-true")
+    if str(precision) not in ("32-true", "32"):
+        raise UserError(
+            f"trainer.precision={precision}: half precision costs a pose millimeters, and double "
+            f"slows all down; "
+            "leave it at 32-true (networks take bfloat16 by themselves where that is fast and "
+            "safe)"
+        )
+    trainer = instantiate(
+        node,
+        "trainer",
+        callbacks=[*callbacks, Stop()],
+        logger=loggers or False,
+        plugins=WholeCheckpoints(),
+        enable_progress_bar=False,
+    )
+    assert isinstance(trainer, Trainer)
+    return trainer
+
+
+def quiet() -> None:
+    """Silence advice that does not apply here."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for text in (
+        ".*does not have many workers.*",
+        ".*LeafSpec.*",
+        ".*Checkpoint directory.*",
+        ".*log_every_n_steps.*",
+    ):
+        warnings.filterwarnings("ignore", text)
+    torch.set_float32_matmul_precision("highest")  # TF32 would cost a pose at 1 m half a millimeter

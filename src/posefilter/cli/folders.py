@@ -1,0 +1,75 @@
+"""Folders that commands write to: what is in them is not overwritten, and none is left empty."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+from posefilter.cli.job import Job
+from posefilter.errors import Carrier, UserError
+
+FAILED = "failed.json"  # in the folder of a sweep's job
+_BY_HYDRA = ("config.yaml", "hydra.yaml", "overrides.yaml")
+
+
+class KeepResults(Callback):
+    """Hydra's callback: refuses a folder that holds results, before anything is written to it."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check a run's folder."""
+        HydraConfig.instance().set_config(config)  # which the folder's name refers to
+        folder = Path(config.hydra.run.dir)
+        if config.hydra.job.name == "evaluate":
+            if holds_evaluation(folder):
+                refuse(folder, "an evaluation already; choose another folder: out=DIR")
+        elif holds_run(folder) and not config.get("resume"):
+            refuse(
+                folder, f"a run already; choose another folder, or go on with it: resume={folder}"
+            )
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check a sweep's folder: an earlier start of the sweep is gone on with."""
+        folder = Path(config.hydra.sweep.dir)
+        if holds_run(folder):
+            refuse(folder, "a single run; choose another folder for a sweep")
+
+
+def refuse(folder: Path, what: str) -> None:
+    """Raise what passes Hydra."""
+    raise Carrier(UserError(f"out={folder}: holds {what}"))
+
+
+def holds_run(folder: Path) -> bool:
+    """Tell whether a training has been there."""
+    return (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir()
+
+
+def holds_evaluation(folder: Path) -> bool:
+    """Tell whether an evaluation has been there, other than a training's own test."""
+    file = folder / "metrics.json"
+    return file.is_file() and json.loads(file.read_text()).get("command") == "evaluate"
+
+
+def remove_if_empty(folder: Path, command: str) -> None:
+    """Remove the folder of a command that has failed at once: nothing is in it but what Hydra wrote,
+    the settings and the command's log.
+    """
+    hydra, log = folder / ".hydra", folder / f"{command}.log"
+    if not folder.is_dir() or folder.samefile(".") or {*folder.iterdir()} - {hydra, log}:
+        return
+    if hydra.is_dir() and {file.name for file in hydra.iterdir()} - {*_BY_HYDRA}:
+        return
+    for file in (log, *(hydra / name for name in _BY_HYDRA)):
+        file.unlink(missing_ok=True)
+    for empty in (hydra, folder):
+        if empty.is_dir():
+            empty.rmdir()
+
+
+def note_failure(job: Job, cause: str) -> None:
+    """Write down why a sweep's job has no result, until it has one."""
+    content = {"overrides": job.overrides, "error": cause}
+    (job.folder / FAILED).write_text(json.dumps(content, indent=2) + "\n")

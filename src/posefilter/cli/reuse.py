@@ -1,0 +1,155 @@
+"""What was done before, and need not be done again: a sweep's finished job, the training of one that
+learned the same, the steps of a run that was cut short.
+"""
+
+import json
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from posefilter.cli.checkpoints import read_checkpoint, recipe
+from posefilter.cli.comparing import HANDS, differing
+from posefilter.cli.console import say
+from posefilter.cli.files import save_whole
+from posefilter.cli.instantiate import locate
+from posefilter.cli.job import Job
+from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
+from posefilter.errors import UserError
+
+_LEARNED_FROM = ("model", "data", "trainer", "callbacks", "seed", "warm_start")
+_TESTED_WITH = ("limit_test", "workers", "progress")  # of the data
+
+
+def finished(job: Job) -> dict[str, Any] | None:
+    """Return the metrics of a sweep's job that was done before; the console says so.
+
+    Raises:
+        UserError: Its folder holds the results of another.
+    """
+    metrics = own_metrics(job.folder) if job.swept else {}
+    if not metrics:
+        return None
+    check_same(job)
+    changed = changed_since(job)
+    other = f", with other settings than now ({', '.join(changed[:5])})" if changed else ""
+    sentence = f"{job.folder}: done before{other}; delete its metrics.json to run it again"
+    say(job.cfg.console, "skipped", sentence, run=str(job.folder), changed=changed)
+    return metrics
+
+
+def check_same(job: Job) -> None:
+    """Raise UserError where the folder of a sweep's job holds results of a job with other overrides,
+    as far as they decide a result.
+    """
+    metrics = own_metrics(job.folder) if job.swept else {}
+    others = {*deciding(metrics.get("overrides", []))} ^ {*deciding(job.overrides)}
+    if metrics and others:
+        told = ", ".join(sorted(others))
+        raise UserError(
+            f"{job.folder}: holds results of other settings ({told}); choose another out="
+        )
+
+
+def changed_since(job: Job) -> list[str]:
+    """Return the settings in which a job that is done differs from what its words mean now, as
+    defaults may change.
+    """
+    try:
+        then = read_checkpoint(job.folder / "checkpoints" / "best.ckpt")["recipe"]
+    except UserError:  # what is left of a finished job need not be whole: its results are
+        return []
+    return differing(then, recipe(job))
+
+
+def deciding(overrides: list[str]) -> list[str]:
+    """Return what was typed, in one order, less what says where and with how many hands a run is
+    done.
+    """
+    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
+
+
+def own_metrics(folder: Path) -> dict[str, Any]:
+    """Return what a run's own test found, also where an evaluation has since written its own; empty
+    before the test.
+    """
+    for name in ("metrics_train.json", "metrics.json"):
+        if (folder / name).is_file():
+            metrics: dict[str, Any] = json.loads((folder / name).read_text())
+            return metrics
+    return {}
+
+
+def learned_from(job: Job) -> str:
+    """Return a digest of all that a job's training depends on: two jobs that have the same learn
+    the same.
+
+    Left out is what only testing reads: a few settings of the data, what the method names in
+    `tested_with`, and `filter` where training rolls out another.
+    """
+    cfg = job.cfg.copy()
+    cfg.folder = ""
+    used: dict[str, Any] = {key: plain(cfg[key]) for key in _LEARNED_FROM}
+    method: Any = locate(str(cfg.model._target_), "model")
+    tested = {*method.tested_with, *(["filter"] if used["model"].get("train_filter") else [])}
+    used["model"] = {key: value for key, value in used["model"].items() if key not in tested}
+    used["data"] = {key: value for key, value in used["data"].items() if key not in _TESTED_WITH}
+    return sha256(json.dumps(used, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def plain(node: Any) -> Any:
+    """Return a part of the settings as plain data."""
+    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
+
+
+def take_over(job: Job) -> dict[str, Any] | None:
+    """Take the checkpoints of another job of the sweep that has learned what this one would.
+
+    Returns:
+        The other's record of its training; None where there is no such job.
+    """
+    if not job.swept:
+        return None
+    wanted = learned_from(job)
+    for folder in sorted(job.folder.parent.iterdir()):
+        best = folder / "checkpoints" / "best.ckpt"
+        training = own_metrics(folder).get("training", {}) if best.is_file() else {}
+        if folder == job.folder or training.get("learned_from") != wanted:
+            continue
+        now = recipe(job)
+        checkpoint = read_checkpoint(best)
+        save_whole({**checkpoint, "recipe": now}, job.folder / "checkpoints" / "best.ckpt")
+        others = ", ".join(differing(checkpoint["recipe"], now))
+        sentence = (
+            f"{job.folder.name}: only tested, with what {folder.name} has learned; "
+            f"training does not depend on {others}"
+        )
+        say(job.cfg.console, "reused", sentence, run=str(job.folder), trained=str(folder))
+        return {**training, "trained_as": folder.name}
+    return None
+
+
+def start_from(job: Job) -> tuple[Path | None, int]:
+    """Return the checkpoint to go on from, of `resume` or of a sweep's job that was cut short, and
+    its step; (None, 0) where the training starts anew.
+
+    Where the last checkpoint is broken it is the one before, and the console says so.
+    """
+    begun = job.swept and any((job.folder / "checkpoints" / n).is_file() for n in (LAST, BEFORE))
+    source = job.cfg.resume or (job.folder if begun else None)
+    if source is None:
+        return None, 0
+    last, *before = last_checkpoints(source)
+    try:
+        return last, step_of(last)
+    except UserError as error:
+        if not before:
+            raise
+        say(job.cfg.console, "fallback", f"{error}; going on from {before[0]}", checkpoint=last)
+        return before[0], step_of(before[0])
+
+
+def step_of(checkpoint: Path) -> int:
+    """Return the step at which a checkpoint was written.  Raises UserError where it is broken."""
+    return int(read_checkpoint(checkpoint)["global_step"])

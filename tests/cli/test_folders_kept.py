@@ -1,0 +1,87 @@
+"""What is there is not overwritten, and a command that fails at once leaves nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli import run_command
+from posefilter.cli.evaluate import keep_training_results
+
+HOME = Path(__file__).parents[2]
+
+
+def fill(folder: Path, **metrics: object) -> Path:
+    """Write what a finished run has."""
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "overrides.yaml").write_text("[seed=7]")
+    (folder / "checkpoints").mkdir()
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "told"),
+    [
+        ("train", [], "holds a run already; choose another folder, or go on with it: resume="),
+        ("train", ["-m", "seed=1,2"], "holds a single run; choose another folder"),
+        ("evaluate", ["checkpoint=weights/x.ckpt"], "holds an evaluation already; choose another"),
+    ],
+    ids=["a run", "a sweep", "an evaluation"],
+)
+def test_a_folder_with_results_is_refused_before_anything_is_written(
+    command: str,
+    arguments: list[str],
+    told: str,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    run = fill(tmp_path / "run", command=command)
+    before = contents(run)
+    nowhere = ["data.root=/nonexistent"] if command == "train" else []
+    assert run_command(command, HOME, [*arguments, *nowhere, f"out={run}", "console=json"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: out={run}: {told}")
+    assert contents(run) == before
+
+
+def test_what_a_run_found_is_set_aside_before_its_first_evaluation(tmp_path: Path) -> None:
+    run = fill(tmp_path / "run", iou=0.5)
+    (run / "errors.csv").write_text("of the run")
+    keep_training_results(run)
+    assert json.loads((run / "metrics_train.json").read_text()) == {"iou": 0.5}
+    assert (run / "errors_train.csv").read_text() == "of the run"
+
+
+@pytest.mark.parametrize("command", ["train", "predict"])
+def test_a_command_that_fails_at_once_leaves_no_folder(command: str, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "train.log").write_text("of another run")
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    for name in ("new", "mine"):
+        assert run_command(command, HOME, ["seed=-1", f"out={tmp_path / name}"]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
+
+
+def test_a_sweep_of_predictions_stays_in_its_folder_and_tells_what_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    typed = ["-m", "checkpoint=none.ckpt", "seed=0,1", "out=there", "console=json"]
+    assert run_command("predict", HOME, typed) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["there"]
+    assert "2 of 2 jobs failed" in capfd.readouterr().err.splitlines()[-1]
+    assert "none.ckpt: no such file" in (tmp_path / "there" / "summary.md").read_text()
+
+
+def test_the_settings_of_several_jobs_are_not_shown_as_one(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert run_command("train", HOME, ["--cfg", "job", "-m", "seed=0,1"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line == "train: --cfg shows the settings of one job; leave -m out"

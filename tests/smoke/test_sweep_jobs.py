@@ -1,0 +1,42 @@
+"""A sweep trains what it must, tests every job, and tells of those that failed."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tests.smoke.conftest import HOME, TINY
+
+from posefilter.cli import run_command
+
+
+def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_told(
+    tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = [*TINY, f"data.root={tiny_scenes}", "trainer.max_steps=2"]
+    typed += ["-m", "filter.particles=4,0,8", f"out={tmp_path}"]
+    assert run_command("train", HOME, typed) == 2
+    out, err = capfd.readouterr()
+    assert err.splitlines()[-1] == f"train: 1 of 3 jobs failed: see {tmp_path}/summary.md"
+    assert "Traceback" not in err
+
+    with (tmp_path / "summary.csv").open() as file:
+        first, second, failed = csv.DictReader(file)
+    assert [row["filter.particles"] for row in (first, second, failed)] == ["4", "8", "0"]
+    assert "must be 1 or more" in failed["error"]
+    assert failed["iou"] == first["error"] == second["error"] == ""
+    assert (tmp_path / "summary.png").is_file()
+
+    events = [json.loads(line) for line in out.splitlines()]
+    said = [event["event"] for event in events]
+    assert said.count("validation") == said.count("reused") == 1
+    assert events[-1]["failed"] == [failed["folder"]]
+
+    runs = [tmp_path / row["folder"] for row in (first, second)]
+    a, b = (torch.load(run / "checkpoints" / "best.ckpt", weights_only=True) for run in runs)
+    assert all(torch.equal(value, b["state_dict"][key]) for key, value in a["state_dict"].items())
+    assert b["recipe"]["settings"]["filter"]["particles"] == 8
+    training = json.loads((runs[1] / "metrics.json").read_text())["training"]
+    assert training["trained_as"] == first["folder"]
+    assert training["steps"] == 2
