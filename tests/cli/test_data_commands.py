@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
 from posefilter.cli.command import FAILURE, compose_job, run_command
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.generate import generate
-from posefilter.cli.build import build_data
 from posefilter.errors import ProblemsFound, UserError
 
 HOME = Path(__file__).parents[2]
