@@ -101,10 +101,12 @@ def banana(real_data, tmp_path):
         (folder / f"{target}.json").write_text(
             (source / f"real_fat_single_banana.{name}.json").read_text()
         )
+    label = np.full((540, 960), 255, np.uint8)
+    label[0] = 0  # a label of everything is refused
     for eye in ("left", "right"):
         cv2.imwrite(str(folder / f"000000.{eye}.jpg"), np.zeros((540, 960, 3), np.uint8))
         cv2.imwrite(str(folder / f"000000.{eye}.depth.png"), np.full((540, 960), 9000, np.uint16))
-        cv2.imwrite(str(folder / f"000000.{eye}.seg.png"), np.full((540, 960), 255, np.uint8))
+        cv2.imwrite(str(folder / f"000000.{eye}.seg.png"), label)
     return folder
 
 
