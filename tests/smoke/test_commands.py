@@ -199,7 +199,7 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     assert weights.stat().st_size < 5e6
     recipe = torch.load(weights, weights_only=True)["recipe"]
     kept = torch.load(trained / "checkpoints" / "best.ckpt", weights_only=True)["recipe"]["choices"]
-    assert recipe["choices"] == {**kept, "refine": "none"}
+    assert recipe["choices"] == {**kept, "filter/refine": "none"}
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     out = tmp_path / "prediction"

@@ -17,7 +17,7 @@ from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator, Result, Run, collect_results
 from posefilter.figures.canvas import save_image
-from posefilter.figures.recording import check_viewer, record
+from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
@@ -37,7 +37,6 @@ def predict(job: Job) -> None:
     """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
     cfg, folder = job.cfg, job.folder
     settle(cfg.threads, cfg.seed)
-    check_view(cfg.view)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg))
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
@@ -72,14 +71,6 @@ def predict(job: Job) -> None:
         following,
         **answer,
     )
-
-
-def check_view(view: Any) -> None:
-    """Raise UserError, before the work is done, where the 3-D view cannot be written."""
-    if not isinstance(view, bool):
-        raise UserError(f"view={view}: choose true or false")
-    if view:
-        check_viewer()
 
 
 def record_view(run: Run, shape: Any, path: Path) -> None:

@@ -33,6 +33,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
     Raises:
         UserError: A file or folder is missing; the message names the setting.
     """
+    if command == "predict":
+        _check_view(cfg.view)
     if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
         find_weights(cfg.checkpoint)
     for key in _NEEDED.get(command, ()):
@@ -50,6 +52,16 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if key == "data.root" and _select(cfg, "data.generate") is not None:
             continue  # it is rendered
         raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+
+
+def _check_view(view: Any) -> None:
+    """Raise UserError where the 3-D view cannot be written."""
+    if not isinstance(view, bool):
+        raise UserError(f"view={view}: choose true or false")
+    if view:
+        from posefilter.figures.recording import check_viewer  # slow to import, rarely asked for
+
+        check_viewer()
 
 
 def _select(cfg: Any, key: str) -> Any:
