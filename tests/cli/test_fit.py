@@ -33,7 +33,8 @@ def test_source_and_class_declare_the_same() -> None:
         name
         for file in CONF.rglob("*.yaml")
         for name in re.findall(r"_target_: *[\"']?(posefilter\.[\w.]+)", file.read_text())
-    } - {"posefilter.cli.sweeps.SweepSummary"}
+    }
+    names = {name for name in names if not name.startswith("posefilter.cli.")}  # Hydra builds these
     declaring = 0
     for name in names:
         kind = locate(name, "x")

@@ -73,7 +73,8 @@ def test_key_frames_and_published_points(real_data, meshes):
         image_width=320,
     )
     batch = dm.test_dataset[0]
-    assert len(dm.test_dataset) == 5
+    frames = list((real_data / "ycbv" / "data" / "0001").glob("*-color.png"))
+    assert len(dm.test_dataset) == len(frames) > 0
     assert batch.rgb.shape == (3, 240, 320)
     points = dm.object_model(0).points.numpy()
     assert len(points) == 2621
