@@ -25,7 +25,6 @@ from PIL import Image
 from posefilter.cli.build import quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.machine import settle
-from posefilter.cli.predict import as_batch
 from posefilter.data.frames import Sample
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
@@ -35,6 +34,7 @@ from posefilter.figures.convergence import animate_convergence, encode_webp
 from posefilter.figures.layout import TITLE, draw_text
 from posefilter.figures.overlay import Shape, draw_poses, list_axes
 from posefilter.figures.particles import draw_iterations
+from posefilter.images import Images, make_batch
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
@@ -192,8 +192,8 @@ def run(
                 f"{scenes}: frames are {sample.rgb.shape[1]} pixels wide, but the "
                 f"filter takes {width}"
             )
-        K = torch.from_numpy(sample.intrinsics).double()
-        batch = as_batch(sample.rgb, sample.depth, K, *sample.depth.shape)
+        one = Images(sample.rgb[None], sample.depth[None], sample.intrinsics[None].astype(float))
+        batch = make_batch(one, None, None)
         method.seed = 0
         with torch.no_grad():
             yield Found(sample, batch, method.predict_step(batch, 0))

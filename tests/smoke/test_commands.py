@@ -325,10 +325,10 @@ def test_plain_is_for_machines(
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("filter/initialize=from_depth", "filter/initialize=from_depth.*PatchPF"),
-        ("filter/initialize=from_relevance model/encoder=pyramid", "from_relevance.*PatchPF"),
+        ("filter/initialize=from_depth", "filter/initialize=from_depth.*patch_pf"),
+        ("filter/initialize=from_relevance model/encoder=pyramid", "from_relevance.*patch_pf"),
         ("filter/resample=guided model/encoder=none", "filter/resample=guided"),
-        ("filter/refine=rescore", "refine.*PatchPF"),
+        ("filter/refine=rescore", "refine.*patch_pf"),
     ],
 )
 def test_pieces_that_do_not_fit_are_told_of_before_any_training(
@@ -343,5 +343,7 @@ def test_pieces_that_do_not_fit_are_told_of_before_any_training(
 def test_particles_are_resampled_by_optimal_transport(
     resample: str, tiny_job, tmp_path: Path
 ) -> None:
-    train(tiny_job(tmp_path, "model=patch_pf", f"resample={resample}", "trainer.max_steps=2"))
+    train(
+        tiny_job(tmp_path, "model=patch_pf", f"filter/resample={resample}", "trainer.max_steps=2")
+    )
     assert 0 <= read(tmp_path)["particles_on_object"] <= 1

@@ -10,7 +10,7 @@ import torch
 from lightning import Callback, Trainer
 from tests.smoke.conftest import HOME, TINY
 
-from posefilter.cli import run_command
+from posefilter.cli import build, run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
 
@@ -54,7 +54,7 @@ def test_a_killed_run_goes_on_to_the_same_end(
     def killer(console: str) -> Callback:
         return Killer(interval + 1)
 
-    monkeypatch.setattr(training, "progress", killer)
+    monkeypatch.setattr(build, "progress", killer)
     with pytest.raises(Killed):
         training.train(tiny_job(cut, *settings))
     monkeypatch.undo()
@@ -121,7 +121,7 @@ def test_a_run_that_is_told_to_stop_says_how_to_go_on_and_goes_on_to_the_same_en
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run_command("train", HOME, [*settings, f"out={whole}"]) == 0
     with monkeypatch.context() as patch:
-        patch.setattr(training, "progress", lambda console: Sender(hook, step, number))
+        patch.setattr(build, "progress", lambda console: Sender(hook, step, number))
         before = signal.getsignal(number)
         assert run_command("train", HOME, [*settings, f"out={cut}"]) == 128 + number
         assert signal.getsignal(number) == before
