@@ -186,7 +186,7 @@ def test_what_is_required_is_asked_for(tmp_path: Path, capfd: pytest.CaptureFixt
         "evaluate": "checkpoint=",
         "predict": "checkpoint",
         "generate": "out",
-        "export": "out",
+        "export": "checkpoint",
     }.items():
         assert run_command(name, HOME, [] if name != "predict" else [f"out={tmp_path}"]) == 2
         assert words in capfd.readouterr().err
