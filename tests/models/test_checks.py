@@ -52,14 +52,14 @@ def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_objec
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
-@pytest.mark.parametrize("train_filter", ["same", "short"])
+@pytest.mark.parametrize("rollout", ["full", "truncated"])
 def test_agreement_serves_both_pose_methods_before_they_know_their_object(
-    model: str, train_filter: str, tmp_path: Path
+    model: str, rollout: str, tmp_path: Path
 ) -> None:
     job = compose_job(
         "train",
         CONF,
-        [f"model={model}", "filter/estimate=agreement", f"train_filter={train_filter}"],
+        [f"model={model}", "filter/estimate=agreement", f"model/train_rollout={rollout}"],
         tmp_path,
     )
     method = build_method(recipe(job))
@@ -98,7 +98,7 @@ def test_votes_are_refused_where_the_memory_is_a_latent(
         images(tmp_path, f"model={model}", f"variant={variant}", "model/box_head=votes")
     one_line(refusal, "model/box_head=votes", "model/box_head=pose or spread")
     for box_head in ("pose", "spread"):
-        images(tmp_path, f"model={model}", f"variant={variant}", f"box_head={box_head}")
+        images(tmp_path, f"model={model}", f"variant={variant}", f"model/box_head={box_head}")
 
 
 def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
@@ -162,7 +162,7 @@ def test_a_short_filters_own_first_cloud_is_named_as_it_is_typed(tmp_path: Path)
 
 
 NUMBERS = {
-    "model=patch_pf patch=-1": ["patch=-1", "1 pixel or more"],
+    "model=patch_pf model.glimpse.size=-1": ["model.glimpse.size=-1", "1 pixel or more"],
     "model=cnn_patch model.glimpse.size=0": ["model.glimpse.size=0", "1 pixel or more"],
     "model=pixel_pf model/glimpse=integer model.glimpse.size=0": [
         "model.glimpse.size=0",
