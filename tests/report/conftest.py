@@ -93,8 +93,8 @@ def sweep(tmp_path: Path) -> Path:
     for particles in (50, 1000):
         for refine in ("none", "gradient"):
             for seed in (0, 1, 2):
-                said = [f"filter.particles={particles}", f"filter/refine={refine}", f"seed={seed}"]
-                own = folder / ",".join(said).replace("/", "_")
+                said = [f"filter.particles={particles}", f"refine={refine}", f"seed={seed}"]
+                own = folder / ",".join(said)
                 (own / ".hydra").mkdir(parents=True)
                 (own / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(said))
                 if (particles, refine, seed) == (1000, "none", 2):
@@ -104,7 +104,7 @@ def sweep(tmp_path: Path) -> Path:
                 (own / "metrics.json").write_text(json.dumps(written))
     asked = {
         "hydra": {
-            "sweeper": {"params": {"filter/refine": "none,gradient"}},
+            "sweeper": {"params": {"refine": "none,gradient"}},
             "overrides": {"task": ["filter.particles=1000,50"]},
         }
     }

@@ -179,7 +179,7 @@ def test_a_browser_shows_it(run: Path, sweep: Path, tmp_path: Path) -> None:
     """
     text = make_run_page(read_run(run), [Change("a.long.key." * 9, "1", "x" * 150)], "x").render()
     (tmp_path / "run.html").write_text(text)
-    best = read_run(sweep / "filter.particles=1000,filter_refine=gradient,seed=2")
+    best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
     (tmp_path / "sweep.html").write_text(make_sweep_page(read_sweep(sweep), best, [], "x").render())
     with browser(tmp_path / "profile") as page:
         for name in ("run", "sweep"):
@@ -247,13 +247,13 @@ def test_the_command(run: Path, sweep: Path) -> None:
 def test_the_sweep_page(sweep: Path) -> None:
     """Means over seeds, the best marked, what is unfinished named; nothing is fetched."""
     found = read_sweep(sweep)
-    best = read_run(sweep / "filter.particles=1000,filter_refine=gradient,seed=2")
+    best = read_run(sweep / "filter.particles=1000,refine=gradient,seed=2")
     content = make_sweep_page(found, best, [], "x")
     page, files = content.render(), content.files()
     marked = re.search(r'<tr class="marked">.*?</tr>', page)
     assert marked
     assert "80.3 ± 2.5" in marked[0]
-    assert "Without a result: filter.particles=1000,filter_refine=none,seed=2" in page
+    assert "Without a result: filter.particles=1000,refine=none,seed=2" in page
     assert "78.0 to 83.0 (sd 2.5)" in page
     assert outside(page).fetched == []
     assert {

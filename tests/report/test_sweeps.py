@@ -23,8 +23,8 @@ def test_axes_groups_and_best(sweep: Path) -> None:
     asked for.
     """
     found = read_sweep(sweep)
-    assert found.axes == ["filter.particles", "filter/refine", "seed"]  # `out` differs too, and is none
-    assert found.shown == ["filter.particles", "filter/refine"]
+    assert found.axes == ["filter.particles", "refine", "seed"]  # `out` differs too, and is none
+    assert found.shown == ["filter.particles", "refine"]
     assert [tuple(group.place.values()) for group in group_jobs(found)] == [
         (50, "none"),
         (50, "gradient"),
@@ -32,8 +32,8 @@ def test_axes_groups_and_best(sweep: Path) -> None:
         (1000, "gradient"),
     ]
     assert [len(group.jobs) for group in group_jobs(found)] == [3, 3, 2, 3]
-    assert found.unfinished == ["filter.particles=1000,filter_refine=none,seed=2"]
-    assert find_best_job(found).place == {"filter.particles": 1000, "filter/refine": "gradient", "seed": 2}
+    assert found.unfinished == ["filter.particles=1000,refine=none,seed=2"]
+    assert find_best_job(found).place == {"filter.particles": 1000, "refine": "gradient", "seed": 2}
     assert find_best_group(group_jobs(found)) == 3
 
 
@@ -42,13 +42,13 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
     found = read_sweep(sweep)
     panel = chart_over("filter.particles", found, group_jobs(found), [find_metric("add/auc")])[0]
     none, gradient = panel.lines
-    assert none.label == "filter/refine=none"
+    assert none.label == "refine=none"
     assert list(gradient.x) == [50.0, 1000.0]
     assert list(gradient.y) == pytest.approx([70.5 + 1 / 3, 80 + 1 / 3])
     assert list(gradient.low) == pytest.approx([68.5, 78.0])
     assert list(gradient.high) == pytest.approx([73.5, 83.0])
     assert panel.log_x
-    assert chart_over("filter/refine", found, group_jobs(found), [find_metric("add/auc")])[
+    assert chart_over("refine", found, group_jobs(found), [find_metric("add/auc")])[
         0
     ].categories == ["none", "gradient"]
 
@@ -65,7 +65,7 @@ def test_cells() -> None:
 def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
     """To one decimal: a hundredth of a point more is no better, a tenth is."""
     best, other = (
-        sweep / f"filter.particles=1000,filter_refine=gradient,seed={seed}" / "metrics.json"
+        sweep / f"filter.particles=1000,refine=gradient,seed={seed}" / "metrics.json"
         for seed in (2, 1)
     )
     first, second = json.loads(best.read_text()), json.loads(other.read_text())
