@@ -52,14 +52,14 @@ def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_objec
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
-@pytest.mark.parametrize("rollout", ["full", "truncated"])
+@pytest.mark.parametrize("train_rollout", ["full", "truncated"])
 def test_agreement_serves_both_pose_methods_before_they_know_their_object(
-    model: str, rollout: str, tmp_path: Path
+    model: str, train_rollout: str, tmp_path: Path
 ) -> None:
     job = compose_job(
         "train",
         CONF,
-        [f"model={model}", "filter/estimate=agreement", f"model/train_rollout={rollout}"],
+        [f"model={model}", "filter/estimate=agreement", f"model/train_rollout={train_rollout}"],
         tmp_path,
     )
     method = build_method(recipe(job))
@@ -172,8 +172,12 @@ NUMBERS = {
     "model=patch_pf filter.estimate.options=0": ["estimate", "options=0", "1 or more"],
     "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
     "model=patch_pf filter.estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
-    "model.candidate_sampler.levels=1": ["lesson", "levels=1", "2 or more"],
-    "model.candidate_sampler.particles=-1": ["lesson", "particles=-1", "0 for none"],
+    "model.candidate_sampler.levels=1": ["model.candidate_sampler", "levels=1", "2 or more"],
+    "model.candidate_sampler.particles=-1": [
+        "model.candidate_sampler",
+        "particles=-1",
+        "0 for none",
+    ],
     "model=patch_pf model.net.latent_width=0": ["net", "latent_width=0", "1 or more"],
     "model=patch_pf model.net.layers=0": ["net", "layers=0", "1 or more"],
     "model=cnn_patch model.net.width=0": ["net", "width=0", "1 or more"],

@@ -86,11 +86,11 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
     parts: dict[str, Any] = {
         "net": net,
         "glimpse": SmoothGlimpse(size),
-        "context": ConvEncoder((16, 24, 32, 32), 32),
+        "encoder": ConvEncoder((16, 24, 32, 32), 32),
         "pose_head": NoPose() if detects else SurfacePointSixD(),
         "displacement": Bounded(0.3),
-        "bounds": VotedBox() if detects else PoseBox(),
-        "lessons": aux_losses,
+        "box_head": VotedBox() if detects else PoseBox(),
+        "aux_losses": aux_losses,
         "detach_position": True,
         "filter": run_filter(
             64, 4, resample=Systematic(), estimate=Argmax() if detects else Agreement()
@@ -108,10 +108,10 @@ def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> 
     parts: dict[str, Any] = {
         "net": PatchNet if detects else LatentNet,
         "glimpse": IntegerCut(size),
-        "context": NoContext(),
+        "encoder": NoContext(),
         "pose_head": NoPose() if detects else AbsoluteQuaternion(),
         "displacement": Unbounded(),
-        "bounds": SpreadBox(size) if detects else PoseBox(),
+        "box_head": SpreadBox(size) if detects else PoseBox(),
         "filter": run_filter(50, steps),
         "loss": Chamfer(size) if detects else Add(),
         "optimizer": partial(torch.optim.Adam, lr=1e-3),

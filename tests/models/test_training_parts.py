@@ -111,9 +111,9 @@ def tiny(kind: type[ImageSpace], **changes: Any) -> ImageSpace:
 
 
 def stages_of(name: str) -> tuple[Stage, ...]:
-    """Return the stages of conf/stages/NAME.yaml."""
-    said: Any = OmegaConf.to_container(OmegaConf.load(CONF / "stages" / f"{name}.yaml"))
-    return tuple(Stage(one["until"], one.get("factors", {})) for one in said["stages"])
+    """Return the stages of conf/loss/schedule/NAME.yaml."""
+    said: Any = OmegaConf.to_container(OmegaConf.load(CONF / "loss" / "schedule" / f"{name}.yaml"))
+    return tuple(Stage(one["until"], one.get("factors", {})) for one in said["loss_schedule"])
 
 
 def at(method: ImageSpace, step: int, steps: int) -> None:
@@ -136,7 +136,7 @@ def teaches(loss: Tensor, method: ImageSpace) -> bool:
 
 
 def test_progress_is_the_share_of_the_steps_that_are_done() -> None:
-    method = tiny(CnnPatch, loss_schedule=stages_of("three_motion"))
+    method = tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement"))
     assert method.progress() == 0.0  # no trainer counts
     for step, share in ((0, 0.0), (5, 0.25), (19, 0.95), (20, 1.0)):
         at(method, step, 20)
@@ -151,7 +151,8 @@ THREE_MOTION = {0: {"loss", "displacement"}, 7: {"loss", "displacement"}, 8: {"l
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "off"), [("three", PatchPF, THREE), ("three_motion", CnnPatch, THREE_MOTION)]
+    ("name", "kind", "off"),
+    [("three_stages", PatchPF, THREE), ("three_stages_displacement", CnnPatch, THREE_MOTION)],
 )
 def test_what_a_stage_switches_off_is_zero_and_teaches_nothing_until_its_turn_comes(
     name: str, kind: type[ImageSpace], off: Mapping[int, set[str]]
@@ -213,7 +214,7 @@ def test_a_training_walks_through_its_stages() -> None:
     trainer = Trainer(max_steps=5, accumulate_grad_batches=2, callbacks=[watch], accelerator="cpu", logger=False,
                       enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
-    trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_motion")), data)
+    trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement")), data)
     first, second = {"loss", "displacement"}, {"likelihood", "sides", "relevance"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]
     assert watch.seen == [one for one in want for _ in range(2)]
