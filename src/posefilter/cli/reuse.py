@@ -146,7 +146,8 @@ def start_from(job: Job) -> tuple[Path | None, int]:
     except UserError as error:
         if not before:
             raise
-        say(job.cfg.console, "fallback", f"{error}; going on from {before[0]}", checkpoint=last)
+        sentence = f"{error}; going on from {before[0]}"
+        say(job.cfg.console, "fallback", sentence, broken=last, checkpoint=before[0])
         return before[0], step_of(before[0])
 
 
