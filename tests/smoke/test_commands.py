@@ -22,7 +22,8 @@ TIMES = ("seconds_per_image",)
 
 def numbers(metrics: dict) -> dict:
     """Return what must agree between a training's test and an evaluation."""
-    keys = ("instances", "missed", "add", "add_s", "iou", "particles_on_object", "belief")
+    keys = ("instances", "missed", "add", "add_s", "mssd", "mspd")
+    keys += ("iou", "particles_on_object", "belief")
     return {key: metrics[key] for key in keys}
 
 

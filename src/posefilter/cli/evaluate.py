@@ -32,6 +32,7 @@ from posefilter.cli.reuse import check_same
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
+from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
@@ -117,7 +118,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     best = {}
     for row in sorted(rows, key=lambda row: row.score):
         best[row.scene_id, row.im_id, row.obj_id] = row
-    errors, iou = PoseErrors([data.object_model(i) for i in range(len(data.objects))]), BoxIoU()
+    models = [data.object_model(i) for i in range(len(data.objects))]
+    errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
     used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
@@ -131,6 +133,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
                 )
                 poses[i] = torch.from_numpy(pose.astype(np.float32))
         errors.update(poses, batch.camera_from_object, batch.object_id)
+        height, width = batch.rgb.shape[-2:]
+        bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         pairs = [
             (nan, nan) if row is None else (row.score, row.seconds if row.seconds >= 0 else nan)
             for row in told
@@ -140,7 +144,6 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             (1000 * state[-1]).tolist() for state in (errors.add, errors.add_s, errors.diameter)
         ]
         table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
-        height, width = batch.rgb.shape[-2:]
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
             truth = box_of_pose(batch.camera_from_object[i : i + 1], hull, K, height, width)
@@ -151,7 +154,12 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             f"estimates={job.cfg.estimates}: none of its {len(rows)} rows is of an "
             f"instance of this data"
         )
-    results = {**errors.compute(), "iou": float(iou.compute()), "particles_on_object": None}
+    results = {
+        **errors.compute(),
+        **bop.compute(),
+        "iou": float(iou.compute()),
+        "particles_on_object": None,
+    }
     seconds = [row.seconds for row in best.values() if row.seconds >= 0]
     results |= {
         "seconds_per_image": sum(seconds) / len(seconds) if seconds else None,

@@ -20,6 +20,8 @@ _TOLD = (
     "missed",
     "add",
     "add_s",
+    "mssd",
+    "mspd",
     "iou",
     "particles_on_object",
     "seconds_per_image",

@@ -22,6 +22,7 @@ from posefilter.geometry.boxes import box_of_pose
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.scores import overall
 from posefilter.metrics.visibility import ErrorsByVisibility
@@ -111,6 +112,7 @@ class PoseEstimator(LightningModule):
         self.scores = nn.ModuleDict({"iou": BoxIoU(), "particles_on_object": ParticlesOnObject()})
         if "pose" in self.capabilities:
             self.scores["poses"] = PoseErrors([model])
+            self.scores["bop"] = BopErrors([model])
             self.scores["by_visibility"] = ErrorsByVisibility([model])
             self.scores["belief"] = BeliefQuality([model])
 
@@ -236,6 +238,9 @@ class PoseEstimator(LightningModule):
         )
         if "poses" in self.scores:
             self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
+            self.scores["bop"].update(
+                trace.belief.best, batch.camera_from_object, batch.intrinsics, width
+            )
             self.scores["by_visibility"].collect(
                 trace.belief.best, batch.camera_from_object, batch.visibility
             )
@@ -261,9 +266,10 @@ class PoseEstimator(LightningModule):
 
     def results(self) -> dict[str, Any]:
         """Return what was collected since the last reset, in the form of metrics.json."""
-        out: dict[str, Any] = {"instances": 0, "missed": 0, "add": None, "add_s": None}
+        out: dict[str, Any] = {"instances": 0, "missed": 0}
+        out |= dict.fromkeys(("add", "add_s", "mssd", "mspd"))
         if "poses" in self.scores:
-            out |= self.scores["poses"].compute()
+            out |= self.scores["poses"].compute() | self.scores["bop"].compute()
         else:
             out["instances"] = int(self.scores["iou"].count)
         for name in ("iou", "particles_on_object"):

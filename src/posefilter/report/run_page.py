@@ -38,7 +38,7 @@ HEADLINE = (
 ROWS = (
     "instances", "missed", "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm",
     "add_s/auc", "add_s/recall_01d", "add_s/recall_2cm", "add_s/median_mm",
-    "iou", "particles_on_object", "seconds_per_image",
+    "mssd/ar", "mspd/ar", "iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
 BELIEF = tuple(key for key in METRICS if key.startswith("belief/"))
 BY_VISIBILITY = ("add/auc", "add/recall_01d", "add/median_mm", "add_s/auc")

@@ -1,0 +1,201 @@
+"""The pose errors of the BOP challenge that know symmetries: MSSD and MSPD (Hodan et al. 2020, "BOP
+Challenge 2020 on 6D Object Localization").
+
+The third error of the challenge, VSD, compares rendered depth and is not computed here.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities.data import dim_zero_cat
+
+from posefilter.geometry.camera import project
+from posefilter.geometry.pose import rotation_of, transform, translation_of
+from posefilter.geometry.rotation import exp_so3, log_so3
+from posefilter.types import ObjectModel
+
+# shares of the diameter, and pixels in an image 640 wide, below which an error counts as correct
+MSSD_THRESHOLDS = tuple(0.05 * i for i in range(1, 11))
+MSPD_THRESHOLDS = tuple(5.0 * i for i in range(1, 11))
+REFERENCE_WIDTH = 640
+# [rad] a group whose least turn is smaller stands for a continuous symmetry
+_CONTINUOUS = math.radians(15.0)
+_STEP = math.radians(1.2)  # the challenge cuts a continuous symmetry into 315 turns
+
+
+def mssd(poses: Tensor, truth: Tensor, symmetries: Tensor, points: Tensor) -> Tensor:
+    """Return the maximum symmetry-aware surface distance: of the symmetries the least of the
+    greatest distances between corresponding points.
+
+    Args:
+        poses: (*, 4, 4) estimates, camera_from_object [m].
+        truth: (*, 4, 4) true poses.
+        symmetries: (S, 4, 4) object_from_object, the identity among them.
+        points: (P, 3) of the object [m]; the greatest distance is always at a vertex of the convex
+            hull.
+
+    Returns:
+        (*) [m].
+    """
+    return _least_of_greatest(poses, truth, symmetries, points, lambda camera, _: camera)
+
+
+def mspd(
+    poses: Tensor, truth: Tensor, symmetries: Tensor, points: Tensor, intrinsics: Tensor
+) -> Tensor:
+    """Return the maximum symmetry-aware projection distance: as `mssd`, between projections.
+
+    Args:
+        poses: (*, 4, 4) estimates, camera_from_object [m].
+        truth: (*, 4, 4) true poses.
+        symmetries: (S, 4, 4) object_from_object, the identity among them.
+        points: (P, 3) of the object [m].
+        intrinsics: (*, 3, 3) [px].
+
+    Returns:
+        (*) [px].
+    """
+    K = intrinsics.expand(*poses.shape[:-2], 3, 3).reshape(-1, 3, 3)
+    return _least_of_greatest(
+        poses, truth, symmetries, points, lambda camera, row: project(camera, K[row])
+    )
+
+
+def _least_of_greatest(
+    poses: Tensor,
+    truth: Tensor,
+    symmetries: Tensor,
+    points: Tensor,
+    view: Callable[[Tensor, int], Tensor],
+) -> Tensor:
+    """Return min over symmetries of max over points of the distance in a view of camera points."""
+    lead = poses.shape[:-2]
+    points, symmetries = points.to(poses), symmetries.to(poses)
+    out = poses.new_zeros(lead.numel())
+    pairs = zip(poses.reshape(-1, 4, 4), truth.to(poses).reshape(-1, 4, 4), strict=True)
+    for row, (pose, true) in enumerate(pairs):
+        guess = view(transform(pose, points), row)
+        same = view(transform(true @ symmetries, points), row)
+        out[row] = (same - guess).norm(dim=-1).amax(-1).amin(0)
+    return out.view(lead)
+
+
+def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
+    """Fill in the turns between those that stand for a continuous symmetry.
+
+    An object knows a continuous symmetry by few turns, which would count a pose between two of
+    them as an error.
+
+    Args:
+        symmetries: (S, 4, 4) object_from_object.
+        step: The largest angle between neighbors [rad].
+
+    Returns:
+        (S', 4, 4); as given where no turn is smaller than 15 degrees.
+    """
+    turns = log_so3(rotation_of(symmetries))
+    angles = turns.norm(dim=-1)
+    least = angles.masked_fill(angles < 1e-4, torch.inf).argmin()
+    if not 1e-4 < float(angles[least]) < _CONTINUOUS:
+        return symmetries
+    count = math.ceil(float(angles[least]) / step)
+    # the axis is where the turn leaves points as they are: (I - R) c = t, least squares
+    R, t = rotation_of(symmetries[least]), translation_of(symmetries[least])
+    point = torch.linalg.pinv(torch.eye(3).to(R) - R, rtol=1e-4) @ t
+    parts = []
+    for k in range(count):
+        part = torch.eye(4).to(symmetries)
+        part[:3, :3] = exp_so3(turns[least] * (k / count))
+        part[:3, 3] = point - part[:3, :3] @ point
+        parts.append(symmetries @ part)
+    return torch.cat(parts)
+
+
+def average_recall(errors: Tensor, thresholds: Sequence[float], unit: Tensor) -> float:
+    """Return the mean over thresholds of the percentage of instances below.
+
+    Args:
+        errors: (N,).
+        thresholds: In units of `unit`.
+        unit: (N,), such as the diameters; in the unit of the errors.
+
+    Returns:
+        The average recall in [0, 100]; NaN without instances.
+    """
+    limits = unit[:, None] * torch.tensor(thresholds, dtype=unit.dtype, device=unit.device)
+    return float(100 * (errors[:, None] < limits).double().mean())
+
+
+class BopErrors(Metric):
+    """MSSD and MSPD of all instances; poses that are not finite have infinite error.
+
+    Args:
+        models: The objects.
+        **kwargs: Arguments of torchmetrics.Metric.
+    """
+
+    full_state_update = False
+    rows: list[Tensor]
+
+    def __init__(self, models: Sequence[ObjectModel], **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.models = list(models)
+        self.symmetries = [densify(model.symmetries.double()) for model in models]
+        # surface points alone would miss corners
+        self.points = [torch.cat([model.hull, model.points]).double() for model in models]
+        self.add_state("rows", default=[], dist_reduce_fx="cat")
+
+    def update(
+        self,
+        poses: Tensor,
+        truth: Tensor,
+        intrinsics: Tensor,
+        width: int,
+        object_id: Tensor | None = None,
+    ) -> None:
+        """Accumulate errors.
+
+        Args:
+            poses: (B, 4, 4) estimates, camera_from_object [m].
+            truth: (B, 4, 4) true poses.
+            intrinsics: (B, 3, 3) [px].
+            width: Of the images [px].
+            object_id: (B,) index into `models`; the only one if None.
+        """
+        ids = [0] * len(truth) if object_id is None else object_id.tolist()
+        rows = torch.full((len(truth), 3), torch.inf, dtype=torch.float64, device=truth.device)
+        for i, index in enumerate(ids):
+            rows[i, 2] = self.models[index].diameter
+            if not bool(poses[i].isfinite().all()):
+                continue
+            pair = poses[i].double(), truth[i].double()
+            known = self.symmetries[index], self.points[index]
+            rows[i, 0] = mssd(*pair, *known)
+            pixels = mspd(*pair, *known, intrinsics[i].double())
+            rows[i, 1] = pixels * REFERENCE_WIDTH / width
+        self.rows.append(rows)
+
+    def compute(self) -> dict[str, dict[str, float]]:
+        """Return {"mssd": {"ar", "median_mm"}, "mspd": {"ar", "median_px"}}, average recalls in [0,
+        100]; pixels are those of an image 640 wide.
+        """
+        rows = dim_zero_cat(self.rows) if len(self.rows) else torch.zeros(0, 3)
+        surface, pixels, diameter = rows.unbind(1)
+        middle = torch.tensor([torch.nan, torch.nan])
+        if len(rows):
+            ordered = rows[:, :2].sort(0).values
+            middle = ordered[[(len(rows) - 1) // 2, len(rows) // 2]].mean(0)
+        return {
+            "mssd": {
+                "ar": average_recall(surface, MSSD_THRESHOLDS, diameter),
+                "median_mm": float(1000 * middle[0]),
+            },
+            "mspd": {
+                "ar": average_recall(pixels, MSPD_THRESHOLDS, torch.ones_like(pixels)),
+                "median_px": float(middle[1]),
+            },
+        }
