@@ -35,6 +35,8 @@ KEYS = (
     "signs/off_frame/last",
     "signs/near_edge/last",
     "signs/near_corner/last",
+    "signs/line_share/first",
+    "signs/line_share/last",
     "signs/auroc",
 )
 NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # have columns, or none

@@ -25,6 +25,8 @@ WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
 MODELS = (*DETECTORS, *WITH_POSE)
 # but for the normalizations' statistics
 UNTRAINED = "optimizer.lr=0 trainer.max_steps=2 trainer.val_check_interval=2"
+# of the displacement, not stated in the paper; the first is the default
+UNITS = "model.displacement.unit=half_frame,10,1,learned"
 # ablations of more than one seed; the detectors' paper and working are in the table of
 # memorization, with all seeds
 TELLING = (
@@ -111,6 +113,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     lines += [
         Line("untrained", f"{memorize} variant=paper {UNTRAINED} seed=1,2,3,4"),
         Line("memorize", f"{memorize} variant=paper seed=1,2,3,4"),
+        *list_units(),
         Line("held_out", f"{FOUR} seed=1,2"),
         Line(
             "held_out_less",
@@ -131,6 +134,20 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         }
         runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
+    return lines
+
+
+def list_units() -> list[Line]:
+    """Return the runs of the paper's variant over the unit of its displacement: without training,
+    then memorizing at the size of the ablations, which has 32 particles (detectors) or a narrower
+    network and ten steps (with a pose).
+    """
+    untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=none"
+    lines = [Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2")]
+    paper = "experiment=memorize ablation=paper callbacks=none"
+    for model in ("patch_pf", "downsized", "cnn_patch"):
+        sweep = "ablation_detect" if model in DETECTORS else "ablation"
+        lines.append(Line("unit", f"model={model} {paper} sweep={sweep} {UNITS} seed=0,1,2"))
     return lines
 
 

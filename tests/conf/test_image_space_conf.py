@@ -93,6 +93,8 @@ REMEDIES = [
     "model/glimpse=integer",
     "model.net.normalization=batch",
     "model/displacement=unbounded",
+    "model/displacement=unbounded model.displacement.unit=10",
+    "model/displacement=unbounded model.displacement.unit=learned",
     "loss/aux/displacement=none",
     "loss/aux/displacement=towards model.aux_losses.displacement.loss.label.target=center",
     "loss/aux/likelihood=none",

@@ -1,7 +1,9 @@
 """What plain outputs mean."""
 
+import pytest
 import torch
 
+from posefilter.errors import UserError
 from posefilter.geometry.pose import invert, is_rigid, transform
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
 from posefilter.nets.heads import (
@@ -33,6 +35,37 @@ def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
     out = state + Unbounded()(raw, logit, state, 100, 50)
     assert (out < 0).any()
     assert (out > 100).any()
+
+
+def test_the_unit_scales_the_displacement() -> None:
+    g = torch.Generator().manual_seed(0)
+    raw, state = torch.randn(2, 7, 2, generator=g), torch.rand(2, 7, 2, generator=g) * 90
+    one = Unbounded(1)(raw, raw[..., 0], state, 100, 50)
+    assert torch.equal(one, raw)
+    assert torch.equal(Unbounded(10.0)(raw, raw[..., 0], state, 100, 50), raw * 10)
+    for width in (100, 160, 333):  # the default, and the bits of runs without a choice of unit
+        assert torch.equal(Unbounded()(raw, raw[..., 0], state, width, 50), raw * (width / 2))
+    assert not list(Unbounded().state_dict()), "weights of before have no unit"
+
+
+def test_a_learned_unit_is_taught_by_the_loss() -> None:
+    head, raw = Unbounded("learned"), torch.tensor([[[0.5, -1.0]]])
+    state, goal = torch.zeros(1, 1, 2), torch.tensor([[[20.0, -40.0]]])
+    optimizer = torch.optim.Adam(head.parameters(), lr=0.1)
+    torch.testing.assert_close(
+        head(raw, raw[..., 0], state, 100, 50), torch.tensor([[[5.0, -10.0]]])
+    )
+    for _ in range(200):
+        optimizer.zero_grad()
+        (head(raw, raw[..., 0], state, 100, 50) - goal).square().sum().backward()
+        optimizer.step()
+    torch.testing.assert_close(head.unit_px(100), torch.tensor(40.0), atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("unit", ["frame", 0, -1.0, float("nan"), float("inf"), True])
+def test_an_unknown_unit_is_named_with_the_choices(unit: str | float) -> None:
+    with pytest.raises(UserError, match=f"unit={unit}: choose half_frame, learned, or a number"):
+        Unbounded(unit)
 
 
 def test_a_particle_pushed_onto_an_edge_can_be_taught_back() -> None:

@@ -26,6 +26,7 @@ LISTS: dict[str, Color] = {
     "off_frame": AXES[0],
     "near_edge": AXES[2],
     "near_corner": (240, 160, 30),
+    "line_share": (150, 90, 200),
 }
 NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 

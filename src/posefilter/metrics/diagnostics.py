@@ -97,11 +97,28 @@ def distinct(state: Tensor, cell_px: float = 0.1) -> Tensor:
     return torch.stack([cells.new_tensor(len(one.unique(dim=0)) / len(one)) for one in cells])
 
 
+def line_share(state: Tensor) -> Tensor:
+    """Return the share of the particles' variance that lies along their first principal axis.
+
+    1: all on one line, whatever its direction; 0.5: no direction is preferred. Particles that are
+    uniform in a frame of 4:3 have 0.64. NaN where all particles coincide. All particles count,
+    those off the frame too.
+
+    (B, N, 2) [px] -> (B,).
+    """
+    centered = (state - state.mean(1, keepdim=True)).double()
+    variances = torch.linalg.eigvalsh(centered.mT @ centered)  # ascending
+    total = variances.sum(-1)
+    share = variances[:, -1] / total.clamp_min(1e-12)
+    return torch.where(total > 1e-6, share, torch.nan).to(state.dtype)
+
+
 class FilterDiagnostics(Metric):
     """The diagnostics of this module over many traces: numbers, and lists with one number for each
     step.
 
-    Lists: off_frame, near_edge, near_corner, on_object, distinct. Numbers: pairwise_cosine, the
+    Lists: off_frame, near_edge, near_corner, on_object, distinct, line_share. Numbers:
+    pairwise_cosine, the
     mean over images and steps; offset_r2 and heading, of displacements against the true offset to
     the mask's nearest pixel; auroc of the likelihood, with particles on the mask as positives and
     others in the frame as negatives. The last three are over all steps.
@@ -131,7 +148,8 @@ class FilterDiagnostics(Metric):
             edge, corner = near_edge(particles.state, width, height)
             on = on_object(batch.mask, particles.state)
             off = off_frame(particles.state, width, height)
-            steps.append(torch.stack([on, off, edge, corner, distinct(particles.state)]))
+            line = line_share(particles.state)
+            steps.append(torch.stack([on, off, edge, corner, distinct(particles.state), line]))
             self.cosine.append(pairwise_cosine(output.displacement))
             state = particles.state[:, : self.most]
             displacement = output.displacement[:, : self.most]
@@ -140,13 +158,13 @@ class FilterDiagnostics(Metric):
             positive = overlaps_mask(batch.mask, state).float()
             scored = torch.stack([output.log_likelihood[:, : self.most].float(), positive], dim=-1)
             self.scored.append(scored[~is_off_frame(state, width, height)])
-        self.shares.append(torch.stack(steps).permute(2, 0, 1))  # (B, T, 5)
+        self.shares.append(torch.stack(steps).permute(2, 0, 1))  # (B, T, 6)
 
     def compute(self) -> dict[str, Any]:
         """Return the diagnostics by name."""
-        shares = concat_state(self.shares).mean(0)
+        shares = concat_state(self.shares).nanmean(0)  # only a line_share can be NaN
         offsets, scored = concat_state(self.offsets), concat_state(self.scored)
-        names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct")
+        names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct", "line_share")
         lists = zip(names, shares.T.tolist(), strict=True)
         displacement, true = offsets[:, :2], offsets[:, 2:]
         return dict(lists) | {

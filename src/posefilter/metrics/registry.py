@@ -247,6 +247,25 @@ _METRICS = (
         "signs/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"
     ),
     MetricInfo(
+        "signs/line_share",
+        "variance along one line",
+        "%",
+        ".1f",
+        factor=100.0,
+        limits=PERCENT,
+        short="along a line",
+        meaning="share of the particles' variance along its first principal axis; 50: no line",
+    ),
+    MetricInfo(
+        "signs/line_share/first",
+        "variance along one line at the start",
+        "%",
+        ".1f",
+        factor=100.0,
+        limits=PERCENT,
+        short="began along a line",
+    ),
+    MetricInfo(
         "signs/pairwise_cosine",
         "agreement of the displacements",
         form=".2f",

@@ -1,5 +1,6 @@
 """Output heads: a displacement over the image, and a pose."""
 
+import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import torch
@@ -35,11 +36,41 @@ class PosePrediction(NamedTuple):
 
 
 class Unbounded(nn.Module):
-    """The outputs are the displacement in half frame widths; particles may leave the frame."""
+    """The outputs are the displacement in a unit of length; particles may leave the frame.
+
+    The paper does not state the unit. It decides how far an untrained network throws particles.
+
+    Args:
+        unit: "half_frame" for half the frame's width, a number of pixels, or "learned" for one
+            positive number of pixels that is trained with the network and starts at 10.
+    """
+
+    learned_from_px: ClassVar[float] = 10.0
+
+    def __init__(self, unit: str | float = "half_frame") -> None:
+        super().__init__()
+        if isinstance(unit, str):
+            known = unit in ("half_frame", "learned")
+        else:
+            known = not isinstance(unit, bool) and 0 < unit < math.inf
+        if not known:
+            raise UserError(
+                f"model.displacement.unit={unit}: choose half_frame, learned, or a number of "
+                "pixels above 0"
+            )
+        self.unit = unit
+        if unit == "learned":  # its logarithm, so that it stays positive
+            self.log_unit = nn.Parameter(torch.tensor(math.log(self.learned_from_px)))
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2) -> (B, N, 2) [px]."""
-        return raw * (width / 2)
+        return raw * self.unit_px(width)
+
+    def unit_px(self, width: int) -> Tensor | float:
+        """Return the unit in a frame of this width [px]."""
+        if self.unit == "half_frame":
+            return width / 2
+        return self.log_unit.exp() if self.unit == "learned" else float(self.unit)
 
 
 class Bounded(nn.Module):

@@ -29,6 +29,7 @@ SIGNS = {
         "signs/off_frame/last",
         "signs/near_edge/last",
         "signs/near_corner/last",
+        "signs/line_share/last",
     ),
     "Displacements": ("val/signs/pairwise_cosine", "val/signs/offset_r2", "val/signs/heading"),
     "Likelihood": ("val/signs/auroc",),
