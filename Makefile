@@ -21,8 +21,8 @@ $(STAMP): pyproject.toml
 train: $(STAMP) ## render scenes if there are none, train on them, test, print the table
 	$(PY) train.py $(ARGS)
 
-test: $(STAMP) ## run the tests
-	$(PY) -m pytest $(ARGS)
+test: $(STAMP) ## run the tests, two at a time, one thread each
+	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist worksteal $(ARGS)
 
 check: $(STAMP) ## check format, lint, types and import floors
 	.ci/check $(VENV)/bin

@@ -51,8 +51,11 @@ BRIGHT = 3  # which of them is animated: well lit, and nothing stands before the
 # the search that is animated: it begins anywhere on the measured surfaces rather than where the
 # network proposes
 SEARCH = {
-    "initialize": {"_target_": "posefilter.filters.initialize.FromDepth", "behind": [0.1, 0.9]},
-    "filter": {"steps": 20, "first_particles": 3000},
+    "filter": {
+        "initialize": {"_target_": "posefilter.filters.initialize.FromDepth", "behind": [0.1, 0.9]},
+        "steps": 20,
+        "first_particles": 3000,
+    },
 }
 WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG
 TOUR = {  # what docs/tour.md shows -> what its commands leave

@@ -72,6 +72,8 @@ def scenes() -> list[Batch]:
 class Told(PoseEstimator):
     """Knows the truth, but believes the object of image i to be i cm to the right."""
 
+    provides = ("pose", "pose_space", "propose_poses")
+
     def __init__(self) -> None:
         pieces = (
             FromProposals(),

@@ -30,7 +30,7 @@ REFUSED = {
     "generate meshes=nowhere": "meshes=nowhere: no such folder",
     "check_data meshes=nowhere": "meshes=nowhere: no such folder",
     "report run=nowhere": "run=nowhere: no such folder",
-    "export checkpoint=999_nothing": "no weights of that name (003_cracker_box",
+    "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, 003_cracker_box",
     "fly": "fly: there is no such command; choose train, evaluate",
 }
 OWN = {**os.environ, "PYTHONPATH": str(HOME / "src")}  # wherever it is started

@@ -164,7 +164,7 @@ def test_the_papers_samples_lie_where_they_are_said_to() -> None:
     method = PosePF(
         PaperLikelihood(),
         LabeledRays(rays=8),
-        filter=working().filter,
+        filter=working(FromDepth()).filter,
         loss=Regression(PaperPoints()),
         optimizer=torch.optim.Adam,
     )

@@ -278,24 +278,24 @@ def test_a_step_that_is_cut_looks_back_at_none() -> None:
     method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
     every = {(later, earlier) for later in range(6) for earlier in range(later)}
     whole = roll(method, None)
-    assert pairs(whole, "displacement") == pairs(whole, "memory") == every
+    assert pairs(whole, "displacement") == pairs(whole, "latent") == every
     for truncate in (1, 2, 3):
         trace = roll(method, truncate)
-        for found in (pairs(trace, "displacement"), pairs(trace, "memory")):
+        for found in (pairs(trace, "displacement"), pairs(trace, "latent")):
             assert not {later for later, _ in found if later % truncate == 0}
             # the others are not cut
             assert {(later, later - 1) for later in range(1, 6) if later % truncate} <= found
 
 
-def test_a_memory_is_cut_into_stretches() -> None:
+def test_a_latent_is_cut_into_stretches() -> None:
     torch.manual_seed(0)
     method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
     # no particle moves, so that latent is all that a step hands on
     method.train_filter.propagate = Identity()
-    assert pairs(roll(method, 2), "memory") == {(1, 0), (3, 2), (5, 4)}
-    assert pairs(roll(method, 3), "memory") == {(1, 0), (2, 0), (2, 1), (4, 3), (5, 3), (5, 4)}
-    assert not pairs(roll(method, 1), "memory")
-    assert len(pairs(roll(method, None), "memory")) == 15
+    assert pairs(roll(method, 2), "latent") == {(1, 0), (3, 2), (5, 4)}
+    assert pairs(roll(method, 3), "latent") == {(1, 0), (2, 0), (2, 1), (4, 3), (5, 3), (5, 4)}
+    assert not pairs(roll(method, 1), "latent")
+    assert len(pairs(roll(method, None), "latent")) == 15
 
 
 def test_places_that_are_judged_are_not_cut() -> None:

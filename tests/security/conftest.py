@@ -37,6 +37,8 @@ _ALWAYS = (  # that no loading of a file has to do with
     "webbrowser.open",
 )
 
+_OWN = ("os.remove",)  # allowed in a run's own folder
+
 
 class Watch:
     """Writes down forbidden events while it is armed: processes, connections, writes, hostile
@@ -55,17 +57,22 @@ class Watch:
             event in _ALWAYS
             and "__pycache__" not in str(arguments[:1])
             and arguments[:1] != (None,)
+            and not (event in _OWN and self._is_own(arguments[0]))
         ):
             self.seen.append(f"{event} {arguments!r:.120}")
         elif event == "import" and str(arguments[0]).startswith("hostile"):
             self.seen.append(f"import {arguments[0]}")
         elif event == "open" and isinstance(arguments[0], str | bytes | Path):
             path, mode = str(arguments[0]), str(arguments[1] or "")
-            own = self.own is not None and Path(path).resolve().is_relative_to(self.own)
+            own = self._is_own(path)
             if (set(mode) & set("wax+") and "__pycache__" not in path and not own) or str(
                 self.secret
             ) in path:
                 self.seen.append(f"open {path} {mode}")
+
+    def _is_own(self, path: Any) -> bool:
+        """Tell whether a path, links resolved, lies in the folder that may be written to."""
+        return self.own is not None and Path(str(path)).resolve().is_relative_to(self.own)
 
     def __enter__(self) -> "Watch":
         self.armed = True

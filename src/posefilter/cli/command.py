@@ -98,7 +98,8 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
         console = job.cfg.get("console", JSON)
         settle_logging(console)
         try:
-            (job.folder / FAILED).unlink(missing_ok=True)
+            if name == "train" or job.swept:  # others may work in a folder that is not theirs
+                (job.folder / FAILED).unlink(missing_ok=True)
             check_settings(cfg)
             use_plugins(cfg)
             check_files(name, cfg)
