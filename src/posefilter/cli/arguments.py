@@ -39,7 +39,7 @@ def check_choices(arguments: list[str], conf: Path) -> None:
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
         if key == "preset" and value != "null":
-            check_preset(value, [conf, *_config_folders(arguments)])
+            check_preset(value, [conf, *config_folders(arguments)])
         now = None if own and (conf / group / f"{value}.yaml").is_file() else rename(argument)
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
@@ -63,7 +63,7 @@ def check_preset(name: str, folders: Sequence[Path]) -> None:
     raise UserError(f"preset={name}: there is no such choice{hint}; there are {', '.join(known)}")
 
 
-def _config_folders(arguments: Sequence[str]) -> list[Path]:
+def config_folders(arguments: Sequence[str]) -> list[Path]:
     """Return the folders of settings that were typed by --config-dir (or -cd)."""
     words = [part for a in arguments for part in a.split("=", 1)]
     return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")]

@@ -31,6 +31,7 @@ from posefilter.cli.preflight import check_files
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import Scope, installed, trust
+from posefilter.cli.usage import describe_command
 from posefilter.errors import (
     FAILURE,
     INTERRUPTED,
@@ -66,6 +67,9 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     register_resolvers()
     before = sys.argv
     try:
+        if {"--help", "-h"} & {*arguments}:
+            print(describe_command(name, conf, arguments))
+            return 0
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")

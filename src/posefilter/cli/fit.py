@@ -14,11 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationResolutionError
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
 from posefilter.cli.options import Groups, list_places, list_targets, open_groups
 from posefilter.cli.trust import Scope, check_name, is_plugin
 from posefilter.errors import UserError
+
+_LINK = re.compile(r"\$\{([\w.]+)\}")
+_DEEPEST = 32  # of nested settings
 
 
 class Piece(NamedTuple):
@@ -43,8 +47,13 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
     model = settings.get("model")
     if not isinstance(model, DictConfig):
         return
-    node = OmegaConf.to_container(model, resolve=True)
     tree = OmegaConf.to_container(settings, resolve=False)
+    broken: InterpolationResolutionError | None = None
+    try:
+        node = OmegaConf.to_container(model, resolve=True)
+    except InterpolationResolutionError as error:
+        # a choice may refer to what another method has: the pair is the mistake
+        node, broken = resolve_known(tree, "model"), error
     pieces = [
         Piece(key, target, declared_by(target, key, scope))
         for place, target in list_targets(node, "model")
@@ -59,6 +68,37 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
         with open_groups() as groups:
             told = _explain(pieces[number], need, pieces, keys, near, scope, groups)
         raise UserError(told)
+    if broken is not None:
+        raise broken
+
+
+def resolve_known(tree: Any, place: str) -> Any:
+    """Return a part of plain settings with every reference in it replaced, save those to what there
+    is not.
+
+    Args:
+        tree: The whole configuration, plain and not resolved.
+        place: The part's place.
+    """
+
+    def walk(node: Any, depth: int) -> Any:
+        if isinstance(node, dict):
+            return {key: walk(value, depth + 1) for key, value in node.items()}
+        if isinstance(node, list):
+            return [walk(value, depth + 1) for value in node]
+        link = _LINK.fullmatch(node) if isinstance(node, str) else None
+        if link is None or depth > _DEEPEST:  # settings that refer to themselves have no end
+            return node
+        found = _find(tree, link[1].split("."))
+        return node if found is None else walk(found, depth + 1)
+
+    return walk(_find(tree, place.split(".")), 0)
+
+
+def _find(tree: Any, path: Sequence[str]) -> Any:
+    for key in path:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return tree
 
 
 def declared_by(target: str, key: str, scope: Scope) -> Declared:
@@ -139,10 +179,8 @@ def typed_key(tree: Any, where: str) -> str:
     path: list[str] = []
     for part in where.split("."):
         path.append(part)
-        node: Any = tree
-        for key in path:
-            node = node.get(key) if isinstance(node, dict) else None
-        if isinstance(node, str) and (link := re.fullmatch(r"\$\{([\w.]+)\}", node)):
+        node = _find(tree, path)
+        if isinstance(node, str) and (link := _LINK.fullmatch(node)):
             path = link[1].split(".")
     return ".".join(path)
 

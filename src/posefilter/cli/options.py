@@ -64,7 +64,8 @@ class Groups:
 
     def list_options(self, group: str) -> list[Option]:
         """Read all choices of a group."""
-        names = self._loader.get_group_options(group.partition("@")[0])
+        # not the loader's own get_group_options, which copies every file that it has read
+        names = self._loader.repository.get_group_options(group.partition("@")[0])
         return [self.load(group, name) for name in names if not name.startswith("_")]
 
     def _load(self, group: str, name: str) -> Option:
