@@ -36,6 +36,13 @@ def test_chamfer_equals_the_naive_double_loop(batch, model, make_trace) -> None:
     assert got == pytest.approx(want / 2 / W**2)
 
 
+def test_all_mask_pixels_or_an_even_selection_count(batch, model, make_trace) -> None:
+    trace = make_trace(f64([[[12.3, 7.6]]]))
+    everything, few = Chamfer(size=3, most=None), Chamfer(size=3, most=3)
+    assert everything(trace, batch, model) == Chamfer(size=3, most=16)(trace, batch, model)
+    assert few(trace, batch, model) != everything(trace, batch, model)
+
+
 def test_towards_object_points_at_the_nearest_or_the_centre_within_reach(
     batch, model, make_trace
 ) -> None:

@@ -22,7 +22,7 @@ from posefilter.labels.paper_points import PaperPoints
 from posefilter.losses.contrast import Contrast
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
-from posefilter.models.candidate_samplers import CandidatePoses, LabeledRays
+from posefilter.models.candidate_samplers import CandidatePoses, LabeledRays, pick_pixels
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.nets.paper_likelihood import PaperLikelihood
@@ -187,6 +187,45 @@ def test_the_papers_samples_lie_where_they_are_said_to() -> None:
     loss = method.training_losses(batch, torch.Generator().manual_seed(0))["likelihood"]
     assert loss.shape == (2,)
     assert torch.isfinite(loss).all()
+
+
+def test_all_rays_are_each_pixel_once_and_images_differ_in_their_number() -> None:
+    usable = torch.tensor([[0.0, 1, 0, 1, 1], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
+    pick, drawn = pick_pixels(usable, None, torch.Generator())
+    assert pick.shape == (3, 3)
+    assert [row[mask].tolist() for row, mask in zip(pick, drawn, strict=True)] == [
+        [1, 3, 4],
+        [2],
+        [],
+    ]
+    some, drawn = pick_pixels(usable, 50, torch.Generator().manual_seed(0))
+    assert [set(row.tolist()) for row in some[:2]] == [{1, 3, 4}, {2}]
+    assert drawn.all(1).tolist() == [True, True, False]
+
+
+def test_every_ray_of_an_image_has_the_same_weight_and_padding_none() -> None:
+    method = PosePF(
+        PaperLikelihood(),
+        LabeledRays(rays=None, samples=3),
+        filter=working().filter,
+        loss=Regression(PaperPoints()),
+        optimizer=torch.optim.Adam,
+    )
+    method.set_object(square())
+    batch = scenes(2)
+    sizes = (batch.mask & (batch.depth > 0.1)).flatten(1).sum(1)
+    batch.mask[1, 0, :, : batch.mask.shape[-1] // 2] = False
+    smaller = (batch.mask & (batch.depth > 0.1)).flatten(1).sum(1)
+    assert 0 < smaller[1] < sizes[1]
+    trace = method.candidate_sampler(
+        method, method.encode(batch), batch, torch.Generator().manual_seed(0)
+    )
+    weight = trace.particles[0].log_weights.exp().unflatten(1, (2, -1, 3))  # color, ray, sample
+    assert ((weight[:, 0, :, 0] > 0).sum(1) == smaller).all()
+    torch.testing.assert_close(weight.flatten(1).sum(1), torch.ones(2))
+    assert torch.isfinite(
+        method.training_losses(batch, torch.Generator().manual_seed(0))["likelihood"]
+    ).all()
 
 
 def test_the_papers_lesson_refuses_another_likelihood() -> None:

@@ -42,6 +42,36 @@ def test_batch_statistics_mix_particles_and_layer_statistics_do_not(
         assert (not torch.allclose(before, after, atol=1e-6)) == mixes
 
 
+def test_the_displacement_reads_the_logit_or_the_likelihood() -> None:
+    torch.manual_seed(0)
+    size = {"latent_width": 8, "width": 16, "normalization": "layer"}
+    by_logit, by_likelihood = (
+        LatentNet(0, 1, displacement_reads=reads, **size) for reads in ("logit", "likelihood")
+    )
+    by_likelihood.load_state_dict(by_logit.state_dict())
+    inputs = torch.rand(1, 3, 4, 1, 1), torch.zeros(1, 3, 0), torch.zeros(1, 3, 8)
+    for net, read in ((by_logit, lambda x: x), (by_likelihood, torch.sigmoid)):
+        out = net(*inputs)
+        told = torch.cat([out.pose, read(out.logit)[..., None], out.latent], -1)
+        torch.testing.assert_close(out.displacement, net.displacement(told))
+    assert not torch.equal(by_logit(*inputs).displacement, by_likelihood(*inputs).displacement)
+    with pytest.raises(UserError, match="choose logit or likelihood"):
+        LatentNet(0, 1, displacement_reads="odds")
+
+
+@pytest.mark.parametrize("kernel", [1, 5])
+def test_the_kernel_decides_what_a_convolution_sees(kernel: int) -> None:
+    """Three layers reach three times half a kernel: what lies further off changes nothing."""
+    net = PatchNet(0, 9, width=4, normalization="layer", kernel=kernel).eval()
+    patch = torch.rand(1, 1, 4, 9, 9, requires_grad=True)
+    net.convolve[0](patch[0])[..., 4, 4].sum().backward()
+    seen = patch.grad[0, 0].abs().sum(0) > 0
+    assert seen.sum() == kernel**2
+    assert net(patch, torch.zeros(1, 1, 0), torch.zeros(1, 1, 0)).displacement.shape == (1, 1, 2)
+    with pytest.raises(UserError, match=r"kernel=4: must be odd"):
+        PatchNet(0, 9, kernel=4)
+
+
 def test_latent_net_remembers() -> None:
     torch.manual_seed(0)
     net = LatentNet(0, 1, latent_width=8, pose_width=9, width=16, normalization="layer")

@@ -172,6 +172,28 @@ def test_context_without_a_proposal_network_is_refused() -> None:
         net(lay_out(*image(), K), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator())
 
 
+def test_pixels_are_drawn_about_the_origin_or_the_center() -> None:
+    rgb, depth = image()
+    noise = torch.zeros(1, 1, 1, 2)
+    for anchor in (None, torch.zeros(3)):
+        points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor)
+        point = CENTER if anchor is None else anchor
+        wanted = project(transform(pose(), point[None, None, None])[:, 0], K).round()
+        ray = torch.nn.functional.normalize(rays(wanted, K), dim=-1) @ pose()[0, 0, :3, :3]
+        torch.testing.assert_close(points.ray[0, 0], ray[0])
+    other = CENTER + 0.3  # far from the origin: about the one or the other is not the same
+    scores = [
+        PaperLikelihood(about=about)(
+            lay_out(rgb, depth, K), pose(), torch.tensor(0.0), center, RADIUS, 8, torch.Generator()
+        ).shape
+        for about in ("origin", "center")
+        for center in (CENTER, other)
+    ]
+    assert set(scores) == {(1, 1)}
+    with pytest.raises(UserError, match="choose origin or center"):
+        PaperLikelihood(about="middle")
+
+
 def test_the_papers_likelihood_is_a_sum_over_points() -> None:
     rgb, depth = image()
     net = PaperLikelihood()

@@ -53,12 +53,12 @@ class Chamfer:
 
     Args:
         size: Side of the patch [px].
-        most: Maximum number of mask pixels, an even selection.
+        most: Maximum number of mask pixels, an even selection; None for all.
     """
 
     requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
-    def __init__(self, size: int = 9, most: int = 256) -> None:
+    def __init__(self, size: int = 9, most: int | None = 256) -> None:
         self.size = size
         self.most = most
 

@@ -176,11 +176,32 @@ class CandidatePoses:
             self.persistent.restore(state)
 
 
+def pick_pixels(usable: Tensor, count: int | None, generator: Generator) -> tuple[Tensor, Tensor]:
+    """Draw pixels of each image with replacement, or list all of them.
+
+    Args:
+        usable: (B, H * W) 1 for pixels to choose from, else 0.
+        count: Pixels of an image; None for all of them, padded to the longest list.
+        generator: Source of randomness; not used where all are listed.
+
+    Returns:
+        Indices (B, R), and which of them are usable (B, R) bool: padding is not, nor any pixel of
+        an image that has none.
+    """
+    if count is not None:
+        empty = usable.sum(1, keepdim=True) == 0
+        pick = torch.multinomial(usable + empty, count, replacement=True, generator=generator)
+        return pick, (~empty).expand_as(pick)
+    longest = max(1, int(usable.sum(1).max()))
+    drawn, pick = usable.sort(dim=1, descending=True, stable=True)
+    return pick[:, :longest], drawn[:, :longest] > 0
+
+
 class LabeledRays:
     """The paper's lesson: points along the rays of the object's pixels, scored one by one (section
     5).
 
-    rays: mask pixels an image and step (not stated; the paper takes all of them); samples: points a
+    rays: mask pixels an image and step, drawn with replacement (null: all of them once, as in the paper); samples: points a
     ray, evenly spaced from `start` in front of the camera to `past` behind the observed point;
     tolerance: the half width of the surface, where a second sample keeps the observed color. Colors
     are random otherwise.
@@ -191,7 +212,7 @@ class LabeledRays:
 
     def __init__(
         self,
-        rays: int = 64,
+        rays: int | None = 64,
         samples: int = 30,
         start: float = 0.10,
         past: float = 0.05,
@@ -221,10 +242,7 @@ class LabeledRays:
         device = batch.rgb.device
         depth = batch.depth.flatten(1)
         usable = (batch.mask.flatten(1) & (depth > self.start)).float()
-        empty = usable.sum(1) == 0  # such an image teaches nothing: its samples get no weight below
-        pick = torch.multinomial(
-            usable + empty[:, None], self.rays, replacement=True, generator=generator
-        )
+        pick, drawn = pick_pixels(usable, self.rays, generator)
         pixel = torch.stack([pick % W, pick // W], dim=-1).float()
         z = depth.gather(1, pick)[..., None]
         share = torch.linspace(0, 1, self.samples, device=device)
@@ -238,12 +256,13 @@ class LabeledRays:
         observed = scene.image.values.gather(1, pick[..., None].expand(-1, -1, 3))
         observed = observed[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)
         random = torch.rand(observed.shape, generator=generator, device=device)
-        near = (offset.abs() <= self.tolerance) & ~empty[:, None]
+        valid = drawn[:, :, None].expand(-1, -1, self.samples).flatten(1)
+        near = (offset.abs() <= self.tolerance) & valid
         state = [
             torch.cat([pixel, offset[..., None], torch.full_like(offset, own)[..., None]], -1)
             for own in (0.0, 1.0)
         ]
-        weight = torch.cat([(~empty[:, None]).expand_as(near), near], dim=1).float()
+        weight = torch.cat([valid, near], dim=1).float()
         judged = net.judge_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
         log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
         particles = make_even_particles(torch.cat(state, dim=1))._replace(log_weights=log_weights)

@@ -76,11 +76,17 @@ def lay_out(
 
 
 def look(
-    image: Pixels, poses: Tensor, center: Tensor, radius: float, noise: Tensor, spread: float = 0.6
+    image: Pixels,
+    poses: Tensor,
+    center: Tensor,
+    radius: float,
+    noise: Tensor,
+    spread: float = 0.6,
+    anchor: Tensor | None = None,
 ) -> Points:
     """Gather the pixels of each pose, and map them into its object frame.
 
-    Pixels are the projected center + spread x projected radius x noise, rounded. With the same
+    Pixels are the projected anchor + spread x projected radius x noise, rounded. With the same
     noise for all poses of an image their scores are comparable (common random numbers).
 
     Args:
@@ -90,6 +96,7 @@ def look(
         radius: The object's radius [m].
         noise: (B, 1 or N, P, 2) standard normal.
         spread: Standard deviation of the pixels, in projected radii.
+        anchor: (3,) the object point about which pixels are drawn [m]; None for the center.
 
     Returns:
         Points (B, N, P).
@@ -97,8 +104,9 @@ def look(
     H, W = image.size
     K = image.intrinsics
     middle = origin_of(poses, center)
-    reach = spread * radius * K[:, None, 0, 0] / middle[..., 2].clamp_min(0.1)
-    pixels = (project(middle, K)[..., None, :] + reach[..., None, None] * noise).round()
+    about = middle if anchor is None else origin_of(poses, anchor)
+    reach = spread * radius * K[:, None, 0, 0] / about[..., 2].clamp_min(0.1)
+    pixels = (project(about, K)[..., None, :] + reach[..., None, None] * noise).round()
     inside = (
         (pixels[..., 0] >= 0) & (pixels[..., 0] < W) & (pixels[..., 1] >= 0) & (pixels[..., 1] < H)
     )

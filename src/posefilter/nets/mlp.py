@@ -77,6 +77,7 @@ class LatentNet(nn.Module):
         width: Width of hidden layers.
         layers: Linear layers of each MLP.
         normalization: "batch" or "layer".
+        displacement_reads: "logit" or "likelihood" (its sigmoid), beside pose and latent.
     """
 
     def __init__(
@@ -88,13 +89,20 @@ class LatentNet(nn.Module):
         width: int = 512,
         layers: int = 4,
         normalization: str = "batch",
+        displacement_reads: str = "logit",
     ) -> None:
         super().__init__()
+        if displacement_reads not in ("logit", "likelihood"):
+            raise UserError(
+                f"model.net.displacement_reads={displacement_reads!r} is unknown: choose logit or "
+                "likelihood"
+            )
         if min(latent_width, width, layers) < 1:
             raise UserError(
                 f"net: latent_width={latent_width}, width={width} and layers={layers} "
                 f"must be 1 or more"
             )
+        self.displacement_reads = displacement_reads
         self.latent_width = latent_width
         self.latent = mlp(
             4 * size * size + extra + latent_width, latent_width, width, layers, normalization
@@ -107,7 +115,8 @@ class LatentNet(nn.Module):
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; C = 4, k = `size`, E = `extra`."""
         latent = self.latent(torch.cat([patch.flatten(2), extra, latent], dim=-1))
         pose, logit = self.pose(latent), self.likelihood(latent)
-        displacement = self.displacement(torch.cat([pose, logit, latent], dim=-1))
+        read = logit if self.displacement_reads == "logit" else torch.sigmoid(logit)
+        displacement = self.displacement(torch.cat([pose, read, latent], dim=-1))
         return NetOutput(latent, logit[..., 0], displacement, pose)
 
 
@@ -122,6 +131,7 @@ class PatchNet(nn.Module):
         hidden: Width of two layers before the outputs; 0 for none.
         latent_width: 4 to predict the distances to the box's four sides as the latent; 0 for none.
         normalization: "batch" or "layer".
+        kernel: Side of the convolutions' kernels [px], odd; the maps keep the patch's size.
     """
 
     provides: ClassVar[Capabilities] = ("free_latent",)
@@ -135,8 +145,11 @@ class PatchNet(nn.Module):
         hidden: int = 0,
         latent_width: int = 0,
         normalization: str = "batch",
+        kernel: int = 3,
     ) -> None:
         super().__init__()
+        if kernel < 1 or kernel % 2 == 0:
+            raise UserError(f"model.net.kernel={kernel}: must be odd, such as 3, 5 or 9")
         if pose_width:
             raise UserError(
                 "model/net=patch predicts no pose: choose model/pose_head=none, or model/net=latent"
@@ -150,7 +163,11 @@ class PatchNet(nn.Module):
         blocks: list[nn.Module] = []
         for inputs in (4, width, width):
             norm = nn.BatchNorm2d(width) if normalization == "batch" else nn.GroupNorm(1, width)
-            blocks += [nn.Conv2d(inputs, width, 3, padding=1), norm, nn.ReLU(inplace=True)]
+            blocks += [
+                nn.Conv2d(inputs, width, kernel, padding=kernel // 2),
+                norm,
+                nn.ReLU(inplace=True),
+            ]
         self.convolve = nn.Sequential(*blocks)
         features = width * size * size + extra
         outputs = 3 + latent_width

@@ -8,6 +8,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.likelihood import Pixels, Points, look
 from posefilter.nets.linear import Linear
@@ -24,12 +25,19 @@ class PaperLikelihood(nn.Module):
         width: Width of M.
         blocks: Its number of residual blocks.
         spread: Standard deviation of the pixels, in projected radii.
+        about: Where the pixels are drawn about: "origin" of the hypothesis's frame, which is that
+            of the mesh file, or "center" of the mesh.
     """
 
     provides: ClassVar[Capabilities] = ("judge_points", "judge_samples")
 
-    def __init__(self, width: int = 128, blocks: int = 5, spread: float = 0.6) -> None:
+    def __init__(
+        self, width: int = 128, blocks: int = 5, spread: float = 0.6, about: str = "center"
+    ) -> None:
         super().__init__()
+        if about not in ("origin", "center"):
+            raise UserError(f"model.likelihood.about={about!r} is unknown: choose origin or center")
+        self.about = about
         self.spread = spread
         self.net = nn.Sequential(
             Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1)
@@ -63,7 +71,8 @@ class PaperLikelihood(nn.Module):
     ) -> Tensor:
         """Score poses.  poses (B, N, 4, 4) -> (B, N); `sigma` is not used."""
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)
+        anchor = torch.zeros_like(center) if self.about == "origin" else None
         with torch.autocast(poses.device.type, enabled=False):
-            points = look(image, poses, center, radius, noise, self.spread)
+            points = look(image, poses, center, radius, noise, self.spread, anchor)
             scores = self.judge_samples(points.position + center, points.color)
         return torch.where(points.inside & points.known, scores, 0.0).sum(-1)
