@@ -32,7 +32,7 @@ KINDS: dict[str, type[ImageSpace]] = {
     "cnn_patch": CnnPatch,
     "downsized": Downsized,
 }
-DETECTING = ("chamfer", "offset", "bce", "balanced_bce", "focal")
+DETECTING = ("chamfer", "chamfer_rgbd", "offset", "bce", "balanced_bce", "focal")
 # losses by what a method requires of its heads
 FITTING = {(): DETECTING, ("pose",): ("add", "add_s", "confidence", *DETECTING)}
 SMALL = ["filter.particles=12", "filter.steps=2"]
@@ -107,6 +107,7 @@ REMEDIES = [
     "filter/initialize=informed",
     "filter/propagate=learned_and_gaussian",
     "model.glimpse.size=6",
+    "loss=chamfer loss.most=null",
     "model/displacement=gated",
     "model.detach_position=false",
     "loss/schedule=three_stages_displacement",

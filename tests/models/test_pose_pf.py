@@ -207,7 +207,7 @@ def test_every_ray_of_an_image_has_the_same_weight_and_padding_none() -> None:
     method = PosePF(
         PaperLikelihood(),
         LabeledRays(rays=None, samples=3),
-        filter=working().filter,
+        filter=working(FromDepth()).filter,
         loss=Regression(PaperPoints()),
         optimizer=torch.optim.Adam,
     )
