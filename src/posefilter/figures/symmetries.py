@@ -1,0 +1,111 @@
+"""Draw the symmetries that were found: the object as it is, and turned by each of them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from posefilter.figures.canvas import AXES, PAPER, arrange_grid, draw_lines, draw_row
+from posefilter.meshes.find_symmetries import ANY, Turn
+from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.symmetries import turn_about
+from posefilter.rendering.embree import EmbreeRenderer
+from posefilter.rendering.surfaces import Instance, Lights
+
+_TILE = 260  # [px]
+_ANY_SHOWN = np.deg2rad(100.0)  # of a continuous symmetry
+_LIGHTS = Lights(background=(1.0, 1.0, 1.0), specular=0.1)
+# seen from above and from the side; the camera's axes in the object's
+_VIEW = np.array([[0.8, 0.6, 0.0], [0.24, -0.32, -0.9165], [-0.55, 0.7333, -0.4]])
+
+
+def draw_symmetries(
+    mesh: Mesh, found: Sequence[Turn], symmetries: np.ndarray, source: str
+) -> np.ndarray:
+    """Draw a row a turn: the object with the turn's axis, and turned.
+
+    Args:
+        mesh: The object.
+        found: The turns that leave its shape as it is.
+        symmetries: (S, 4, 4) those in use [m].
+        source: Where these come from, in words.
+
+    Returns:
+        The picture (h, w, 3) uint8.
+    """
+    renderer, near = EmbreeRenderer(), 1.6 * diameter(mesh.vertices)
+    camera = _place_camera(mesh, near)
+    K = np.array([[1.3 * _TILE, 0, _TILE / 2], [0, 1.3 * _TILE, _TILE / 2], [0, 0, 1.0]])
+    width = 2 * _TILE + 18
+    rows = [draw_row(width, f"{mesh.name}: symmetries {source}", size=16)]
+    for turn in found:
+        angle = _ANY_SHOWN if turn.fold == ANY else 2 * np.pi / turn.fold
+        transform = turn_about(turn.axis, angle, turn.point)
+        turned = camera @ transform
+        tiles = [_render(renderer, mesh, pose, K) for pose in (camera, turned)]
+        for tile in tiles:
+            _draw_axis(tile, turn, camera, K, near)
+        mark = "in use" if _contains(symmetries, transform) else "not in use"
+        rows.append(draw_row(width, f"{describe_turn(turn)}: {mark}", size=13))
+        rows.append(draw_row(width, _measure(turn), size=11))
+        rows.append(arrange_grid(tiles, 2))
+    if not found:
+        rows.append(draw_row(width, "no turn leaves its shape as it is", size=13))
+        rows.append(arrange_grid([_render(renderer, mesh, camera, K)], 1))
+    return _stack(rows, width)
+
+
+def describe_turn(turn: Turn) -> str:
+    """Return a turn in words: `half turn about (0.00, 0.00, 1.00)`."""
+    kind = {ANY: "any turn", 2: "half turn", 3: "third of a turn", 4: "quarter turn"}[turn.fold]
+    axis = ", ".join(f"{x:.2f}" for x in turn.axis + 0.0)
+    return f"{kind} about ({axis})"
+
+
+def _measure(turn: Turn) -> str:
+    texture = "same texture" if turn.texture else "another texture"
+    return (
+        f"surface {1000 * max(turn.distance, 0):.1f} mm off, farthest {1000 * max(turn.far, 0):.1f} "
+        f"mm; color difference {turn.color:.2f}: {texture}"
+    )
+
+
+def _contains(symmetries: np.ndarray, transform: np.ndarray) -> bool:
+    """Tell whether a turn is one of the symmetries, up to the error of a measured axis."""
+    return bool((np.abs(symmetries - transform)[:, :3, :3].max((1, 2)) < 0.2).any())
+
+
+def _place_camera(mesh: Mesh, distance: float) -> np.ndarray:
+    """Return camera_from_object (4, 4) [m]: the object's center that far ahead."""
+    U, _, Vt = np.linalg.svd(_VIEW)
+    rotation = U @ Vt
+    rotation *= np.sign(np.linalg.det(rotation))
+    out = np.eye(4)
+    out[:3, :3] = rotation
+    out[:3, 3] = np.array([0, 0, distance]) - rotation @ mesh.bounds.mean(0)
+    return out
+
+
+def _render(renderer: EmbreeRenderer, mesh: Mesh, pose: np.ndarray, K: np.ndarray) -> np.ndarray:
+    rgb = renderer.render([Instance(mesh, pose)], K, _TILE, _TILE, _LIGHTS).rgb
+    return (rgb.clip(0, 1) * 255).astype(np.uint8)
+
+
+def _draw_axis(
+    tile: np.ndarray, turn: Turn, camera: np.ndarray, K: np.ndarray, length: float
+) -> None:
+    ends = turn.point + np.array([[-0.4], [0.4]]) * length * turn.axis
+    points: Any = ends @ camera[:3, :3].T + camera[:3, 3]
+    pixels = points @ K.T
+    draw_lines(tile, [pixels[:, :2] / pixels[:, 2:]], AXES[2], 2)
+
+
+def _stack(rows: Sequence[np.ndarray], width: int) -> np.ndarray:
+    """Put rows below each other, on paper."""
+    wide = max(width, *(row.shape[1] for row in rows))
+    out = []
+    for row in rows:
+        full = np.full((row.shape[0], wide, 3), PAPER, np.uint8)
+        full[:, : row.shape[1]] = row
+        out.append(full)
+    return np.concatenate(out)

@@ -1,0 +1,322 @@
+"""Find an object's symmetries: turns that move its surface, and its texture, onto themselves.
+
+Candidate axes are the principal axes of the surface and the axes of its smallest oriented box.
+About each, turns by a half, a third and a quarter are tried, and some by angles that divide no
+circle, which stand for any turn.  A turn is first refined by registering the turned surface with
+itself, since a scan's axes are not exact, and is then judged by distances of turned surface samples
+to the nearest of a second, denser sampling.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+
+from posefilter.geometry.rotation import log_so3
+from posefilter.meshes.mesh import (
+    Mesh,
+    diameter,
+    hull_vertices,
+    sample_surface,
+    surface_colors,
+    surface_points,
+)
+from posefilter.meshes.symmetries import symmetry_group, turn_about
+
+ANY = 0  # the fold of a turn by any angle
+FOLDS = (2, 3, 4)
+# Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance, and
+# of the distance that a fiftieth of the samples exceed, which holes and handles raise.
+MEAN_EXCESS, FAR_EXCESS = 0.01, 0.02
+# of the color difference, in [0, 1], that a twentieth of the samples exceed
+MOST_COLOR = 0.18
+_SAMPLES, _DENSE = 3000, 20000
+_ANY_ANGLES = tuple(2 * np.pi * k * 0.381966 for k in (1, 2, 3))  # by the golden angle
+_COARSE = 0.03  # [diameters] a candidate that is farther off before its refinement is none
+_PARALLEL = np.cos(np.deg2rad(10.0))
+_MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
+
+
+class Turn(NamedTuple):
+    """A turn that was tried, and how well it fits.
+
+    Attributes:
+        axis: (3,) unit vector.
+        point: (3,) a point on the axis [m].
+        fold: 2, 3 or 4 for turns by that part of a circle, 0 for any.
+        distance: Mean distance of the turned surface to the surface, less that of two samplings
+            [m].
+        far: The same of the distance that a fiftieth of the samples exceed [m].
+        color: Color difference that a twentieth of the samples exceed, in [0, 1].
+        shape: Whether the shape is the same.
+        texture: Whether shape and texture are.
+    """
+
+    axis: np.ndarray
+    point: np.ndarray
+    fold: int
+    distance: float
+    far: float
+    color: float
+    shape: bool
+    texture: bool
+
+
+class _Surface(NamedTuple):
+    """Samples of a surface, and denser ones to which they are compared."""
+
+    points: np.ndarray  # (P, 3) [m]
+    normals: np.ndarray  # (P, 3), times a length: far apart for the two sides of a thin wall
+    dense: np.ndarray  # (D, 3) [m]
+    nearest: cKDTree  # of the dense points
+    nearest_side: cKDTree  # of the dense points with their normals
+    dense_colors: np.ndarray  # (D, 3)
+    colors: np.ndarray  # (P, 3), smoothed
+    diameter: float
+
+
+def find_symmetries(mesh: Mesh, seed: int = 0) -> list[Turn]:
+    """Return the turns that leave the shape of a mesh as it is; of each, whether the texture too.
+
+    Args:
+        mesh: The mesh [m].
+        seed: Of the surface samples.
+
+    Returns:
+        The turns, the best first; `select` takes a group's generators from them.
+    """
+    surface = _sample(mesh, seed)
+    center = surface.points.mean(0)  # every symmetry leaves the centroid as it is
+    found: list[Turn] = []
+    for axis in _candidate_axes(mesh, surface.points - center):
+        for fold in (ANY, *FOLDS):
+            turn = _try(surface, axis, center, fold)
+            if turn is not None and turn.shape:
+                found.append(turn)
+    found.sort(key=lambda turn: turn.distance)
+    kept: list[Turn] = []
+    for turn in found:
+        if not any(turn.fold == k.fold and _are_parallel(turn.axis, k.axis) for k in kept):
+            kept.append(turn)
+    return [turn for turn in kept if not _is_implied(turn, kept)]
+
+
+def select(turns: Sequence[Turn], texture: bool = True) -> list[Turn]:
+    """Return the turns that generate a mesh's symmetries.
+
+    Args:
+        turns: What `find_symmetries` has found.
+        texture: Leave out those that change what one sees; False: all that keep the shape.
+
+    Returns:
+        Two continuous ones at most, since those of two axes make all turns; beside a continuous
+        one a half turn across it at most; else all discrete ones.
+    """
+    good = [turn for turn in turns if turn.texture or not texture]
+    continuous = [turn for turn in good if turn.fold == ANY][:2]
+    if not continuous:
+        return _drop_divisors(good)
+    across = [
+        turn
+        for turn in good
+        if turn.fold == 2 and all(abs(turn.axis @ c.axis) < 0.1 for c in continuous)
+    ]
+    return [*continuous, *(across[:1] if len(continuous) == 1 else [])]
+
+
+def make_group(turns: Sequence[Turn], size: float, steps: int = 36) -> np.ndarray:
+    """Return every product of turns.
+
+    Args:
+        turns: What `select` returns.
+        size: The object's diameter [m].
+        steps: Turns that a continuous symmetry is cut into.
+
+    Returns:
+        (S, 4, 4) object_from_object [m], the identity first.
+    """
+    continuous = [(turn.axis, turn.point) for turn in turns if turn.fold == ANY]
+    return symmetry_group(list_discrete(turns, size), continuous, steps)
+
+
+def list_discrete(turns: Sequence[Turn], size: float) -> list[np.ndarray]:
+    """Return every product of the discrete turns but the identity, (4, 4) each.
+
+    Where the products of turns about several axes do not close, as they do in a group, those of the
+    best turn's axis alone.
+    """
+    discrete = [turn for turn in turns if turn.fold != ANY]
+    generators = [turn_about(t.axis, 2 * np.pi / t.fold, t.point) for t in discrete]
+    group = _close(generators, size)
+    if len(group) > _MOST_ELEMENTS:
+        group = _close(generators[:1], size)
+    return group[1:]
+
+
+def describe_symmetries(turns: Sequence[Turn], size: float, scale: float = 1.0) -> dict[str, Any]:
+    """Return symmetries in the BOP challenge's format.
+
+    Args:
+        turns: What `select` returns.
+        size: The object's diameter [m].
+        scale: Meters a unit of the file that the result is to stand beside.
+    """
+    discrete = [matrix.copy() for matrix in list_discrete(turns, size)]
+    for matrix in discrete:
+        matrix[:3, 3] /= scale
+    return {
+        "symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in discrete],
+        "symmetries_continuous": [
+            {"axis": turn.axis.tolist(), "offset": (turn.point / scale).tolist()}
+            for turn in turns
+            if turn.fold == ANY
+        ],
+    }
+
+
+def _sample(mesh: Mesh, seed: int) -> _Surface:
+    size = diameter(mesh.vertices)
+    face, weights = sample_surface(mesh, _SAMPLES, seed)
+    many_faces, many_weights = sample_surface(mesh, _DENSE, seed + 1)
+    points = surface_points(mesh, face, weights)
+    dense = surface_points(mesh, many_faces, many_weights)
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-20)
+    normals = 0.05 * size * unit
+    sides = cKDTree(np.concatenate([dense, normals[many_faces]], axis=1))
+    colors = surface_colors(mesh, many_faces, many_weights)
+    near = sides.query(np.concatenate([points, normals[face]], axis=1), k=16)[1]
+    return _Surface(
+        points,
+        normals[face],
+        dense,
+        cKDTree(dense),
+        sides,
+        colors,
+        colors[near].mean(1),
+        size,
+    )
+
+
+def _candidate_axes(mesh: Mesh, centered: np.ndarray) -> list[np.ndarray]:
+    """Return the principal axes of the surface, and the axes of its smallest oriented box."""
+    principal = np.linalg.svd(centered, full_matrices=False)[2]
+    box = trimesh.bounds.oriented_bounds(hull_vertices(mesh.vertices))[0][:3, :3]
+    return [*principal, *box]
+
+
+def _try(surface: _Surface, axis: np.ndarray, center: np.ndarray, fold: int) -> Turn | None:
+    """Refine and judge a turn; None where it is far from a symmetry."""
+    angles = _ANY_ANGLES if fold == ANY else (2 * np.pi / fold,)
+    start = turn_about(axis, angles[0], center)
+    if _distances(surface, start).mean() > _COARSE * surface.diameter:
+        return None
+    axis, point = _axis_of(_register(surface, start), axis)
+    point = point + ((center - point) @ axis) * axis
+    exact = [turn_about(axis, angle, point) for angle in angles]
+    before = _distances(surface, np.eye(4))
+    after = [_distances(surface, turn) for turn in exact]
+    distance = max(_excess(one, before, np.mean) for one in after)
+    far = max(_excess(one, before, lambda d: np.quantile(d, 0.98)) for one in after)
+    color = max(float(np.quantile(_color_change(surface, turn), 0.95)) for turn in exact)
+    limit = surface.diameter
+    shape = distance <= MEAN_EXCESS * limit and far <= FAR_EXCESS * limit
+    return Turn(axis, point, fold, distance, far, color, shape, shape and color <= MOST_COLOR)
+
+
+def _excess(after: np.ndarray, before: np.ndarray, of: Callable[[np.ndarray], Any]) -> float:
+    return float(of(after) - of(before))
+
+
+def _move(points: np.ndarray, transform: np.ndarray) -> np.ndarray:
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _distances(surface: _Surface, transform: np.ndarray) -> np.ndarray:
+    """Return how far the samples, moved, are from the surface.  -> (P,) [m]."""
+    return np.asarray(surface.nearest.query(_move(surface.points, transform))[0])
+
+
+def _color_change(surface: _Surface, transform: np.ndarray) -> np.ndarray:
+    """Return by how much colors differ where the samples, moved, come to lie.  -> (P,) in [0, 1].
+
+    Means of 16 neighbors on the same side of the surface: print finer than the sampling is noise.
+    """
+    moved = _move(surface.points, transform), surface.normals @ transform[:3, :3].T
+    near = surface.nearest_side.query(np.concatenate(moved, axis=1), k=16)[1]
+    return np.asarray(np.abs(surface.dense_colors[near].mean(1) - surface.colors).mean(1))
+
+
+def _register(surface: _Surface, transform: np.ndarray, rounds: int = 15) -> np.ndarray:
+    """Refine a transform of the surface onto itself: closest points (Besl and McKay 1992), the
+    farthest tenth left out.
+    """
+    for _ in range(rounds):
+        moved = _move(surface.points, transform)
+        distance, near = surface.nearest.query(moved)
+        kept = distance <= np.quantile(distance, 0.9)
+        x, y = moved[kept], surface.dense[near[kept]]
+        U, _, Vt = np.linalg.svd((x - x.mean(0)).T @ (y - y.mean(0)))
+        flip = np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))])
+        step = np.eye(4)
+        step[:3, :3] = Vt.T @ flip @ U.T
+        step[:3, 3] = y.mean(0) - step[:3, :3] @ x.mean(0)
+        transform = step @ transform
+    return transform
+
+
+def _axis_of(transform: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the axis of a turn, nearer to `towards` than away from it, and a point on it."""
+    rotation = transform[:3, :3]
+    vector = log_so3(torch.from_numpy(rotation)).numpy()
+    axis = vector / max(np.linalg.norm(vector), 1e-12)
+    point = np.linalg.pinv(np.eye(3) - rotation, rcond=1e-3) @ transform[:3, 3]
+    return (axis if axis @ towards >= 0 else -axis), point
+
+
+def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(abs(a @ b) > _PARALLEL)
+
+
+def _is_implied(turn: Turn, turns: Sequence[Turn]) -> bool:
+    """Tell whether any turn about the same axis does, and as well, what a discrete one does."""
+    return turn.fold != ANY and any(
+        one.fold == ANY and _are_parallel(one.axis, turn.axis) and (one.texture or not turn.texture)
+        for one in turns
+    )
+
+
+def _drop_divisors(turns: Sequence[Turn]) -> list[Turn]:
+    """Leave out half turns about an axis that has quarter turns."""
+    return [
+        turn
+        for turn in turns
+        if not (
+            turn.fold == 2 and any(t.fold == 4 and _are_parallel(t.axis, turn.axis) for t in turns)
+        )
+    ]
+
+
+def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
+    """Return the products of transforms, the identity first; more than `_MOST_ELEMENTS` of them
+    where they do not close.
+    """
+    group = [np.eye(4)]
+    for element in group:  # grows meanwhile
+        for generator in generators:
+            product = element @ generator
+            if all(_differ(product, one, size) for one in group):
+                group.append(product)
+        if len(group) > _MOST_ELEMENTS:
+            break
+    return group
+
+
+def _differ(a: np.ndarray, b: np.ndarray, size: float) -> bool:
+    """Tell whether two transforms differ by more than the errors of measured axes."""
+    turned = np.abs(a[:3, :3] - b[:3, :3]).max() > 0.2
+    return bool(turned or np.abs(a[:3, 3] - b[:3, 3]).max() > 0.1 * size)

@@ -1,0 +1,135 @@
+"""Symmetries that are found: of shapes that are known, and of scans."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.figures.symmetries import draw_symmetries
+from posefilter.meshes.builtin import catalog
+from posefilter.meshes.find_symmetries import (
+    ANY,
+    Turn,
+    describe_symmetries,
+    find_symmetries,
+    make_group,
+    select,
+)
+from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.store import MeshStore
+from posefilter.meshes.symmetries import read_symmetries, turn_about
+
+
+def folds(turns: list[Turn], texture: bool) -> list[int]:
+    return sorted(turn.fold for turn in select(turns, texture))
+
+
+def distance_to(group: np.ndarray, transform: np.ndarray) -> float:
+    """Return how near the nearest element is, by the largest entry."""
+    return float(np.abs(group - transform).max((1, 2)).min())
+
+
+def test_a_printed_box_is_symmetric_by_shape_alone() -> None:
+    mesh = catalog.build("gelatin_carton")
+    turns = find_symmetries(mesh)
+    assert folds(turns, texture=True) == []
+    assert folds(turns, texture=False) == [2, 2, 2]
+    group = make_group(select(turns, texture=False), diameter(mesh.vertices))
+    assert len(group) == 4
+    for axis in np.eye(3):
+        half = turn_about(axis, np.pi, mesh.bounds.mean(0))
+        assert distance_to(group, half) < 0.02
+
+
+def test_an_unprinted_brick_keeps_the_declared_half_turns() -> None:
+    mesh = catalog.build("brick")
+    group = make_group(select(find_symmetries(mesh)), diameter(mesh.vertices))
+    for declared in mesh.symmetries:
+        assert distance_to(group, declared) < 0.02
+
+
+def test_a_printed_can_turns_by_shape_alone_and_may_be_upside_down() -> None:
+    mesh = catalog.build("soup_can")
+    turns = find_symmetries(mesh)
+    assert folds(turns, texture=True) == []
+    assert folds(turns, texture=False) == [ANY, 2]
+    free = next(turn for turn in turns if turn.fold == ANY)
+    assert abs(free.axis[2]) > 0.999
+    assert np.abs(free.point[:2]).max() < 5e-4
+    assert len(make_group(select(turns, texture=False), 0.12)) == 72
+
+
+@pytest.mark.parametrize("name", ["mug", "bowl"])
+def test_a_handle_and_a_foot_are_seen(name: str) -> None:
+    turns = find_symmetries(catalog.build(name))
+    expected = [ANY] if name == "bowl" else []
+    assert folds(turns, texture=False) == folds(turns, texture=True) == expected
+
+
+def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) -> None:
+    """Found in another frame, they are the same turns there; read back, the same matrices."""
+    bowl = catalog.build("bowl")
+    pose = turn_about(np.array([0.6, 0.0, 0.8]), 1.1, np.array([0.2, -0.1, 0.3]))
+    mesh = replace(bowl, vertices=bowl.vertices @ pose[:3, :3].T + pose[:3, 3])
+    turns = select(find_symmetries(mesh))
+    (turn,) = turns
+    assert abs(turn.axis @ pose[:3, 2]) > 0.9999
+    base = pose[:3, 3]  # on the bowl's axis
+    off = np.cross(turn.point - base, pose[:3, 2])
+    assert np.linalg.norm(off) < 5e-4
+
+    file = tmp_path / "symmetries.json"
+    size = diameter(mesh.vertices)
+    file.write_text(json.dumps(describe_symmetries(turns, size, scale=0.001)))
+    again = read_symmetries(file, "anything", 0.001, 36)
+    np.testing.assert_allclose(again, make_group(turns, size), atol=1e-9)
+
+
+def test_a_dent_spoils_a_symmetry() -> None:
+    """A corner pulled out of a box leaves no half turn."""
+    box = catalog.build("brick")
+    vertices = box.vertices.copy()
+    corner = np.linalg.norm(vertices - box.bounds[1], axis=1) < 1e-6
+    vertices[corner] += 0.03
+    assert find_symmetries(replace(box, vertices=vertices)) == []
+
+
+def test_the_picture_has_a_row_a_turn() -> None:
+    mesh = catalog.build("brick")
+    size = diameter(mesh.vertices)
+    axis = np.array([0.0, 0.0, 1.0])
+    turn = Turn(axis, mesh.bounds.mean(0), 2, 0.0, 0.0, 0.05, True, True)
+    one = draw_symmetries(mesh, [turn], make_group([turn], size), "found")
+    two = draw_symmetries(mesh, [turn, turn], make_group([turn], size), "found")
+    assert two.shape[0] > one.shape[0] + 200
+    tile = one[-200:]
+    assert (
+        tile.reshape(-1, 3).astype(int) @ [1, -1, 0] > 40
+    ).mean() > 0.1  # the red brick is there
+
+
+KNOWN = {  # folds by shape, and by shape and texture
+    "024_bowl": ([ANY], [ANY]),
+    "061_foam_brick": ([2], [2]),
+    "003_cracker_box": ([2, 2, 2], []),
+    "002_master_chef_can": ([ANY, 2], []),
+    "005_tomato_soup_can": ([ANY, 2], []),
+    "025_mug": ([], []),
+    "035_power_drill": ([], []),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_scans(name: str, real_data: Path) -> None:
+    root = real_data / "ycb"
+    if not (root / name).is_dir():
+        pytest.skip(f"no {root / name}")
+    mesh: Mesh = MeshStore(root).load(name)
+    turns = find_symmetries(mesh)
+    assert (folds(turns, texture=False), folds(turns, texture=True)) == KNOWN[name]
+    if len(mesh.symmetries) > 1:  # what was measured before
+        group = make_group(select(turns), diameter(mesh.vertices))
+        for declared in mesh.symmetries:
+            assert distance_to(group, declared) < 0.1
