@@ -74,9 +74,9 @@ REFUSED = {
     "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrast"),
     "model=patch_pf loss=contrast": (
         "candidate poses",
-        "choose loss=add, add_s, balanced_bce, bce, chamfer, confidence, focal or offset",
+        "choose loss=add, add_s, balanced_bce, bce, chamfer, chamfer_rgbd, confidence, focal or offset",
     ),
-    "model=cnn_patch loss=add": ("loss=balanced_bce, bce, chamfer, focal or offset",),
+    "model=cnn_patch loss=add": ("loss=balanced_bce, bce, chamfer, chamfer_rgbd, focal or offset",),
     "model=patch_pf filter/refine=rescore": ("filter/refine=rescore", "choose filter/refine=none"),
     "model=pose_pf model/proposals=none": (
         "filter/initialize=from_depth",
