@@ -23,21 +23,21 @@ from posefilter.metrics.registry import find_metric, read_number
 HOME = Path(__file__).parents[1]
 KEYS = (
     "particles_on_object",
-    "signs/on_object/first",
+    "diagnostics/on_object/first",
     "iou",
     "add/auc",
     "add/recall_01d",
     "add_s/auc",
-    "signs/distinct/last",
-    "signs/pairwise_cosine",
-    "signs/heading",
-    "signs/offset_r2",
-    "signs/off_frame/last",
-    "signs/near_edge/last",
-    "signs/near_corner/last",
-    "signs/line_share/first",
-    "signs/line_share/last",
-    "signs/auroc",
+    "diagnostics/distinct/last",
+    "diagnostics/pairwise_cosine",
+    "diagnostics/heading",
+    "diagnostics/offset_r2",
+    "diagnostics/off_frame/last",
+    "diagnostics/near_edge/last",
+    "diagnostics/near_corner/last",
+    "diagnostics/line_share/first",
+    "diagnostics/line_share/last",
+    "diagnostics/auroc",
 )
 NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # have columns, or none
 # these change no result
@@ -72,6 +72,8 @@ def read_runs(folder: Path) -> list[Run]:
     runs = []
     for path in sorted(folder.rglob("metrics.json")):
         run: Run = json.loads(path.read_text())
+        if "signs" in run:  # the name of before
+            run["diagnostics"] = run.pop("signs")
         typed = [text.lstrip("+~") for text in run.get("overrides") or [] if "=" in text]
         run["choices"] = dict(text.split("=", 1) for text in typed)
         runs.append(run)

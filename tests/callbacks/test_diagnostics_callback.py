@@ -48,15 +48,15 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     signs.update(run, batch)
     hull = torch.zeros(4, 3)
     method = SimpleNamespace(
-        scores={"signs": signs}, space=PixelSpace(), model=SimpleNamespace(hull=hull)
+        scores={"diagnostics": signs}, space=PixelSpace(), model=SimpleNamespace(hull=hull)
     )
     callback = Diagnostics(tmp_path, images=1)
     callback.on_validation_epoch_start(trainer, method)  # type: ignore[arg-type]
     callback.on_validation_epoch_end(trainer, method)  # type: ignore[arg-type]
     callback.on_test_batch_end(trainer, method, run, batch, 0)  # type: ignore[arg-type]
     callback.on_test_epoch_end(trainer, method)  # type: ignore[arg-type]
-    assert logged["signs/off_frame/last"] > 0.9
-    assert logged["signs/on_object/last"] == 0
+    assert logged["diagnostics/off_frame/last"] > 0.9
+    assert logged["diagnostics/on_object/last"] == 0
     files = sorted(path.name for path in tmp_path.iterdir())
     assert files == [
         "test_animation_0.gif",

@@ -24,7 +24,7 @@ from posefilter.geometry.pose import invert, make_pose, origin_of, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.nets.coordinates import Coordinates
-from posefilter.nets.likelihood import Points, PoseLikelihood, lay_out
+from posefilter.nets.likelihood import Points, PoseLikelihood, flatten_images
 from posefilter.nets.paper_likelihood import PaperLikelihood
 from posefilter.types import Batch, ObjectModel, Step
 
@@ -116,7 +116,7 @@ class Knows(PoseLikelihood):
 
 
 def test_a_pixel_is_read_where_it_is() -> None:
-    batch, image = scene(), lay_out(scene().rgb, scene().depth, scene().intrinsics)
+    batch, image = scene(), flatten_images(scene().rgb, scene().depth, scene().intrinsics)
     points = make_point((40, 30), image, TRUE, model())
     camera = torch.tensor([(40 - 31.5) / 60 * 0.8, (30 - 23.5) / 60 * 0.8, 0.8])
     assert bool(points.inside.all())
@@ -128,7 +128,7 @@ def test_a_pixel_is_read_where_it_is() -> None:
 def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_favors(
     depthwise: bool,
 ) -> None:
-    image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
+    image = flatten_images(scene().rgb, scene().depth, scene().intrinsics)
     field = evaluate_point_field(
         Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise
     )
@@ -145,7 +145,7 @@ def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_fa
 
 
 def test_the_papers_likelihood_has_a_field_too() -> None:
-    image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
+    image = flatten_images(scene().rgb, scene().depth, scene().intrinsics)
     with torch.no_grad():
         field = evaluate_point_field(
             PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,)
@@ -181,7 +181,7 @@ def test_picture_of_poses_is_brightest_at_the_truth_and_black_where_that_is_outs
 
 
 def test_picture_of_points_shows_each_slice() -> None:
-    image = lay_out(scene().rgb, scene().depth, scene().intrinsics)
+    image = flatten_images(scene().rgb, scene().depth, scene().intrinsics)
     fields = [
         evaluate_point_field(Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), d)
         for d in (False, True)
@@ -216,7 +216,7 @@ def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() 
     said = Coordinates(
         torch.zeros(1, 6, 8), share, torch.zeros(1, 6, 8, 2, 3), centers, torch.zeros(1, 6, 8, 4)
     )
-    image = lay_out(scene().rgb, scene().depth, scene().intrinsics, said)
+    image = flatten_images(scene().rgb, scene().depth, scene().intrinsics, said)
     field = evaluate_point_field(
         Told(), image, TRUE, model(), (40, 30), True, (0.04,), depthwise=True
     )

@@ -14,7 +14,7 @@ from posefilter.meshes import ycb
 FRONT = pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.35))
 
 
-def test_millimeters_become_metres(tmp_path):
+def test_millimeters_become_meters(tmp_path):
     bop_scene(tmp_path / "test" / "000048", [[(2, pose()), (2, FRONT)], [(5, pose())]])
     reader = BopReader(tmp_path, part="test")
     assert reader.objects == ("obj_000002", "obj_000005")

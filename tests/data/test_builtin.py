@@ -14,7 +14,7 @@ from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.builtin.shapes import box, disc, lathe, tube, weld
 from posefilter.meshes.mesh import Mesh, surface_colors
 from posefilter.meshes.store import MeshStore
-from posefilter.meshes.symmetries import turn_about
+from posefilter.meshes.symmetries import rotation_about
 
 # builtin -> (the YCB object it is as large as, in which order its x, y, z are FAT's aligned axes)
 TWINS = {
@@ -190,7 +190,7 @@ def test_declared_symmetries_hold_for_shape_and_color() -> None:
             assert np.abs(colors[vertex] - colors).mean() < 0.05
     brick = store.load("brick")
     # this one is none
-    quarter = turn_about(np.array([0, 0, 1.0]), np.pi / 2, brick.bounds.mean(0))
+    quarter = rotation_about(np.array([0, 0, 1.0]), np.pi / 2, brick.bounds.mean(0))
     turned = brick.vertices @ quarter[:3, :3].T + quarter[:3, 3]
     assert cKDTree(brick.vertices).query(turned)[0].max() > 1e-3
 

@@ -88,7 +88,7 @@ WRONG = {
     "depth x 1000": ({"factor_depth": 10.0}, "depth is 1000 times"),
     "millimeters": ({"poses": scaled(1000)}, "translations are in millimeters"),
     "centimeters": ({"poses": scaled(100)}, "translations are in centimeters"),
-    "kilometres": ({"poses": scaled(0.001)}, "translations are too small by a factor of 1000"),
+    "kilometers": ({"poses": scaled(0.001)}, "translations are too small by a factor of 1000"),
     "inverse": ({"poses": inverted}, "wrong way round"),
     "frame": (
         {"native": np.eye(4)},
@@ -122,7 +122,7 @@ def test_models_of_the_other_frame(tmp_path, meshes):
     assert "YCB-Video's object frame, meshes in the original" in report["problems"][0]
 
 
-def test_a_centerd_frame_is_named(tmp_path, meshes):
+def test_a_centered_frame_is_named(tmp_path, meshes):
     center = np.eye(4)
     center[:3, 3] = (LOW + HIGH) / 2
     bop_scene(tmp_path / "000001", [[(2, each @ center)] for each in POSES])

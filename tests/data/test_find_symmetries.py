@@ -19,7 +19,7 @@ from posefilter.meshes.find_symmetries import (
 )
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.store import MeshStore
-from posefilter.meshes.symmetries import read_symmetries, turn_about
+from posefilter.meshes.symmetries import read_symmetries, rotation_about
 
 
 def folds(turns: list[Turn], texture: bool) -> list[int]:
@@ -39,7 +39,7 @@ def test_a_printed_box_is_symmetric_by_shape_alone() -> None:
     group = make_group(select(turns, texture=False), diameter(mesh.vertices))
     assert len(group) == 4
     for axis in np.eye(3):
-        half = turn_about(axis, np.pi, mesh.bounds.mean(0))
+        half = rotation_about(axis, np.pi, mesh.bounds.mean(0))
         assert distance_to(group, half) < 0.02
 
 
@@ -71,7 +71,7 @@ def test_a_handle_and_a_foot_are_seen(name: str) -> None:
 def test_symmetries_move_with_the_object_and_survive_the_file(tmp_path: Path) -> None:
     """Found in another frame, they are the same turns there; read back, the same matrices."""
     bowl = catalog.build("bowl")
-    pose = turn_about(np.array([0.6, 0.0, 0.8]), 1.1, np.array([0.2, -0.1, 0.3]))
+    pose = rotation_about(np.array([0.6, 0.0, 0.8]), 1.1, np.array([0.2, -0.1, 0.3]))
     mesh = replace(bowl, vertices=bowl.vertices @ pose[:3, :3].T + pose[:3, 3])
     turns = select(find_symmetries(mesh))
     (turn,) = turns

@@ -18,8 +18,8 @@ from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 from posefilter.synthetic import fat_format
+from posefilter.synthetic.frame_renderer import make_renderer
 from posefilter.synthetic.generate import camera_matrix, generate
-from posefilter.synthetic.painter import make_renderer
 
 SIZE = (160, 120)
 SETTINGS: dict[str, Any] = {

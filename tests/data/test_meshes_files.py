@@ -67,7 +67,7 @@ def test_obj_keeps_polygons_seams_and_normals(pyramid: Path) -> None:
     assert np.array_equal(mesh.texture, picture)  # as it is, in RGB: Kd beside a picture is ignored
 
 
-def test_scale_turns_units_into_metres(pyramid: Path) -> None:
+def test_scale_turns_units_into_meters(pyramid: Path) -> None:
     assert np.allclose(
         read_mesh(pyramid, "a", scale=0.5).vertices, read_mesh(pyramid, "a").vertices * 0.5
     )

@@ -10,7 +10,7 @@ import trimesh
 from posefilter.errors import UserError
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore, symmetry_group
-from posefilter.meshes.symmetries import turn_about
+from posefilter.meshes.symmetries import rotation_about
 
 HALF = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about z
 
@@ -153,7 +153,7 @@ def test_symmetry_group_is_closed() -> None:
 
 def test_turn_about_leaves_its_line() -> None:
     axis, point = np.array([0.6, 0, 0.8]), np.array([0.1, 0.2, 0.3])
-    turn = turn_about(axis, 1.0, point)
+    turn = rotation_about(axis, 1.0, point)
     assert turn @ [*(point + 0.7 * axis), 1] == pytest.approx([*(point + 0.7 * axis), 1])
     moved = (turn @ [*(point + np.array([0, 1, 0])), 1])[:3] - point
     assert moved @ [0, 1, 0] == pytest.approx(np.cos(1.0))

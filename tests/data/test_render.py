@@ -13,8 +13,8 @@ from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 from posefilter.rendering.sampling import sample_texture
-from posefilter.rendering.surfaces import Instance, Lights, Plane, Surfaces, light, pixel_rays
-from posefilter.synthetic.lookalikes import box, stretched
+from posefilter.rendering.surfaces import Instance, Lights, Plane, Surfaces, pixel_rays, shade
+from posefilter.synthetic.lookalikes import box, stretch
 
 H, W = 120, 160
 K = np.array([[270.0, 0, 81.3], [0, 268.0, 58.6], [0, 0, 1]])
@@ -145,8 +145,10 @@ def test_the_nearer_of_two_is_seen_and_each_is_counted_alone() -> None:
         front = order.index(0)
         assert seen.index[58, 81] == front
         assert seen.depth[58, 81] == pytest.approx(0.58, abs=1e-4)
-        assert (seen.index == front).sum() == seen.alone[front]
-        assert (seen.index == 1 - front).sum() == seen.alone[1 - front] - seen.alone[front]
+        assert (seen.index == front).sum() == seen.unoccluded[front]
+        assert (seen.index == 1 - front).sum() == seen.unoccluded[1 - front] - seen.unoccluded[
+            front
+        ]
 
 
 def test_an_object_across_the_near_plane_is_not_lost() -> None:
@@ -162,7 +164,7 @@ def test_a_stretched_pose_equals_a_stretched_mesh() -> None:
     factors = np.array([1.3, 0.7, 1.1])
     seen = EmbreeRenderer().surfaces([Instance(mesh, T @ np.diag([*factors, 1]))], K, H, W)
     baked = EmbreeRenderer().surfaces(
-        [Instance(stretched(mesh, "other", factors, mesh.texture), T)], K, H, W
+        [Instance(stretch(mesh, "other", factors, mesh.texture), T)], K, H, W
     )
     np.testing.assert_allclose(seen.depth, baked.depth, atol=2e-6)
     np.testing.assert_allclose(seen.normal, baked.normal, atol=1e-4)
@@ -206,7 +208,7 @@ def test_light_follows_lambert_and_shadow_takes_only_its_lamp() -> None:
         np.array([2]),
     )
     lights = Lights(ambient=0.2, directions=((0, 0, -2), (0, 3**0.5, -1)), strengths=(0.5, 0.4))
-    rgb = light(seen, pixel_rays(np.eye(3), 1, 2), lights, np.array([[1.0, 0.0]], np.float32))
+    rgb = shade(seen, pixel_rays(np.eye(3), 1, 2), lights, np.array([[1.0, 0.0]], np.float32))
     np.testing.assert_allclose(rgb[0, :, 0], [0.2 + 0.5 + 0.4 * 0.5, 0.2 + 0.4 * 0.5], rtol=1e-5)
 
 
@@ -251,7 +253,7 @@ def test_both_renderers_agree_on_color_and_index() -> None:
         pytest.skip(str(error))
     b = EmbreeRenderer().surfaces(instances, K, H, W, [plane])
     assert (a.index != b.index).mean() < 2e-3
-    assert np.abs(a.alone - b.alone).max() <= 12
+    assert np.abs(a.unoccluded - b.unoccluded).max() <= 12
     same = (a.index == b.index) & (a.depth > 0) & (b.depth > 0)
     assert np.median(np.abs(a.albedo - b.albedo)[same]) < 0.01
     assert np.percentile(np.abs(a.normal - b.normal)[same], 99) < 0.01

@@ -13,14 +13,14 @@ from posefilter.synthetic.lookalikes import box, make_lookalike
 from posefilter.synthetic.placing import View
 from posefilter.synthetic.scenes import (
     Layout,
-    Library,
     SceneSet,
     SceneSettings,
+    SolidStore,
     draw_layout,
-    draw_set,
+    draw_scene_set,
     shift_camera,
 )
-from posefilter.synthetic.solids import make_solid, resting_rotations, separated, turn_down
+from posefilter.synthetic.solids import find_stable_rotations, make_solid, rotation_down, separated
 
 H, W = 240, 320
 K = camera_matrix("ycb_video", W, H)
@@ -29,13 +29,13 @@ BLANK = [np.zeros((4, 4, 3), np.uint8)] * 6
 
 
 @pytest.fixture(scope="module")
-def library() -> Library:
-    return Library(MeshStore("builtin"))
+def library() -> SolidStore:
+    return SolidStore(MeshStore("builtin"))
 
 
 @pytest.fixture(scope="module")
-def scene(library: Library) -> SceneSet:
-    return draw_set(library, "carton", SceneSettings(), np.random.default_rng(0))
+def scene(library: SolidStore) -> SceneSet:
+    return draw_scene_set(library, "carton", SceneSettings(), np.random.default_rng(0))
 
 
 def draw(scene: SceneSet, settings: SceneSettings, count: int, seed: int = 0) -> list[Layout]:
@@ -50,7 +50,7 @@ def draw(scene: SceneSet, settings: SceneSettings, count: int, seed: int = 0) ->
 
 
 def test_a_box_rests_on_its_six_faces_and_nowhere_else() -> None:
-    rests, weights = resting_rotations(box("box", SIDES, BLANK).vertices)
+    rests, weights = find_stable_rotations(box("box", SIDES, BLANK).vertices)
     down = -rests[:, 2, :]
     assert len(down) == 6
     assert weights.sum() == pytest.approx(1)
@@ -63,7 +63,7 @@ def test_a_box_rests_on_its_six_faces_and_nowhere_else() -> None:
 
 def test_turn_down_turns_down() -> None:
     for d in (*np.eye(3), *-np.eye(3), np.array([0.6, 0, 0.8])):
-        R = turn_down(d)
+        R = rotation_down(d)
         np.testing.assert_allclose(R @ d, [0, 0, -1], atol=1e-9)
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(R) == pytest.approx(1)
@@ -117,7 +117,7 @@ def visible_shares(layouts: list[Layout]) -> np.ndarray:
     renderer, out = EmbreeRenderer(), []
     for layout in layouts:
         seen = renderer.surfaces(layout.instances(), K, H, W)
-        out.append((seen.index == 0).sum() / max(seen.alone[0], 1))
+        out.append((seen.index == 0).sum() / max(seen.unoccluded[0], 1))
         depth, _ = renderer.depth(layout.instances()[:1], K, H, W)
         hidden = (depth > 0) & (seen.index > 0)
         # whatever hides the target lies in front of it
@@ -150,7 +150,7 @@ def test_the_foreseen_share_is_near_the_rendered_one(scene: SceneSet) -> None:
     assert np.median(np.abs(foreseen - visible_shares(layouts))) < 0.06
 
 
-def test_lookalikes_are_not_the_target(library: Library) -> None:
+def test_lookalikes_are_not_the_target(library: SolidStore) -> None:
     target = library.store.load("carton")
     sides = target.bounds[1] - target.bounds[0]
     for seed in range(12):
@@ -195,7 +195,7 @@ def test_settled_objects_lie_on_the_table_and_touch_but_do_not_mix(scene: SceneS
     assert tilts > 0  # placed by hand, boxes and cans only ever stand or lie square
 
 
-def test_solids_measure_their_mesh(library: Library) -> None:
+def test_solids_measure_their_mesh(library: SolidStore) -> None:
     mesh = library.store.load("carton")
     solid = make_solid(mesh)
     np.testing.assert_allclose(solid.center, mesh.bounds.mean(0))

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.synthetic.sensor import sense, sense_color, sense_depth, sensor_model
+from posefilter.synthetic.sensor import (
+    sensor_model,
+    simulate_color,
+    simulate_depth,
+    simulate_sensor,
+)
 
 H, W = 240, 320
 
@@ -27,14 +32,16 @@ GREY = np.full((H, W, 3), 0.5, np.float32)
 
 def test_the_ideal_sensor_changes_nothing() -> None:
     rgb = np.random.default_rng(0).uniform(0, 1.2, (H, W, 3)).astype(np.float32)
-    photo, depth = sense(rgb, step_scene(), sensor_model("ideal"), np.random.default_rng(0))
+    photo, depth = simulate_sensor(
+        rgb, step_scene(), sensor_model("ideal"), np.random.default_rng(0)
+    )
     np.testing.assert_array_equal(depth, step_scene())
     assert np.abs(photo / 255 - np.clip(rgb, 0, 1)).max() <= 0.5 / 255 + 1e-6
 
 
 def test_the_same_generator_gives_the_same_reading() -> None:
     a, b, c = (
-        sense(GREY, step_scene(), sensor_model("kinect"), np.random.default_rng(s))
+        simulate_sensor(GREY, step_scene(), sensor_model("kinect"), np.random.default_rng(s))
         for s in (1, 1, 2)
     )
     np.testing.assert_array_equal(a[0], b[0])
@@ -47,7 +54,7 @@ def test_depth_errors_are_millimeters_and_grow_with_distance() -> None:
     near, far = [], []
     for seed in range(24):
         for z, errors in ((0.6, near), (1.2, far)):
-            out = sense_depth(flat(z), GREY, np.random.default_rng(seed))
+            out = simulate_depth(flat(z), GREY, np.random.default_rng(seed))
             errors.append(np.median(np.abs(out - z)[out > 0]) * 1000)
     assert 0.3 < np.median(near) < 3
     assert 1 < np.median(far) < 6  # real depth lies 2 to 3.6 mm off
@@ -56,7 +63,9 @@ def test_depth_errors_are_millimeters_and_grow_with_distance() -> None:
 
 def test_disparity_comes_in_steps() -> None:
     slope = np.broadcast_to(np.linspace(0.8, 1.4, W, dtype=np.float32), (H, W)).copy()
-    counts = [len(np.unique(sense_depth(slope, GREY, np.random.default_rng(s)))) for s in range(12)]
+    counts = [
+        len(np.unique(simulate_depth(slope, GREY, np.random.default_rng(s)))) for s in range(12)
+    ]
     assert np.median(counts) < 2000  # 76,800 pixels without steps
     assert min(counts) > 50
 
@@ -71,7 +80,7 @@ def test_depth_is_lost_at_edges_more_than_elsewhere() -> None:
     )
     at_edge, elsewhere = [], []
     for seed in range(20):
-        lost = sense_depth(step_scene(), GREY, np.random.default_rng(seed)) == 0
+        lost = simulate_depth(step_scene(), GREY, np.random.default_rng(seed)) == 0
         at_edge.append(lost[edge].mean())
         elsewhere.append(lost[~edge].mean())
     assert np.mean(at_edge) > 0.25
@@ -82,7 +91,7 @@ def test_depth_is_lost_at_edges_more_than_elsewhere() -> None:
 def test_edges_are_ragged_but_stay_within_pixels() -> None:
     spread = []
     for seed in range(12):
-        out = sense_depth(step_scene(), GREY, np.random.default_rng(seed))
+        out = simulate_depth(step_scene(), GREY, np.random.default_rng(seed))
         box = (out > 0) & (out < 1.0)
         rows, columns = np.nonzero(box)
         assert abs(rows.min() - 80) <= 6
@@ -96,13 +105,13 @@ def test_edges_are_ragged_but_stay_within_pixels() -> None:
 
 def test_nothing_stays_nothing() -> None:
     depth = np.zeros((H, W), np.float32)
-    assert not sense_depth(depth, GREY, np.random.default_rng(0)).any()
+    assert not simulate_depth(depth, GREY, np.random.default_rng(0)).any()
 
 
 def test_color_stays_in_range_and_varies_in_brightness() -> None:
     means = []
     for seed in range(20):
-        photo = sense_color(GREY * np.float32(1.3), np.random.default_rng(seed))
+        photo = simulate_color(GREY * np.float32(1.3), np.random.default_rng(seed))
         assert photo.min() >= 0
         assert photo.max() <= 1
         means.append(photo.mean())
@@ -124,7 +133,7 @@ def test_real_depth_could_have_come_from_it(real_data: Path) -> None:
                 (depth * 100).astype(np.uint8), (depth == 0).astype(np.uint8), 3, cv2.INPAINT_NS
             ) / np.float32(100)
             model = [
-                sense_depth(
+                simulate_depth(
                     whole, np.full((*depth.shape, 3), 0.5, np.float32), np.random.default_rng(s)
                 )
                 for s in range(6)

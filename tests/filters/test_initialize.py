@@ -109,7 +109,7 @@ def test_a_prior_says_where() -> None:
     torch.testing.assert_close(pixels, torch.tensor([4.0, 6.0]).expand(2, 50, 2), atol=1e-3, rtol=0)
 
 
-def test_without_any_depth_poses_start_a_metre_away() -> None:
+def test_without_any_depth_poses_start_a_meter_away() -> None:
     batch = images()
     none = draw_from_depth(
         batch.depth * 0, batch.intrinsics, SPACE, 500, Generator().manual_seed(0), behind=(0.0, 0.0)

@@ -12,14 +12,14 @@ from posefilter.labels.paper_points import PaperPoints
 from posefilter.losses.contrast import Contrast, pose_distance
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
-from posefilter.models.candidate_samplers import make_even_particles, one_step_trace
+from posefilter.models.candidate_samplers import make_uniform_particles, one_step_trace
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Trace
 
 MODEL = square()
 
 
 def trace(poses: torch.Tensor, scores: torch.Tensor, sigma: float) -> Trace:
-    particles = make_even_particles(poses)
+    particles = make_uniform_particles(poses)
     output = ParticleOutput(scores, torch.zeros(*scores.shape, 6), poses, particles.latent)
     return one_step_trace(particles, output, torch.full((len(poses),), sigma))
 
@@ -83,7 +83,7 @@ def test_the_papers_labels() -> None:
     offset = torch.tensor([-0.5, -0.011, -0.009, 0.009, 0.011, -0.009, 0.009, 0.02])
     own = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     state = torch.stack([torch.zeros(8), torch.zeros(8), offset, own], -1)[None]
-    particles = make_even_particles(state)
+    particles = make_uniform_particles(state)
     output = ParticleOutput(
         torch.zeros(1, 8), torch.zeros(1, 8, 6), torch.eye(4).expand(1, 8, 4, 4), particles.latent
     )

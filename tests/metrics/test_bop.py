@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
-from posefilter.meshes.symmetries import symmetry_group, turn_about
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 from posefilter.metrics.bop import BopErrors, average_recall, densify, mspd, mssd
 from posefilter.types import ObjectModel
 
@@ -19,7 +19,9 @@ POINTS = 0.1 * torch.randn(50, 3, generator=Generator().manual_seed(3), dtype=to
 EYE = torch.eye(4, dtype=torch.float64)[None]
 # half turns about three orthogonal axes through a point: a group
 HALF_TURNS = torch.from_numpy(
-    np.stack([np.eye(4), *(turn_about(a, np.pi, np.array([0.01, 0.02, 0.03])) for a in np.eye(3))])
+    np.stack(
+        [np.eye(4), *(rotation_about(a, np.pi, np.array([0.01, 0.02, 0.03])) for a in np.eye(3))]
+    )
 )
 
 
@@ -57,7 +59,7 @@ def test_what_is_known_by_hand() -> None:
     moved = make_pose(torch.eye(3), torch.tensor([0.03, 0.0, 1.0])).double()
     turned = make_pose(exp_so3(torch.tensor([0.0, 0.0, math.pi])), torch.tensor([0.0, 0.0, 1.0]))
     rod = torch.tensor([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
-    half = torch.from_numpy(np.stack([np.eye(4), turn_about(np.eye(3)[2], np.pi, np.zeros(3))]))
+    half = torch.from_numpy(np.stack([np.eye(4), rotation_about(np.eye(3)[2], np.pi, np.zeros(3))]))
     assert float(mssd(moved, pose, EYE, rod)) == pytest.approx(0.03)
     assert float(mspd(moved, pose, EYE, rod, K)) == pytest.approx(15)
     assert float(mssd(turned.double(), pose, EYE, rod)) == pytest.approx(0.2, rel=1e-6)
@@ -96,7 +98,7 @@ def test_continuous_symmetries_have_no_gaps() -> None:
     coarse = torch.from_numpy(symmetry_group(continuous=[(axis, point)], steps=36))
     fine = densify(coarse)
     assert len(fine) == 36 * 9
-    between = torch.from_numpy(turn_about(axis, math.radians(5), point))
+    between = torch.from_numpy(rotation_about(axis, math.radians(5), point))
     assert float((fine - between).abs().amax((1, 2)).min()) < math.radians(0.6)
     on_axis = torch.from_numpy(point + 0.1 * axis)
     torch.testing.assert_close(transform(fine, on_axis[None]), on_axis.expand(len(fine), 1, 3))

@@ -16,7 +16,7 @@ HOME = Path(__file__).parents[2]
 def test_keys_are_unique_and_labels_tell_metrics_of_a_table_apart() -> None:
     tables = [
         [key for key in METRICS if key.startswith(prefix)]
-        for prefix in ("add", "belief/", "signs/")
+        for prefix in ("add", "belief/", "diagnostics/")
     ]
     for keys in tables:
         labels = [METRICS[key].title for key in keys]
@@ -29,7 +29,7 @@ def test_a_number_is_written_in_its_unit() -> None:
     assert find_metric("belief/spread_m").describe(0.0123) == "12.3 mm"
     assert find_metric("add/median_mm").title == "median ADD [mm]"
     assert find_metric("iou").describe(0.8766) == "0.877"
-    assert find_metric("signs/on_object/first").column == "began on it %"
+    assert find_metric("diagnostics/on_object/first").column == "began on it %"
 
 
 @pytest.mark.parametrize(
@@ -39,8 +39,8 @@ def test_a_number_is_written_in_its_unit() -> None:
         ("test/iou", "iou"),
         ("by_visibility/0.3-0.5/add_s/median_mm", "add_s/median_mm"),
         ("val/by_visibility/0-0.3/instances", "instances"),
-        ("signs/off_frame/last", "signs/off_frame"),
-        ("val/signs/heading", "signs/heading"),
+        ("diagnostics/off_frame/last", "diagnostics/off_frame"),
+        ("val/diagnostics/heading", "diagnostics/heading"),
         ("filter/ess/step_03", "filter/ess"),
     ],
 )
@@ -56,15 +56,23 @@ def test_an_unknown_key_is_named() -> None:
 def test_numbers_are_read_where_they_are() -> None:
     metrics = {
         "add": {"auc": 71},
-        "signs": {"on_object": [0.1, 0.7]},
+        "diagnostics": {"on_object": [0.1, 0.7]},
         "iou": float("nan"),
         "seed": True,
         "name": "x",
     }
     assert read_number(metrics, "add/auc") == 71.0
-    assert read_number(metrics, "signs/on_object/first") == 0.1
-    assert read_number(metrics, "signs/on_object/last") == 0.7
-    for key in ("add/median_mm", "add_s/auc", "iou", "seed", "name", "signs/on_object", "add"):
+    assert read_number(metrics, "diagnostics/on_object/first") == 0.1
+    assert read_number(metrics, "diagnostics/on_object/last") == 0.7
+    for key in (
+        "add/median_mm",
+        "add_s/auc",
+        "iou",
+        "seed",
+        "name",
+        "diagnostics/on_object",
+        "add",
+    ):
         assert read_number(metrics, key) is None
 
 

@@ -150,8 +150,8 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     after = method.results()
     assert after["particles_on_object"] > 0.85
     assert after["iou"] > 0.7
-    assert after["signs"]["auroc"] > 0.8
-    assert after["signs"]["on_object"][0] < 0.4 < after["signs"]["on_object"][-1]
+    assert after["diagnostics"]["auroc"] > 0.8
+    assert after["diagnostics"]["on_object"][0] < 0.4 < after["diagnostics"]["on_object"][-1]
     if "pose" in kind.requires:
         assert before["add"]["median_mm"] > 60
         assert after["add"]["median_mm"] < 25
@@ -229,7 +229,7 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
         method.filter = run_filter(64, 3, initialize, resample)
         with torch.no_grad():
             method.test_step(batch, 0)
-        return method.results()["signs"]["on_object"]
+        return method.results()["diagnostics"]["on_object"]
 
     uniform = share(UniformPixels(), NoResampling())
     assert share(FromRelevance(), NoResampling())[0] > uniform[0] + 0.3

@@ -122,7 +122,7 @@ def test_where_the_own_point_belongs_says_nothing_of_the_rotation() -> None:
     was told to belong.
     """
     code = SurfacePointSixD()
-    code.about(square())
+    code.set_object(square())
     g = torch.Generator().manual_seed(0)
     raw = torch.randn(2, 5, 9, generator=g, dtype=torch.float64).requires_grad_()
     point = torch.randn(2, 5, 3, generator=g, dtype=torch.float64) + torch.tensor([0.0, 0.0, 5.0])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from posefilter.models.base import score_of
+from posefilter.models.base import compute_checkpoint_score
 
 
 def detector(on: float, iou: float) -> dict[str, object]:
@@ -11,13 +11,15 @@ def detector(on: float, iou: float) -> dict[str, object]:
 
 
 def test_a_detector_is_scored_by_particles_and_box_alike() -> None:
-    assert score_of(detector(1.0, 0.5)) == pytest.approx(75.0)
-    assert score_of(detector(0.5, 1.0)) == pytest.approx(75.0)
+    assert compute_checkpoint_score(detector(1.0, 0.5)) == pytest.approx(75.0)
+    assert compute_checkpoint_score(detector(0.5, 1.0)) == pytest.approx(75.0)
 
 
 def test_among_checkpoints_with_all_particles_on_the_object_the_better_box_wins() -> None:
-    assert score_of(detector(1.0, 0.9)) > score_of(detector(1.0, 0.4))
+    assert compute_checkpoint_score(detector(1.0, 0.9)) > compute_checkpoint_score(
+        detector(1.0, 0.4)
+    )
 
 
 def test_a_method_with_poses_is_scored_by_them() -> None:
-    assert score_of(detector(1.0, 1.0) | {"add": {"auc": 12.5}}) == 12.5
+    assert compute_checkpoint_score(detector(1.0, 1.0) | {"add": {"auc": 12.5}}) == 12.5

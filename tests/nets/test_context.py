@@ -25,7 +25,7 @@ def test_pyramid_sees_block_means_under_the_particle() -> None:
     pyramid = Pyramid(levels=3)
     # the center of cell (4, 5) of the level of stride 8
     pixels = torch.tensor([[[8 * 5 + 3.5, 8 * 4 + 3.5]]])
-    features = pyramid.look(pyramid(rgb, depth, K), pixels)
+    features = pyramid.sample_features(pyramid(rgb, depth, K), pixels)
     assert features.shape == (1, 1, pyramid.width)
     # level 3, sample 4 of 9: the particle's own cell
     middle = features[0, 0, 2 * 45 + 4 * 5 : 2 * 45 + 5 * 5]
@@ -38,7 +38,7 @@ def test_pyramid_sees_block_means_under_the_particle() -> None:
 def test_no_context_is_empty() -> None:
     rgb, depth = scene()
     none = NoContext()
-    assert none.look(none(rgb, depth, K), torch.zeros(1, 7, 2)).shape == (1, 7, 0)
+    assert none.sample_features(none(rgb, depth, K), torch.zeros(1, 7, 2)).shape == (1, 7, 0)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,10 @@ def test_wide_images_are_averaged_down_for_context_and_looked_up_where_they_are(
         # of 160, which is not too wide
         small = encoder(small_rgb, small_depth, intrinsics(150.0, 150.0, 79.5, 59.5)[None])
         assert (seen.strides, small.strides) == ((8,), (4,))
-        found = encoder.look(seen, pixels), encoder.look(small, (pixels - 0.5) / 2)
+        found = (
+            encoder.sample_features(seen, pixels),
+            encoder.sample_features(small, (pixels - 0.5) / 2),
+        )
     torch.testing.assert_close(*found, atol=1e-5, rtol=1e-5)
 
 

@@ -99,7 +99,7 @@ def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> No
     center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
     raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
     code = SurfacePointSixD()
-    code.about(thing(center, radius))
+    code.set_object(thing(center, radius))
     pose = code(raw, point).pose
     assert is_rigid(pose)
     back = transform(invert(pose), point[:, :, None])[:, :, 0]
@@ -114,7 +114,7 @@ def test_a_pose_of_fragments_is_that_of_the_likeliest() -> None:
     g = torch.Generator().manual_seed(2)
     center, radius, K = torch.tensor([0.01, 0.02, -0.03]), 0.1, 8
     code = SurfacePointFragments(K)
-    code.about(thing(center, radius))
+    code.set_object(thing(center, radius))
     raw, point = torch.randn(2, 6, code.width, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5
     pose, said = code(raw, point)
     assert said is not None
@@ -127,7 +127,7 @@ def test_a_pose_of_fragments_is_that_of_the_likeliest() -> None:
         want = code.centers[k] + code.reach * raw[i, j, 6 + K + 3 * k : 6 + K + 3 * k + 3]
         torch.testing.assert_close(back[i, j], want, atol=1e-5, rtol=0)
     cut = code.centers.clone()
-    code.about(thing(center + 0.01, 2 * radius, seed=4))
+    code.set_object(thing(center + 0.01, 2 * radius, seed=4))
     assert torch.equal(code.centers, cut), "fragments are cut once: what was learned is about these"
 
 

@@ -8,7 +8,7 @@ from posefilter.geometry.camera import intrinsics, project, rays
 from posefilter.geometry.pose import invert, make_pose, origin_of, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.nets.coordinates import Coordinates
-from posefilter.nets.likelihood import PoseLikelihood, lay_out, look
+from posefilter.nets.likelihood import PoseLikelihood, flatten_images, sample_points
 from posefilter.nets.paper_likelihood import PaperLikelihood
 
 H, W = 48, 64
@@ -30,7 +30,7 @@ def pose() -> torch.Tensor:
 def test_points_are_the_pixels_lifted_into_the_object_frame() -> None:
     rgb, depth = image()
     noise = torch.randn(1, 1, 20, 2, generator=torch.Generator().manual_seed(1))
-    points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise)
+    points = sample_points(flatten_images(rgb, depth, K), pose(), CENTER, RADIUS, noise)
     middle = origin_of(pose(), CENTER)
     reach = 0.6 * RADIUS * K[0, 0, 0] / middle[0, 0, 2]
     for k in range(20):  # one by one, by the definition
@@ -51,7 +51,9 @@ def test_points_are_the_pixels_lifted_into_the_object_frame() -> None:
 def test_a_pixel_without_depth_gives_the_rays_nearest_point() -> None:
     rgb, depth = image()
     noise = torch.randn(1, 1, 50, 2, generator=torch.Generator().manual_seed(1))
-    points = look(lay_out(rgb, torch.zeros_like(depth), K), pose(), CENTER, RADIUS, noise)
+    points = sample_points(
+        flatten_images(rgb, torch.zeros_like(depth), K), pose(), CENTER, RADIUS, noise
+    )
     assert not points.known.any()
     # the nearest point is square to the ray
     assert (points.position * points.ray).sum(-1).abs().max() < 1e-5
@@ -60,7 +62,9 @@ def test_a_pixel_without_depth_gives_the_rays_nearest_point() -> None:
 def test_pixels_outside_the_frame_are_known_to_be_so() -> None:
     rgb, depth = image()
     away = make_pose(torch.eye(3), torch.tensor([2.0, 0.0, 0.8]))[None, None]
-    points = look(lay_out(rgb, depth, K), away, CENTER, RADIUS, torch.randn(1, 1, 50, 2))
+    points = sample_points(
+        flatten_images(rgb, depth, K), away, CENTER, RADIUS, torch.randn(1, 1, 50, 2)
+    )
     assert not points.inside.any()
 
 
@@ -70,7 +74,7 @@ def test_a_score_does_not_change_with_the_frame() -> None:
     """
     rgb, depth = image()
     net = PoseLikelihood(width=32, blocks=1)
-    scene = lay_out(rgb, depth, K)
+    scene = flatten_images(rgb, depth, K)
     g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
     others = make_pose(random_rotation(1, 5), torch.tensor([0.0, 0.0, 0.9]))
     alone = net(scene, pose(), torch.tensor(0.02), CENTER, RADIUS, 64, g())
@@ -80,7 +84,7 @@ def test_a_score_does_not_change_with_the_frame() -> None:
 
 
 def test_the_noise_level_changes_the_score() -> None:
-    scene = lay_out(*image(), K)
+    scene = flatten_images(*image(), K)
     net = PoseLikelihood(width=32, blocks=1)
     g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
     broad = net(scene, pose(), torch.tensor(0.2), CENTER, RADIUS, 64, g())
@@ -92,7 +96,7 @@ def test_the_noise_level_changes_the_score() -> None:
 
 
 def test_gradients_reach_the_pose() -> None:
-    scene = lay_out(*image(), K)
+    scene = flatten_images(*image(), K)
     shift = torch.zeros(3, requires_grad=True)
     moved = make_pose(pose()[..., :3, :3], pose()[..., :3, 3] + shift)
     net = PoseLikelihood(width=32, blocks=1)
@@ -103,7 +107,7 @@ def test_gradients_reach_the_pose() -> None:
     assert shift.grad.abs().max() > 0
 
 
-def said(features: int = 2, wrong: float = 0.0) -> Coordinates:
+def predicted(features: int = 2, wrong: float = 0.0) -> Coordinates:
     """Return what a network might say of a wall at 0.8 m: coordinates true at the pose above but
     for a shift, in radii.
 
@@ -128,7 +132,7 @@ def test_context_is_read_where_the_point_is() -> None:
     rgb, _ = image()
     flat = torch.full((1, 1, H, W), 0.8)
     noise = 0.3 * torch.randn(1, 1, 40, 2, generator=torch.Generator().manual_seed(1))
-    points = look(lay_out(rgb, flat, K, said()), pose(), CENTER, RADIUS, noise)
+    points = sample_points(flatten_images(rgb, flat, K, predicted()), pose(), CENTER, RADIUS, noise)
     assert points.context is not None
     assert points.context.shape == (1, 1, 40, 5 + 2)
     torch.testing.assert_close(points.context[..., 0].exp(), torch.full((1, 1, 40), 0.5))
@@ -137,15 +141,17 @@ def test_context_is_read_where_the_point_is() -> None:
     assert middle.sum() > 10
     off = (points.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle]
     assert off.max() < 1e-3  # on a wall the true coordinates are linear in the pixel
-    moved = look(lay_out(rgb, flat, K, said(wrong=0.5)), pose(), CENTER, RADIUS, noise)
+    moved = sample_points(
+        flatten_images(rgb, flat, K, predicted(wrong=0.5)), pose(), CENTER, RADIUS, noise
+    )
     assert moved.context is not None
     assert (moved.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle].min() > 0.7
 
 
 def test_gradients_reach_the_features_but_not_what_is_said_of_the_object() -> None:
-    told = Coordinates(*(x.requires_grad_() for x in said()))
+    told = Coordinates(*(x.requires_grad_() for x in predicted()))
     net = PoseLikelihood(width=32, blocks=1, context=2)
-    scene = lay_out(*image(), K, told)
+    scene = flatten_images(*image(), K, told)
     net(
         scene, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
     ).sum().backward()
@@ -160,8 +166,8 @@ def test_what_the_context_says_changes_the_score() -> None:
     net = PoseLikelihood(width=32, blocks=1, context=2)
     g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
     right, wrong = (
-        net(lay_out(*image(), K, told), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, g())
-        for told in (said(), said(wrong=1.0))
+        net(flatten_images(*image(), K, told), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, g())
+        for told in (predicted(), predicted(wrong=1.0))
     )
     assert (right - wrong).abs().item() > 1e-4
 
@@ -169,14 +175,24 @@ def test_what_the_context_says_changes_the_score() -> None:
 def test_context_without_a_proposal_network_is_refused() -> None:
     net = PoseLikelihood(width=32, blocks=1, context=2)
     with pytest.raises(UserError, match="model/proposals=dense"):
-        net(lay_out(*image(), K), pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator())
+        net(
+            flatten_images(*image(), K),
+            pose(),
+            torch.tensor(0.01),
+            CENTER,
+            RADIUS,
+            64,
+            torch.Generator(),
+        )
 
 
 def test_pixels_are_drawn_about_the_origin_or_the_center() -> None:
     rgb, depth = image()
     noise = torch.zeros(1, 1, 1, 2)
     for anchor in (None, torch.zeros(3)):
-        points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor)
+        points = sample_points(
+            flatten_images(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor
+        )
         point = CENTER if anchor is None else anchor
         wanted = project(transform(pose(), point[None, None, None])[:, 0], K).round()
         ray = torch.nn.functional.normalize(rays(wanted, K), dim=-1) @ pose()[0, 0, :3, :3]
@@ -190,14 +206,16 @@ def test_the_papers_likelihood_is_a_sum_over_points(about: str, anchor: torch.Te
     rgb, depth = image()
     net = PaperLikelihood(about=about)
     noise = torch.randn(1, 1, 30, 2, generator=torch.Generator().manual_seed(5))
-    points = look(lay_out(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor)
+    points = sample_points(
+        flatten_images(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor
+    )
     by_hand = sum(
-        net.judge_samples(points.position[0, 0, k] + CENTER, points.color[0, 0, k])
+        net.score_samples(points.position[0, 0, k] + CENTER, points.color[0, 0, k])
         for k in range(30)
         if points.inside[0, 0, k] and points.known[0, 0, k]
     )
     got = net(
-        lay_out(rgb, depth, K),
+        flatten_images(rgb, depth, K),
         pose(),
         torch.tensor(0.0),
         CENTER,

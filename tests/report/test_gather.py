@@ -47,14 +47,14 @@ def test_signs_of_failure_are_found(run: Path) -> None:
     found = {
         finding.diagnostic.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))
     }
-    assert found["signs/pairwise_cosine"] == (0.95, True)
-    assert found["signs/off_frame/last"] == (0.625, True)  # the last step's
-    assert found["signs/offset_r2"] == (0.5, False)
+    assert found["diagnostics/pairwise_cosine"] == (0.95, True)
+    assert found["diagnostics/off_frame/last"] == (0.625, True)  # the last step's
+    assert found["diagnostics/offset_r2"] == (0.5, False)
     assert found["missed_share"] == (0.25, True)
     assert found["belief/coverage_90"] == (41.0, True)
     assert found["fallen"] == (20.0, True)
     assert found["particles_on_object"] == (0.75, False)
-    assert "signs/auroc" not in found
+    assert "diagnostics/auroc" not in found
 
 
 def test_timings(run: Path) -> None:

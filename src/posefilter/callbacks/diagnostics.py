@@ -35,7 +35,7 @@ class Diagnostics(Callback):
     """Log where the particles are, step by step, after each validation; draw it of a test, with
     trajectories of some images.
 
-    The numbers themselves are among the method's metrics (val/signs/...).  Silent for methods whose
+    The numbers themselves are among the method's metrics (val/diagnostics/...).  Silent for methods whose
     particles are no pixels.
 
     Args:
@@ -59,12 +59,12 @@ class Diagnostics(Callback):
         """Log the shares of particles, step by step."""
         self.budget.stop()
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
-        if "signs" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
+        if "diagnostics" not in scores or trainer.sanity_checking or not trainer.is_global_zero:
             return
-        found = cast(FilterDiagnostics, scores["signs"]).compute()
+        found = cast(FilterDiagnostics, scores["diagnostics"]).compute()
         for logger in trainer.loggers:
             logger.log_metrics(
-                {f"signs/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
+                {f"diagnostics/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
             )
         if self.budget.allows():
             with self.budget.spend():
@@ -89,8 +89,8 @@ class Diagnostics(Callback):
         early one.
         """
         scores = cast(torch.nn.ModuleDict, pl_module.scores)
-        if "signs" in scores and trainer.is_global_zero:
-            found = cast(FilterDiagnostics, scores["signs"]).compute()
+        if "diagnostics" in scores and trainer.is_global_zero:
+            found = cast(FilterDiagnostics, scores["diagnostics"]).compute()
             figure = draw_diagnostics(found, "Diagnostics\nof the test")
             post_image(trainer, "diagnostics", figure, self.folder, "test")
 
@@ -130,9 +130,10 @@ def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:
         A figure (H, 600, 3) uint8: shares of particles on the object, off the frame, at an edge and
         in a corner; below it the numbers that are one for all steps.
     """
-    numbers = [(find_metric(f"signs/{name}"), found[name]) for name in NUMBERS]
+    numbers = [(find_metric(f"diagnostics/{name}"), found[name]) for name in NUMBERS]
     foot = ", ".join(f"{info.short} {info.describe(value)}" for info, value in numbers)
     lines = {
-        find_metric(f"signs/{name}").label: (found[name], color) for name, color in LISTS.items()
+        find_metric(f"diagnostics/{name}").label: (found[name], color)
+        for name, color in LISTS.items()
     }
     return draw_shares(lines, title, foot)

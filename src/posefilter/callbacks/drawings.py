@@ -134,7 +134,7 @@ def field(o: Occasion) -> Drawn:
     return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
 
 
-@needs("judge_points")
+@needs("score_points")
 def points(o: Occasion) -> Drawn:
     """Draw slices of the likelihood of single points through the object's frame (the paper, figure
     5).

@@ -27,19 +27,19 @@ from posefilter.geometry.pose import (
     transform,
 )
 from posefilter.geometry.rotation import exp_so3
-from posefilter.nets.coordinates import Cells, Coordinates, ask, true_coordinates
+from posefilter.nets.coordinates import Cells, Coordinates, query, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
-from posefilter.nets.likelihood import Pixels, Points, look
+from posefilter.nets.likelihood import Pixels, Points, sample_points
 from posefilter.protocols import ProposesPoses, Scene, ScoresPoses
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
 
 
-class JudgesPoints(Protocol):
+class ScoresPoints(Protocol):
     """A likelihood that judges single image points."""
 
-    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+    def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
         """Judge points at a noise level [m].  Points (B, N, P) -> (B, N, P)."""
         ...
 
@@ -48,7 +48,7 @@ class JudgesPoints(Protocol):
 class HasPointLikelihood(Protocol):
     """A method whose likelihood judges the points of images that it keeps as `scene.image`."""
 
-    likelihood: JudgesPoints
+    likelihood: ScoresPoints
 
 
 class ObjectCoordinates(Protocol):
@@ -136,7 +136,7 @@ def turn_pose(pose: Tensor, center: Tensor, angles: Tensor) -> Tensor:
 
 
 def evaluate_point_field(
-    likelihood: JudgesPoints,
+    likelihood: ScoresPoints,
     image: Pixels,
     truth: Tensor,
     model: ObjectModel,
@@ -167,10 +167,10 @@ def evaluate_point_field(
     )
     if image.context is not None:  # what the proposal network says of the place that is asked for
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
-        many = many._replace(context=ask(image.context, u, v, many.position / model.radius))
+        many = many._replace(context=query(image.context, u, v, many.position / model.radius))
     found = torch.stack(
         [
-            likelihood.judge_points(many, sigma, center, model.radius)[0, 0].float().cpu()
+            likelihood.score_points(many, sigma, center, model.radius)[0, 0].float().cpu()
             for sigma in sigmas
         ]
     ).numpy()
@@ -187,9 +187,11 @@ def make_point(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: Obje
     center = model.center.to(truth)
     middle = origin_of(truth, center)
     reach = model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
-    # what `look` will undo
+    # what `sample_points` will undo
     noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach
-    return look(image, truth[None, None], center, model.radius, noise[None, None, None], spread=1.0)
+    return sample_points(
+        image, truth[None, None], center, model.radius, noise[None, None, None], spread=1.0
+    )
 
 
 def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:

@@ -63,7 +63,7 @@ LAYOUT: dict[str, dict[str, Chart]] = {
         ),
         "spread [px], by iteration": ("Multiline", [r"filter/spread_px/step_\d+$"]),
         "noise level [m] or [px], by iteration": ("Multiline", [r"filter/sigma_(m|px)/step_\d+$"]),
-        "where they end": ("Multiline", [r"signs/.*/last$"]),
+        "where they end": ("Multiline", [r"diagnostics/.*/last$"]),
     },
     "4  Is the belief honest?": {
         "truths within the region that holds 50 % and 90 % of the belief [%]": (

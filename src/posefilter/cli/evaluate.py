@@ -36,7 +36,7 @@ from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
-from posefilter.models.base import score_of
+from posefilter.models.base import compute_checkpoint_score
 from posefilter.paths import check_links
 from posefilter.types import ObjectModel
 
@@ -71,7 +71,7 @@ def evaluate(job: Job) -> float:
         files,
         following,
     )
-    return score_of(metrics)
+    return compute_checkpoint_score(metrics)
 
 
 def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:

@@ -86,13 +86,16 @@ def learned_from(job: Job) -> str:
     the same.
 
     Left out is what only testing reads: a few settings of the data, what the method names in
-    `tested_with`, and `filter` where training rolls out another.
+    `test_only_settings`, and `filter` where training rolls out another.
     """
     cfg = job.cfg.copy()
     cfg.folder = ""
     used: dict[str, Any] = {key: plain(cfg[key]) for key in _LEARNED_FROM}
     method: Any = locate(str(cfg.model._target_), "model")
-    tested = {*method.tested_with, *(["filter"] if used["model"].get("train_filter") else [])}
+    tested = {
+        *method.test_only_settings,
+        *(["filter"] if used["model"].get("train_filter") else []),
+    }
     used["model"] = {key: value for key, value in used["model"].items() if key not in tested}
     used["data"] = {key: value for key, value in used["data"].items() if key not in _TESTED_WITH}
     return sha256(json.dumps(used, sort_keys=True, default=str).encode()).hexdigest()

@@ -20,7 +20,7 @@ from posefilter.cli.reuse import finished, learned_from, start_from, take_over
 from posefilter.cli.warm_start import warm_start
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped
-from posefilter.models.base import PoseEstimator, score_of
+from posefilter.models.base import PoseEstimator, compute_checkpoint_score
 from posefilter.paths import stays_inside
 
 log = logging.getLogger(__name__)
@@ -52,7 +52,7 @@ def train(job: Job) -> float:
         checkpoint = read_checkpoint(run.best)
         training |= {"tested_step": int(checkpoint["global_step"])}
         metrics = finish(run, training, test(run, checkpoint))
-    return score_of(metrics)
+    return compute_checkpoint_score(metrics)
 
 
 def build(job: Job) -> Run:

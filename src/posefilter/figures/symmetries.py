@@ -8,7 +8,7 @@ import numpy as np
 from posefilter.figures.canvas import AXES, PAPER, arrange_grid, draw_lines, draw_row
 from posefilter.meshes.find_symmetries import ANY, Turn
 from posefilter.meshes.mesh import Mesh, diameter
-from posefilter.meshes.symmetries import turn_about
+from posefilter.meshes.symmetries import rotation_about
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.surfaces import Instance, Lights
 
@@ -40,7 +40,7 @@ def draw_symmetries(
     rows = [draw_row(width, f"{mesh.name}: symmetries {source}", size=16)]
     for turn in found:
         angle = _ANY_SHOWN if turn.fold == ANY else 2 * np.pi / turn.fold
-        transform = turn_about(turn.axis, angle, turn.point)
+        transform = rotation_about(turn.axis, angle, turn.point)
         turned = camera @ transform
         tiles = [_render(renderer, mesh, pose, K) for pose in (camera, turned)]
         for tile in tiles:

@@ -24,7 +24,7 @@ from posefilter.meshes.mesh import (
     surface_colors,
     surface_points,
 )
-from posefilter.meshes.symmetries import symmetry_group, turn_about
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
 ANY = 0  # the fold of a turn by any angle
 FOLDS = (2, 3, 4)
@@ -149,7 +149,7 @@ def list_discrete(turns: Sequence[Turn], size: float) -> list[np.ndarray]:
     best turn's axis alone.
     """
     discrete = [turn for turn in turns if turn.fold != ANY]
-    generators = [turn_about(t.axis, 2 * np.pi / t.fold, t.point) for t in discrete]
+    generators = [rotation_about(t.axis, 2 * np.pi / t.fold, t.point) for t in discrete]
     group = _close(generators, size)
     if len(group) > _MOST_ELEMENTS:
         group = _close(generators[:1], size)
@@ -212,12 +212,12 @@ def _candidate_axes(mesh: Mesh, centered: np.ndarray) -> list[np.ndarray]:
 def _try(surface: _Surface, axis: np.ndarray, center: np.ndarray, fold: int) -> Turn | None:
     """Refine and judge a turn; None where it is far from a symmetry."""
     angles = _ANY_ANGLES if fold == ANY else (2 * np.pi / fold,)
-    start = turn_about(axis, angles[0], center)
+    start = rotation_about(axis, angles[0], center)
     if _distances(surface, start).mean() > _COARSE * surface.diameter:
         return None
     axis, point = _axis_of(_register(surface, start), axis)
     point = point + ((center - point) @ axis) * axis
-    exact = [turn_about(axis, angle, point) for angle in angles]
+    exact = [rotation_about(axis, angle, point) for angle in angles]
     before = _distances(surface, np.eye(4))
     after = [_distances(surface, turn) for turn in exact]
     distance = max(_excess(one, before, np.mean) for one in after)

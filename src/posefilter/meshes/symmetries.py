@@ -24,12 +24,12 @@ def symmetry_group(
     group = [np.eye(4), *(discrete or [])]
     for axis, offset in continuous or []:
         unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
-        turns = [turn_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
+        turns = [rotation_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
         group = [a @ b for a in group for b in turns]
     return np.stack(group)
 
 
-def turn_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndarray:
+def rotation_about(axis: np.ndarray, angle: float, point: np.ndarray) -> np.ndarray:
     """Return the turn by an angle [rad] about a line.
 
     Unit axis (3,), a point on it (3,) [m] -> (4, 4).

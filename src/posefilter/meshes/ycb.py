@@ -6,7 +6,7 @@ object settings).
 
 import numpy as np
 
-from posefilter.meshes.symmetries import symmetry_group, turn_about
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
 # YCB-Video's order; label images and cls_indexes count from 1, FAT's segmentation ids in steps of
 # 12.
@@ -137,7 +137,7 @@ def symmetries(name: str, steps: int = 36) -> np.ndarray | None:
     """
     if name in _HALF_TURNS:
         axis, point = (np.array(v) for v in _HALF_TURNS[name])
-        return symmetry_group(discrete=[turn_about(axis / np.linalg.norm(axis), np.pi, point)])
+        return symmetry_group(discrete=[rotation_about(axis / np.linalg.norm(axis), np.pi, point)])
     if name in _ANY_TURN:
         axis, point = (np.array(v) for v in _ANY_TURN[name])
         return symmetry_group(continuous=[(axis, point)], steps=steps)

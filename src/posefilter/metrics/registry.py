@@ -1,8 +1,8 @@
 """What each number of metrics.json is called, how it is written, and which way is better.
 
 One table for all who show numbers.  Keys are those of metrics.json, nested ones joined by "/"
-(`add/auc`).  A list, one number an iteration, is read at its ends: `signs/off_frame/first` and
-`signs/off_frame/last`.  `filter/...` are the filter's quantities by iteration and `train/...` those
+(`add/auc`).  A list, one number an iteration, is read at its ends: `diagnostics/off_frame/first` and
+`diagnostics/off_frame/last`.  `filter/...` are the filter's quantities by iteration and `train/...` those
 of a training, which are only logged.
 """
 
@@ -219,9 +219,9 @@ _METRICS = (
         "what no search can mend",
     ),
     # where particles that are pixels are; lists over the iterations
-    MetricInfo("signs/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
+    MetricInfo("diagnostics/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
     MetricInfo(
-        "signs/on_object/first",
+        "diagnostics/on_object/first",
         "on the object at the start",
         "%",
         ".1f",
@@ -231,7 +231,7 @@ _METRICS = (
         "began on it",
     ),
     MetricInfo(
-        "signs/on_object/last",
+        "diagnostics/on_object/last",
         "on the object at the end",
         "%",
         ".1f",
@@ -240,14 +240,16 @@ _METRICS = (
         PERCENT,
         "on the object",
     ),
-    MetricInfo("signs/off_frame", "off the frame", "%", ".1f", LOWER, 100.0, PERCENT, "off frame"),
-    MetricInfo("signs/near_edge", "at an edge", "%", ".1f", LOWER, 100.0, PERCENT),
-    MetricInfo("signs/near_corner", "in a corner", "%", ".1f", LOWER, 100.0, PERCENT),
     MetricInfo(
-        "signs/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"
+        "diagnostics/off_frame", "off the frame", "%", ".1f", LOWER, 100.0, PERCENT, "off frame"
+    ),
+    MetricInfo("diagnostics/near_edge", "at an edge", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo("diagnostics/near_corner", "in a corner", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo(
+        "diagnostics/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"
     ),
     MetricInfo(
-        "signs/line_share",
+        "diagnostics/line_share",
         "variance along one line",
         "%",
         ".1f",
@@ -257,7 +259,7 @@ _METRICS = (
         meaning="share of the particles' variance along its first principal axis; 50: no line",
     ),
     MetricInfo(
-        "signs/line_share/first",
+        "diagnostics/line_share/first",
         "variance along one line at the start",
         "%",
         ".1f",
@@ -266,7 +268,7 @@ _METRICS = (
         short="began along a line",
     ),
     MetricInfo(
-        "signs/pairwise_cosine",
+        "diagnostics/pairwise_cosine",
         "agreement of the displacements",
         form=".2f",
         direction=LOWER,
@@ -274,7 +276,7 @@ _METRICS = (
         short="same direction",
     ),
     MetricInfo(
-        "signs/offset_r2",
+        "diagnostics/offset_r2",
         "true offsets explained (R²)",
         form=".2f",
         direction=HIGHER,
@@ -282,7 +284,7 @@ _METRICS = (
         short="offset R2",
     ),
     MetricInfo(
-        "signs/heading",
+        "diagnostics/heading",
         "cosine of displacement and true offset",
         form=".2f",
         direction=HIGHER,
@@ -290,7 +292,7 @@ _METRICS = (
         short="heading",
     ),
     MetricInfo(
-        "signs/auroc",
+        "diagnostics/auroc",
         "AUROC of the likelihood",
         form=".2f",
         direction=HIGHER,
@@ -330,7 +332,7 @@ def find_metric(key: str) -> MetricInfo:
 
     Args:
         key: Its key.  That of a logged scalar (`val/add/auc`), of a range of visibility
-            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list (`signs/off_frame/last`)
+            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list (`diagnostics/off_frame/last`)
             lead to the same number.
 
     Raises:

@@ -46,7 +46,7 @@ class PoseEstimator(LightningModule):
 
     provides: ClassVar[Capabilities] = ("rollout",)
     requires: ClassVar[Capabilities] = ()
-    tested_with: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
+    test_only_settings: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class PoseEstimator(LightningModule):
         self._object_model: ObjectModel | None = None
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
-        self.lost = self.lost_in_a_row = 0  # steps whose gradient was not finite
+        self.lost = self.skipped_in_a_row = 0  # steps whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
 
     @cached_property
@@ -141,13 +141,13 @@ class PoseEstimator(LightningModule):
                 f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
             )
         for name, value in means.items():
-            self.watch(name, value.detach())
+            self.log_scalar(name, value.detach())
         if self._trainer is not None:
             self.log("train/total", total.detach(), prog_bar=True)
             self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return total
 
-    def watch(self, name: str, value: Tensor) -> None:
+    def log_scalar(self, name: str, value: Tensor) -> None:
         """Log a training scalar, where a trainer listens."""
         if self._trainer is not None:
             self.log(f"train/{name}", value)
@@ -188,7 +188,7 @@ class PoseEstimator(LightningModule):
                 for parameter in parameters:
                     parameter.grad = None  # zeros would still move it, by momentum
         self.lost += bool(lost)
-        self.lost_in_a_row = self.lost_in_a_row + 1 if lost else 0
+        self.skipped_in_a_row = self.skipped_in_a_row + 1 if lost else 0
         if lost and self.lost in (1, 10, 100, 1000, 10_000):
             at = self.global_step
             log.warning(
@@ -197,7 +197,7 @@ class PoseEstimator(LightningModule):
                 ", ".join(lost),
                 self.lost,
             )
-        if self.lost_in_a_row == _PATIENCE:
+        if self.skipped_in_a_row == _PATIENCE:
             raise FloatingPointError(
                 f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: "
                 f"a roll-out's can grow "
@@ -299,7 +299,7 @@ class PoseEstimator(LightningModule):
         """Log the metrics; `val/score` is what the best checkpoint has most of."""
         results = self.results()
         self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
-        self.log("val/score", score_of(results), prog_bar=True)
+        self.log("val/score", compute_checkpoint_score(results), prog_bar=True)
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
@@ -320,7 +320,7 @@ class PoseEstimator(LightningModule):
         self.set_object(ObjectModel(**checkpoint["object_model"]))
 
 
-def score_of(results: dict[str, Any]) -> float:
+def compute_checkpoint_score(results: dict[str, Any]) -> float:
     """Return the one figure of results in the form of metrics.json (see `overall`)."""
     auc = float(results["add"]["auc"]) if results["add"] else None
     return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))

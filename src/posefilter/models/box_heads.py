@@ -60,9 +60,9 @@ class VotedBox:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
-        particles, told = trace.particles[-1], trace.outputs[-1].latent * batch.rgb.shape[-1]
+        particles, predicted = trace.particles[-1], trace.outputs[-1].latent * batch.rgb.shape[-1]
         sides = torch.cat(
-            [particles.state - told[..., :2], particles.state + told[..., 2:]], dim=-1
+            [particles.state - predicted[..., :2], particles.state + predicted[..., 2:]], dim=-1
         )
         return weighted_quantile(sides, particles.log_weights.exp(), 0.5)
 

@@ -24,10 +24,10 @@ from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particl
 
 
 @runtime_checkable
-class JudgesSamples(Protocol):
+class ScoresSamples(Protocol):
     """A likelihood that judges colored points by themselves: labeled rays ask for it."""
 
-    def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
+    def score_samples(self, position: Tensor, color: Tensor) -> Tensor:
         """Judge points (*, 3) in the object frame [m] with colors (*, 3) in [0, 1].  -> (*)."""
         ...
 
@@ -90,7 +90,7 @@ def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) 
     return Trace((particles,), (output,), (Step(0, 1, sigma),), belief)
 
 
-def make_even_particles(state: Tensor) -> Particles:
+def make_uniform_particles(state: Tensor) -> Particles:
     """Wrap states (B, N, *S) as an evenly weighted cloud without latent."""
     B, N = state.shape[:2]
     weights = state.new_full((B, N), -math.log(N))
@@ -159,7 +159,7 @@ class CandidatePoses:
             own = torch.rand(B, device=device, generator=generator) < self.own_level
             sigma = torch.where(own, level, sigma)
             groups.append(states)
-        particles = make_even_particles(torch.cat(groups, dim=1))
+        particles = make_uniform_particles(torch.cat(groups, dim=1))
         output = method.measure(scene, particles, Step(0, 1, sigma), generator)
         if self.persistent is not None:
             scores = output.log_likelihood[:, -self.persistent.particles :].detach()
@@ -208,7 +208,7 @@ class LabeledRays:
     """
 
     provides: ClassVar[Capabilities] = ("ray_samples",)
-    requires: ClassVar[Capabilities] = ("judge_samples",)
+    requires: ClassVar[Capabilities] = ("score_samples",)
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class LabeledRays:
         surface [m], own color.
         """
         net = method.likelihood
-        if not isinstance(net, JudgesSamples):
+        if not isinstance(net, ScoresSamples):
             raise UserError(
                 "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood only; choose "
                 "model/likelihood=paper or model/candidate_sampler=candidates"
@@ -263,9 +263,11 @@ class LabeledRays:
             for own in (0.0, 1.0)
         ]
         weight = torch.cat([valid, near], dim=1).float()
-        judged = net.judge_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
+        judged = net.score_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
         log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
-        particles = make_even_particles(torch.cat(state, dim=1))._replace(log_weights=log_weights)
+        particles = make_uniform_particles(torch.cat(state, dim=1))._replace(
+            log_weights=log_weights
+        )
         pose = batch.camera_from_object[:, None].expand(-1, judged.shape[1], -1, -1)
         output = ParticleOutput(
             judged, judged.new_zeros(B, judged.shape[1], 6), pose, particles.latent

@@ -148,13 +148,21 @@ class ImageSpace(PoseEstimator):
             state = state.detach()
         patch = self.image_patches(scene, state)
         extra = torch.cat(
-            [self.encoder.look(scene.context, state), self.place(scene, state)], dim=-1
+            [
+                self.encoder.sample_features(scene.context, state),
+                self.position_features(scene, state),
+            ],
+            dim=-1,
         )
-        said = self.net(patch, extra, latent)
+        predicted = self.net(patch, extra, latent)
         height, width = scene.image.shape[-2:]
-        displacement = self.displacement(said.displacement, said.logit, state, width, height)
-        pose, fragments = self.pose_head(said.pose, self.surface_points(scene, state)[0])
-        return ParticleOutput(F.logsigmoid(said.logit), displacement, pose, said.latent, fragments)
+        displacement = self.displacement(
+            predicted.displacement, predicted.logit, state, width, height
+        )
+        pose, fragments = self.pose_head(predicted.pose, self.surface_points(scene, state)[0])
+        return ParticleOutput(
+            F.logsigmoid(predicted.logit), displacement, pose, predicted.latent, fragments
+        )
 
     def surface_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
@@ -177,7 +185,7 @@ class ImageSpace(PoseEstimator):
         patches: Tensor = self.glimpse(scene.image, state)
         return patches
 
-    def place(self, scene: ImageScene, state: Tensor) -> Tensor:
+    def position_features(self, scene: ImageScene, state: Tensor) -> Tensor:
         """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its
         location in [-1, 1].
         """
@@ -195,7 +203,7 @@ class ImageSpace(PoseEstimator):
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
         scene = self.encode(batch)
-        trace: Trace = self.train_filter(batch, _Observed(self, scene), generator)
+        trace: Trace = self.train_filter(batch, _EncodedMethod(self, scene), generator)
         losses = {"loss": self.loss(trace, batch, self.model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.model)
@@ -213,18 +221,18 @@ class ImageSpace(PoseEstimator):
     def set_object(self, model: ObjectModel) -> None:
         """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
         super().set_object(model)
-        self.pose_head.about(model)
-        self.scores["signs"] = FilterDiagnostics()
+        self.pose_head.set_object(model)
+        self.scores["diagnostics"] = FilterDiagnostics()
 
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and its signs of failure."""
         super().score(trace, batch)
-        cast(FilterDiagnostics, self.scores["signs"]).update(trace, batch)
+        cast(FilterDiagnostics, self.scores["diagnostics"]).update(trace, batch)
 
     def results(self) -> dict[str, Any]:
         """Return the metrics, and the signs of failure."""
         return super().results() | {
-            "signs": cast(FilterDiagnostics, self.scores["signs"]).compute()
+            "diagnostics": cast(FilterDiagnostics, self.scores["diagnostics"]).compute()
         }
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
@@ -232,7 +240,7 @@ class ImageSpace(PoseEstimator):
         return self.box_head(trace, batch, self.model)
 
 
-class _Observed:
+class _EncodedMethod:
     """A method that has looked at its images already, so that a roll-out and a loss on the scene
     share one look.
     """

@@ -16,7 +16,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
 from posefilter.nets.layers import fast_bfloat16
-from posefilter.nets.likelihood import Pixels, lay_out
+from posefilter.nets.likelihood import Pixels, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
@@ -56,7 +56,7 @@ class PosePF(PoseEstimator):
     """
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
-    tested_with = ("filter", "train_filter", "pixels")  # training rolls out no filter
+    test_only_settings = ("filter", "train_filter", "pixels")  # training rolls out no filter
     # for comparing the estimate with the truth: image points, noise level [m]
     judged_pixels, judged_at = 4096, 0.004
 
@@ -98,10 +98,10 @@ class PosePF(PoseEstimator):
     def encode(self, batch: Batch) -> PoseScene:
         """Lay the image out, and run the proposal network once."""
         if self.proposals is None:
-            return PoseScene(lay_out(batch.rgb, batch.depth, batch.intrinsics), None, None)
+            return PoseScene(flatten_images(batch.rgb, batch.depth, batch.intrinsics), None, None)
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         context = coordinates if coordinates.features.shape[-1] else None
-        image = lay_out(batch.rgb, batch.depth, batch.intrinsics, context)
+        image = flatten_images(batch.rgb, batch.depth, batch.intrinsics, context)
         return PoseScene(image, coordinates, measure_cells(batch.depth, batch.intrinsics))
 
     def measure(
@@ -160,7 +160,7 @@ class PosePF(PoseEstimator):
                 scene.coordinates, scene.cells, batch.mask, batch.camera_from_object, *size
             )
             losses["proposals"] = self.proposal_weight * fit
-            self.watch("coordinate_error_mm", 1000 * error.mean())
+            self.log_scalar("coordinate_error_mm", 1000 * error.mean())
         return losses
 
     def set_object(self, model: ObjectModel) -> None:
@@ -203,12 +203,12 @@ class PosePF(PoseEstimator):
         cut.
         """
         super().on_save_checkpoint(checkpoint)
-        checkpoint["lesson"] = self.candidate_sampler.state()
+        checkpoint["candidate_sampler"] = self.candidate_sampler.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Give the candidate sampler its state back."""
         super().on_load_checkpoint(checkpoint)
-        self.candidate_sampler.restore(checkpoint.get("lesson", {}))
+        self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 
     def _center(self) -> Tensor:
         return self.model.center.to(self.device)

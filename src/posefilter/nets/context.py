@@ -16,7 +16,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.geometry.lookup import patch_offsets, sample
-from posefilter.nets.encoding import UNet, geometry, grow, in_bfloat16, masked_mean_pool
+from posefilter.nets.encoding import UNet, geometry, in_bfloat16, masked_mean_pool, upsample_like
 from posefilter.nets.layers import ResBlock
 
 
@@ -38,7 +38,7 @@ class NoContext(nn.Module):
         """Return an empty map."""
         return ContextMap((), (), None)
 
-    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+    def sample_features(self, maps: ContextMap, pixels: Tensor) -> Tensor:
         """Return no features.  (B, N, 2) -> (B, N, 0), without gradient.
 
         With a gradient, the graph behind the positions would be traversed for nothing.
@@ -84,7 +84,7 @@ class Pyramid(nn.Module):
             levels.append(torch.cat([F.avg_pool2d(rgb, stride) * 2 - 1, z, known], dim=1))
         return ContextMap(tuple(levels), self.strides, None)
 
-    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+    def sample_features(self, maps: ContextMap, pixels: Tensor) -> Tensor:
         """Sample features.  (B, N, 2) [px] -> (B, N, width)."""
         features = []
         for level, stride in zip(maps.levels, maps.strides, strict=True):
@@ -111,12 +111,12 @@ class _Encoder(nn.Module):
         features = features.float()
         return ContextMap((features,), (stride,), self.relevance(features)[:, 0])
 
-    def look(self, maps: ContextMap, pixels: Tensor) -> Tensor:
+    def sample_features(self, maps: ContextMap, pixels: Tensor) -> Tensor:
         """Sample features.  (B, N, 2) [px] -> (B, N, width); off the frame, those at its edge."""
         return sample(maps.levels[0], pixels, maps.strides[0], padding="border")
 
 
-def averaged(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tensor, Tensor, Tensor]:
+def downsample(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return images, depths and cameras at 1 / factor of the size; rows and columns that do not
     fill a cell are left out.
 
@@ -153,7 +153,7 @@ class ConvEncoder(_Encoder, UNet):
         if most_px is not None and most_px < 32:
             raise UserError(f"model.encoder.most_px={most_px}: must be 32 or more, or null")
         self.most_px = most_px
-        self.lay_trunk(widths)
+        self.build_trunk(widths)
         a, b = widths[:2]
         self.up8 = ResBlock(b)
         self.to4, self.skip4, self.up4 = (
@@ -166,11 +166,11 @@ class ConvEncoder(_Encoder, UNet):
         """Return one map, of 4 pixels of the downsampled image a cell."""
         factor = 1 if self.most_px is None else math.ceil(rgb.shape[-1] / self.most_px)
         if factor > 1:
-            rgb, depth, K = averaged(rgb, depth, K, factor)
+            rgb, depth, K = downsample(rgb, depth, K, factor)
         shape = geometry(depth, K)
         with in_bfloat16(rgb):
             x4, y8 = self.encode(rgb, shape)
-            y4 = self.up4(self.skip4(x4) + grow(self.to4(y8), x4))
+            y4 = self.up4(self.skip4(x4) + upsample_like(self.to4(y8), x4))
         return self._map(y4, 4 * factor)
 
 
@@ -195,5 +195,5 @@ class ResNetContext(_Encoder):
         maps = self.trunk(rgb, geometry(depth, K))
         top = self.lateral[-1](maps[-1])
         for lateral, low in zip(reversed(self.lateral[:-1]), reversed(maps[:-1]), strict=True):
-            top = lateral(low) + grow(top, low)
+            top = lateral(low) + upsample_like(top, low)
         return self._map(self.smooth(top), 4)

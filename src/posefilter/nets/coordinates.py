@@ -143,7 +143,7 @@ class Context(NamedTuple):
         return Context(smooth, share, position, centers, self.grid, self.columns)
 
 
-def lay_out_context(coordinates: Coordinates, height: int, width: int) -> Context:
+def flatten_context(coordinates: Coordinates, height: int, width: int) -> Context:
     """Flatten the output of H x W images for gathering.
 
     Gradients flow to the features only: the rest is trained by `coordinate_loss`.
@@ -165,7 +165,7 @@ def lay_out_context(coordinates: Coordinates, height: int, width: int) -> Contex
     )
 
 
-def ask(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
+def query(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
     """Sample the coordinate network's output at pixels, for the object points of a hypothesis.
 
     Cells are interpolated bilinearly, positions weighted by the probability of the fragment.

@@ -61,7 +61,7 @@ def geometry(depth: Tensor, K: Tensor) -> Tensor:
     return whole.contiguous(memory_format=torch.channels_last)
 
 
-def grow(x: Tensor, like: Tensor) -> Tensor:
+def upsample_like(x: Tensor, like: Tensor) -> Tensor:
     """Interpolate a map to the size of another.  (B, C, h, w), (B, *, H, W) -> (B, C, H, W)."""
     return F.interpolate(x, size=like.shape[-2:], mode="bilinear", align_corners=False)
 
@@ -81,14 +81,14 @@ def in_bfloat16(rgb: Tensor) -> torch.autocast:
 class UNet(nn.Module):
     """Trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8.
 
-    Color enters at full resolution, geometry at half. Subclasses create the layers by `lay_trunk`,
+    Color enters at full resolution, geometry at half. Subclasses create the layers by `build_trunk`,
     then `up8`: names and order of parameters are those of existing checkpoints and optimizer
     states.
     """
 
     up8: nn.Module  # of each subclass, laid next: what follows on the way up at stride 8
 
-    def lay_trunk(self, widths: tuple[int, int, int, int]) -> None:
+    def build_trunk(self, widths: tuple[int, int, int, int]) -> None:
         """Create all layers but `up8`.
 
         Args:
@@ -119,5 +119,5 @@ class UNet(nn.Module):
         x8 = self.down8(x4)
         x16 = self.down16(x8)
         x32 = self.down32(x16)
-        y16 = self.up16(x16 + grow(self.to16(x32), x16))
-        return x4, self.up8(x8 + grow(self.to8(y16), x8))
+        y16 = self.up16(x16 + upsample_like(self.to16(x32), x16))
+        return x4, self.up8(x8 + upsample_like(self.to8(y16), x8))

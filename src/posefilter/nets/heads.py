@@ -119,7 +119,7 @@ class Gated(nn.Module):
 class _AnyObject(nn.Module):
     """A head that does not depend on the object."""
 
-    def about(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Need nothing of the object."""
 
 
@@ -149,7 +149,7 @@ class _SurfacePointHead(nn.Module):
         self.register_buffer("center", torch.zeros(3), persistent=False)
         self.radius = 1.0
 
-    def about(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Use the object's center and radius as origin and unit of object points."""
         self.center, self.radius = model.center.to(self.center), model.radius
 
@@ -211,9 +211,9 @@ class SurfacePointFragments(_SurfacePointHead):
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
 
-    def about(self, model: ObjectModel) -> None:
+    def set_object(self, model: ObjectModel) -> None:
         """Compute the object's fragments, unless loaded weights have theirs."""
-        super().about(model)
+        super().set_object(model)
         init_fragments(self.centers, self.reach, model.points, model.center, model.radius)
 
     def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:

@@ -22,7 +22,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project, rays
 from posefilter.geometry.pose import origin_of, rotation_of
-from posefilter.nets.coordinates import Context, Coordinates, ask, lay_out_context
+from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
 
@@ -52,10 +52,10 @@ class Points(NamedTuple):
     ray: Tensor  # (B, N, P, 3) unit viewing ray
     known: Tensor  # (B, N, P) bool: depth is known
     inside: Tensor  # (B, N, P) bool: the pixel lies in the frame
-    context: Tensor | None = None  # (B, N, P, 5 + C), as returned by `ask`
+    context: Tensor | None = None  # (B, N, P, 5 + C), as returned by `query`
 
 
-def lay_out(
+def flatten_images(
     rgb: Tensor, depth: Tensor, K: Tensor, coordinates: Coordinates | None = None
 ) -> Pixels:
     """Flatten images for gathering.
@@ -70,12 +70,12 @@ def lay_out(
         The images.
     """
     H, W = rgb.shape[-2:]
-    context = None if coordinates is None else lay_out_context(coordinates, H, W)
+    context = None if coordinates is None else flatten_context(coordinates, H, W)
     values = torch.cat([rgb, depth], dim=1).flatten(2).transpose(1, 2).contiguous()
     return Pixels(values, (H, W), K, context)
 
 
-def look(
+def sample_points(
     image: Pixels,
     poses: Tensor,
     center: Tensor,
@@ -122,7 +122,7 @@ def look(
     along = (ray * middle[..., None, :]).sum(-1, keepdim=True) / (ray * ray).sum(-1, keepdim=True)
     known = z > 0
     position = (ray * torch.where(known, z, along) + origin) @ R
-    context = None if image.context is None else ask(image.context, u, v, position / radius)
+    context = None if image.context is None else query(image.context, u, v, position / radius)
     return Points(position, color, F.normalize(ray, dim=-1) @ R, known[..., 0], inside, context)
 
 
@@ -148,7 +148,7 @@ class PoseLikelihood(nn.Module):
         context: Features of the coordinate network for each point; None for points without context.
     """
 
-    provides: ClassVar[Capabilities] = ("judge_points",)
+    provides: ClassVar[Capabilities] = ("score_points",)
 
     def __init__(
         self,
@@ -197,7 +197,7 @@ class PoseLikelihood(nn.Module):
         known = [log_share / 5, torch.sigmoid(logit), logit / 8]
         return torch.cat([*known, contract(error), torch.asinh(10 * error), features], dim=-1)
 
-    def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
+    def score_at_level(self, points: Points, level: Tensor, radius: float) -> Tensor:
         """Score points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
         p = contract(points.position / radius)
         known = points.known[..., None].to(p.dtype)
@@ -211,9 +211,9 @@ class PoseLikelihood(nn.Module):
             x = block(x)
         return self.leave(torch.relu(x))[..., 0]
 
-    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+    def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
         """Judge points one by one at one noise level [m].  Points (B, N, P) -> (B, N, P)."""
-        return self.judge(points, self.level(points.position.new_tensor([sigma])), radius)
+        return self.score_at_level(points, self.level(points.position.new_tensor([sigma])), radius)
 
     def forward(
         self,
@@ -243,10 +243,10 @@ class PoseLikelihood(nn.Module):
         noise = torch.randn(B, 1, pixels, 2, generator=generator, device=poses.device)
         # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
-            points = look(image, poses, center, radius, noise)
+            points = sample_points(image, poses, center, radius, noise)
         level = self.level(sigma.expand(B))
         scores = torch.where(
-            points.inside, self.judge(points, level, radius), self.outside(level)[:, None]
+            points.inside, self.score_at_level(points, level, radius), self.outside(level)[:, None]
         )
         # penalize centers closer than 0.15 m
         too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])

@@ -10,7 +10,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.nets.layers import ResnetFC
-from posefilter.nets.likelihood import Pixels, Points, look
+from posefilter.nets.likelihood import Pixels, Points, sample_points
 from posefilter.nets.linear import Linear
 
 
@@ -29,7 +29,7 @@ class PaperLikelihood(nn.Module):
             of the mesh file, or "center" of the mesh.
     """
 
-    provides: ClassVar[Capabilities] = ("judge_points", "judge_samples")
+    provides: ClassVar[Capabilities] = ("score_points", "score_samples")
 
     def __init__(
         self, width: int = 128, blocks: int = 5, spread: float = 0.6, about: str = "center"
@@ -43,7 +43,7 @@ class PaperLikelihood(nn.Module):
             Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1)
         )
 
-    def judge_samples(self, position: Tensor, color: Tensor) -> Tensor:
+    def score_samples(self, position: Tensor, color: Tensor) -> Tensor:
         """Score points.
 
         Args:
@@ -55,9 +55,9 @@ class PaperLikelihood(nn.Module):
         """
         return self.net(torch.cat([position, color], dim=-1))[..., 0]
 
-    def judge_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
+    def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
         """Judge points one by one; `sigma` and `radius` are not used.  Points (B, N, P) -> (B, N, P)."""
-        return self.judge_samples(points.position + center, points.color)
+        return self.score_samples(points.position + center, points.color)
 
     def forward(
         self,
@@ -73,6 +73,6 @@ class PaperLikelihood(nn.Module):
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)
         anchor = torch.zeros_like(center) if self.about == "origin" else None
         with torch.autocast(poses.device.type, enabled=False):
-            points = look(image, poses, center, radius, noise, self.spread, anchor)
-            scores = self.judge_samples(points.position + center, points.color)
+            points = sample_points(image, poses, center, radius, noise, self.spread, anchor)
+            scores = self.score_samples(points.position + center, points.color)
         return torch.where(points.inside & points.known, scores, 0.0).sum(-1)

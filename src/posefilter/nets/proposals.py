@@ -37,7 +37,7 @@ class ObjectCoordinateNet(UNet):
         self.fragments = fragments
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
-        self.lay_trunk(widths)
+        self.build_trunk(widths)
         b = widths[1]
         self.up8 = nn.Sequential(ResBlock(b), ResBlock(b))
         self.parts = [1, fragments, 3 * fragments, features]

@@ -14,7 +14,7 @@ from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 
 from posefilter.meshes.mesh import Mesh, hull_vertices
-from posefilter.rendering.sampling import TexturePyramids, sample_texture
+from posefilter.rendering.sampling import MipmapCache, sample_texture
 from posefilter.rendering.surfaces import (
     NEAR,
     Instance,
@@ -24,8 +24,8 @@ from posefilter.rendering.surfaces import (
     Renderer,
     Surfaces,
     covered_pixels,
-    light,
     pixel_rays,
+    shade,
     unit,
 )
 
@@ -51,7 +51,7 @@ class _Prepared:
     uv: np.ndarray | None  # (F, 3, 2) float32
     colors: np.ndarray | None  # (F, 3, 3) float32 in [0, 1]
     hull: np.ndarray  # (V, 3) vertices of the convex hull
-    uv_per_metre: float  # how much of the texture's side one meter of surface takes
+    uv_per_meter: float  # how much of the texture's side one meter of surface takes
 
 
 @dataclass(eq=False)
@@ -63,7 +63,7 @@ class EmbreeRenderer:
 
     keep: int = 96
     _meshes: dict[int, _Prepared] = field(default_factory=dict)
-    _pyramids: TexturePyramids = field(default_factory=TexturePyramids)
+    _pyramids: MipmapCache = field(default_factory=MipmapCache)
 
     def render(
         self,
@@ -78,7 +78,7 @@ class EmbreeRenderer:
         seen = self.surfaces(instances, K, height, width, planes)
         rays = pixel_rays(K, height, width)
         shadow = self.shadow(seen, rays, instances, lights) if lights.shadows else None
-        return Rendered(light(seen, rays, lights, shadow), seen.depth, seen.index, seen.alone)
+        return Rendered(shade(seen, rays, lights, shadow), seen.depth, seen.index, seen.unoccluded)
 
     def surfaces(
         self,
@@ -101,10 +101,10 @@ class EmbreeRenderer:
             far.reshape(-1)[hit.pixel[near]] = hit.t[near]
             index.reshape(-1)[hit.pixel[near]] = i
         for plane in planes:
-            self._paint_plane(plane, rays, K, far, albedo, normal, index)
+            self._write_plane(plane, rays, K, far, albedo, normal, index)
         for i, (one, hit) in enumerate(zip(instances, hits, strict=True)):
             mine = (index.reshape(-1)[hit.pixel] == i) & (hit.t == far.reshape(-1)[hit.pixel])
-            self._paint(one, hit.keep(mine), K, rays, albedo, normal)
+            self._write_instance(one, hit.keep(mine), K, rays, albedo, normal)
         return Surfaces(
             albedo, normal, np.where(np.isfinite(far), far, np.float32(0)), index, alone
         )
@@ -212,7 +212,7 @@ class EmbreeRenderer:
         hit = (out["primID"] >= 0) & (out["tfar"] > NEAR)
         return _Hits(pixel[hit], out["tfar"][hit], out["u"][hit], out["v"][hit], out["primID"][hit])
 
-    def _paint(
+    def _write_instance(
         self,
         one: Instance,
         hit: "_Hits",
@@ -237,9 +237,9 @@ class EmbreeRenderer:
             color = np.broadcast_to(texture[0, 0] / np.float32(255), n.shape)
         else:
             stretch = max(float(abs(np.linalg.det(linear))) ** (1 / 3), 1e-6)
-            texels_per_metre = ready.uv_per_metre * max(texture.shape[:2]) / stretch
+            texels_per_meter = ready.uv_per_meter * max(texture.shape[:2]) / stretch
             level = self._pyramids.level(
-                texture, texels_per_metre * float(np.median(hit.t)) / K[0, 0]
+                texture, texels_per_meter * float(np.median(hit.t)) / K[0, 0]
             )
             uv = _blend(ready.uv, hit.face, corner)
             color = sample_texture(level, uv[:, 0], uv[:, 1])
@@ -247,7 +247,7 @@ class EmbreeRenderer:
             color = color * _blend(ready.colors, hit.face, corner)
         albedo.reshape(-1, 3)[hit.pixel] = color
 
-    def _paint_plane(
+    def _write_plane(
         self,
         plane: Plane,
         rays: np.ndarray,

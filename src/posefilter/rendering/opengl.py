@@ -23,8 +23,8 @@ from posefilter.rendering.surfaces import (
     Plane,
     Rendered,
     Surfaces,
-    light,
     pixel_rays,
+    shade,
 )
 
 _FAR = 100.0  # [m]
@@ -103,7 +103,7 @@ class GLRenderer:
         seen = self.surfaces(instances, K, height, width, planes)
         rays = pixel_rays(K, height, width)
         shadow = self._embree.shadow(seen, rays, instances, lights) if lights.shadows else None
-        return Rendered(light(seen, rays, lights, shadow), seen.depth, seen.index, seen.alone)
+        return Rendered(shade(seen, rays, lights, shadow), seen.depth, seen.index, seen.unoccluded)
 
     def surfaces(
         self,

@@ -22,7 +22,7 @@ def sample_texture(texture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndar
     return out.reshape(-1, 3)[:n] * np.float32(1 / 255)
 
 
-class TexturePyramids:
+class MipmapCache:
     """Halvings of textures, made when first asked for."""
 
     def __init__(self) -> None:

@@ -59,7 +59,7 @@ class Surfaces:
     normal: np.ndarray  # (H, W, 3) float32 unit, camera axes, towards the camera
     depth: np.ndarray  # (H, W) float32 [m], 0 = nothing
     index: np.ndarray  # (H, W) int32 into the instances, -1 = none of them
-    alone: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
+    unoccluded: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Rendered:
     rgb: np.ndarray  # (H, W, 3) float32, 1 = white, may exceed it
     depth: np.ndarray  # (H, W) float32 [m], 0 = nothing
     index: np.ndarray  # (H, W) int32 into the instances, -1 = none of them
-    alone: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
+    unoccluded: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
 
 
 class Renderer(Protocol):
@@ -117,7 +117,7 @@ def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) ->
     return (y + low[1]) * width + x + low[0]
 
 
-def light(
+def shade(
     seen: Surfaces, rays: np.ndarray, lights: Lights, shadow: np.ndarray | None = None
 ) -> np.ndarray:
     """Light the surfaces: ambient, Lambert, and a Blinn-Phong highlight of the first light.  -> (H,

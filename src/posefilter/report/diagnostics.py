@@ -42,13 +42,13 @@ DIAGNOSTICS = (
         "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
     Diagnostic("belief/coverage_90", 75.0, "The belief is too sure of itself."),
-    Diagnostic("signs/pairwise_cosine", 0.8, "All particles move in one direction."),
-    Diagnostic("signs/offset_r2", 0.1, "Displacements say no more than their mean would."),
-    Diagnostic("signs/heading", 0.2, "Particles do not head for the object."),
-    Diagnostic("signs/auroc", 0.7, "The likelihood hardly tells object from background."),
-    Diagnostic("signs/off_frame/last", 0.1, "Particles drift out of the image."),
-    Diagnostic("signs/near_edge/last", 0.4, "Particles gather at the image's edges."),
-    Diagnostic("signs/near_corner/last", 0.2, "Particles gather in the image's corners."),
+    Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
+    Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
+    Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),
+    Diagnostic("diagnostics/auroc", 0.7, "The likelihood hardly tells object from background."),
+    Diagnostic("diagnostics/off_frame/last", 0.1, "Particles drift out of the image."),
+    Diagnostic("diagnostics/near_edge/last", 0.4, "Particles gather at the image's edges."),
+    Diagnostic("diagnostics/near_corner/last", 0.2, "Particles gather in the image's corners."),
     Diagnostic("particles_on_object", 0.2, "Few particles find the object."),
     Diagnostic("fallen", 5.0, "Training went past its best: see the curves."),
     Diagnostic("not_finite", 0.0, "The training diverged."),
@@ -71,9 +71,9 @@ def collect_numbers(run: Run) -> dict[str, float]:
     none.
     """
     out = flatten(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
-    for name, values in (run.metrics.get("signs") or {}).items():
+    for name, values in (run.metrics.get("diagnostics") or {}).items():
         if isinstance(values, list) and values:
-            out[f"signs/{name}/last"] = float(values[-1])
+            out[f"diagnostics/{name}/last"] = float(values[-1])
     if out.get("instances"):
         out["missed_share"] = out.get("missed", 0.0) / out["instances"]
     score = run.curves.get("val/score")
@@ -92,7 +92,7 @@ def read_last_validation(curves: Mapping[str, Curve]) -> tuple[int | None, dict[
     own = {
         tag.removeprefix("val/"): curve
         for tag, curve in curves.items()
-        if tag.startswith(("val/", "signs/"))
+        if tag.startswith(("val/", "diagnostics/"))
     }
     if not own:
         return None, {}

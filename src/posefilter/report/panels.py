@@ -25,14 +25,18 @@ BELIEF = {
 }
 SIGNS = {
     "Where particles end": (
-        "signs/on_object/last",
-        "signs/off_frame/last",
-        "signs/near_edge/last",
-        "signs/near_corner/last",
-        "signs/line_share/last",
+        "diagnostics/on_object/last",
+        "diagnostics/off_frame/last",
+        "diagnostics/near_edge/last",
+        "diagnostics/near_corner/last",
+        "diagnostics/line_share/last",
     ),
-    "Displacements": ("val/signs/pairwise_cosine", "val/signs/offset_r2", "val/signs/heading"),
-    "Likelihood": ("val/signs/auroc",),
+    "Displacements": (
+        "val/diagnostics/pairwise_cosine",
+        "val/diagnostics/offset_r2",
+        "val/diagnostics/heading",
+    ),
+    "Likelihood": ("val/diagnostics/auroc",),
 }
 
 

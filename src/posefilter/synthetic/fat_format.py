@@ -2,7 +2,7 @@
 
 A folder holds `_object_settings.json`, `_camera_settings.json` and for each frame and camera
 `NNNNNN.left.jpg`, `.json`, `.depth.png` and `.seg.png`. Lengths in the JSON files are centimeters,
-depth images are 0.1 mm a unit. Poses are of an *aligned* object frame: y down, centerd on the
+depth images are 0.1 mm a unit. Poses are of an *aligned* object frame: y down, centered on the
 bounding box. How the mesh gets there, each folder's `fixed_model_transform` F says, for row
 vectors: p_aligned_cm = [x y z 1] @ F.
 """
@@ -70,7 +70,7 @@ class ObjectInFrame:
 
 
 def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
-    """Describe a mesh by its own bounding box: upright turned y down, centerd."""
+    """Describe a mesh by its own bounding box: upright turned y down, centered."""
     center = mesh.bounds.mean(0)
     aligned = np.eye(4)
     aligned[:3, :3] = _ALIGNED_FROM_UPRIGHT

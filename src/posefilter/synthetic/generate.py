@@ -25,7 +25,7 @@ from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.progress import bars
 from posefilter.synthetic import fat_format as fat
-from posefilter.synthetic.painter import Job, Painter, make_renderer
+from posefilter.synthetic.frame_renderer import FrameRenderer, Job, make_renderer
 from posefilter.synthetic.scenes import SceneSettings, choose_distractors
 from posefilter.synthetic.sensor import sensor_model
 from posefilter.synthetic.settle import load_mujoco
@@ -137,7 +137,7 @@ def generate(
     store = MeshStore(meshes, scale=job.mesh_scale)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
     check_meshes(job, store, todo)
-    _claim(out, job, frames)
+    _open_dataset(out, job, frames)
     if todo:
         log.info("rendering %d frames of %s into %s", len(todo), object, out)
     began = time.perf_counter()
@@ -160,7 +160,7 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
             )
         fx, fy, cx, cy, w, h = named[camera]
         scale = width / w
-        # another shape of picture: same field of view across, centerd
+        # another shape of picture: same field of view across, centered
         if abs(height / h - scale) > 0.01 * scale:
             cy = (h - 1) / 2 + ((height / scale) - h) / 2
         fx, fy, cx, cy = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
@@ -220,7 +220,7 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
             store.load(name)
 
 
-def _claim(out: Path, job: Job, frames: int) -> None:
+def _open_dataset(out: Path, job: Job, frames: int) -> None:
     """Write the settings into a new dataset, or make sure that the one there has the same."""
     settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
     path = out / GENERATOR
@@ -266,10 +266,10 @@ def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
 def _run(
     job: Job, out: Path, todo: list[int], workers: int, progress: bool, store: MeshStore
 ) -> Iterator[int]:
-    """Render frames, here or in processes; yield the number done after each lot."""
-    lots: dict[tuple[int, int], list[int]] = {}
+    """Render frames, here or in processes; yield the number done after each chunk."""
+    chunks: dict[tuple[int, int], list[int]] = {}
     for i in todo:
-        lots.setdefault((i // job.frames_per_scene, i // FRAMES_PER_TASK), []).append(i)
+        chunks.setdefault((i // job.frames_per_scene, i // FRAMES_PER_TASK), []).append(i)
     speed = TextColumn("{task.fields[rate]}")
     columns = (
         TextColumn("rendering"),
@@ -281,7 +281,7 @@ def _run(
     with bars(*columns, shown=progress) as bar:
         task = bar.add_task("frames", total=len(todo), rate="")
         began, done = time.perf_counter(), 0
-        for count in _results(job, out, list(lots.values()), workers, store):
+        for count in _results(job, out, list(chunks.values()), workers, store):
             done += count
             bar.update(
                 task, completed=done, rate=f"{done / (time.perf_counter() - began):.1f} frames/s"
@@ -290,21 +290,21 @@ def _run(
 
 
 def _results(
-    job: Job, out: Path, lots: list[list[int]], workers: int, store: MeshStore
+    job: Job, out: Path, chunks: list[list[int]], workers: int, store: MeshStore
 ) -> Iterator[int]:
-    """Yield how many frames each lot had, as they finish."""
-    if workers == 1 or len(lots) <= 1:
-        painter = Painter(job, out, store)
-        for lot in lots:
-            for frame in lot:
-                painter.write(frame)
-            yield len(lot)
+    """Yield how many frames each chunk had, as they finish."""
+    if workers == 1 or len(chunks) <= 1:
+        renderer = FrameRenderer(job, out, store)
+        for chunk in chunks:
+            for frame in chunk:
+                renderer.write(frame)
+            yield len(chunk)
         return
     context = multiprocessing.get_context("spawn")
     with _single_threaded_children():
-        pool = ProcessPoolExecutor(min(workers, len(lots)), context, _start_worker, (job, out))
+        pool = ProcessPoolExecutor(min(workers, len(chunks)), context, _start_worker, (job, out))
         with pool:
-            futures = [pool.submit(_paint_lot, lot) for lot in lots]
+            futures = [pool.submit(_render_chunk, chunk) for chunk in chunks]
             try:
                 for future in as_completed(futures):
                     yield future.result()
@@ -312,23 +312,23 @@ def _results(
                 pool.shutdown(cancel_futures=True)
 
 
-_painter: Painter | None = None  # one a worker process
+_frame_renderer: FrameRenderer | None = None  # one a worker process
 
 
 def _start_worker(job: Job, out: Path) -> None:
     """Set up a worker process."""
-    global _painter
+    global _frame_renderer
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    _painter = Painter(job, out)
+    _frame_renderer = FrameRenderer(job, out)
 
 
-def _paint_lot(lot: list[int]) -> int:
+def _render_chunk(chunk: list[int]) -> int:
     """Render some frames in a worker."""
-    assert _painter is not None
-    for frame in lot:
-        _painter.write(frame)
-    return len(lot)
+    assert _frame_renderer is not None
+    for frame in chunk:
+        _frame_renderer.write(frame)
+    return len(chunk)
 
 
 @contextmanager

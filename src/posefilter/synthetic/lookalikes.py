@@ -8,7 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from posefilter.meshes.mesh import Mesh, creased_normals
-from posefilter.synthetic.textures import as_bytes, label, random_texture, recolor, typical_color
+from posefilter.synthetic.textures import (
+    find_dominant_color,
+    label,
+    random_texture,
+    recolor,
+    to_uint8,
+)
 
 
 def make_lookalike(
@@ -20,17 +26,17 @@ def make_lookalike(
     kind = rng.random()
     printed = target.corner_uv is not None and min(target.texture.shape[:2]) >= 16
     if printed and kind < 0.2:
-        return stretched(target, name, _clear_stretch(rng), target.texture)
+        return stretch(target, name, _clear_stretch(rng), target.texture)
     if printed and kind < 0.4:
-        return stretched(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
+        return stretch(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
     if printed and kind < 0.55:
-        return stretched(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
+        return stretch(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
     sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
-    base = typical_color(target.texture) if kind < 0.85 else None
-    return box(name, np.maximum(sides, 0.02), [as_bytes(label(rng, 96, base)) for _ in range(6)])
+    base = find_dominant_color(target.texture) if kind < 0.85 else None
+    return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])
 
 
-def stretched(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:
+def stretch(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:
     """Return a mesh drawn out along its axes, in another texture.  factors: (3,)."""
     normals = mesh.corner_normals / factors
     normals = normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12)
@@ -45,7 +51,7 @@ def stretched(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -
 
 
 def box(name: str, sides: np.ndarray, faces: Sequence[np.ndarray]) -> Mesh:
-    """Return a box centerd on its origin with six printed faces.  sides: (3,) [m]; faces: six (n,
+    """Return a box centered on its origin with six printed faces.  sides: (3,) [m]; faces: six (n,
     n, 3) uint8.
     """
     corners, triangles, uv = [], [], []

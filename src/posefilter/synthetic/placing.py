@@ -104,7 +104,7 @@ def set_table(
     return Table(camera_from_spot, camera_from_spot @ turn, half_extent)
 
 
-def stand_target(
+def place_target_on_table(
     solid: Solid, view: View, distance: float, elevation_deg: float, rng: np.random.Generator
 ) -> tuple[Placed, np.ndarray]:
     """Put the target on a table, the camera so far from it and so high.  -> it, and
@@ -116,34 +116,36 @@ def stand_target(
     right = roll @ np.array([1.0, 0, 0])
     camera_from_spot = np.eye(4)
     camera_from_spot[:3, :3] = np.stack([right, np.cross(up, right), up], 1)
-    rest = _draw_rest(solid, rng, 0.5)
+    rest = _draw_stable_rotation(solid, rng, 0.5)
     bottom = (solid.hull @ rest.T).min(0)[2]
     middle = float((rest @ solid.center)[2] - bottom)
     center = view.ray(rng.uniform(0.15, 0.85), rng.uniform(0.18, 0.85)) * distance
     camera_from_spot[:3, 3] = center - up * middle
-    return _stand(solid, rest, np.zeros(2), camera_from_spot), camera_from_spot
+    return _place_on_table(solid, rest, np.zeros(2), camera_from_spot), camera_from_spot
 
 
-def hang_target(solid: Solid, view: View, distance: float, rng: np.random.Generator) -> Placed:
+def place_floating_target(
+    solid: Solid, view: View, distance: float, rng: np.random.Generator
+) -> Placed:
     """Put the target anywhere in the view, turned anyhow."""
     rotation = Rotation.random(rng=rng).as_matrix()
     center = view.ray(rng.uniform(0.12, 0.88), rng.uniform(0.12, 0.88)) * distance
-    return _hang(solid, rotation, center)
+    return _place_floating(solid, rotation, center)
 
 
-def apart(a: Placed, b: Placed) -> bool:
+def are_separate(a: Placed, b: Placed) -> bool:
     """Tell whether two objects stand apart, by their spheres or else by their hulls."""
     far = np.linalg.norm(a.center - b.center) > a.solid.radius + b.solid.radius + _GAP
     return bool(far) or separated(a.hull, b.hull, _GAP)
 
 
-def face(solid: Solid) -> float:
+def compute_hiding_size(solid: Solid) -> float:
     """Return the second largest side of a solid's box [m]: how much it hides at best."""
     low, high = solid.mesh.bounds
     return float(np.sort(high - low)[1])
 
 
-def place(
+def place_distractor(
     solid: Solid,
     placed: list[Placed],
     view: View,
@@ -162,12 +164,12 @@ def place(
     free, whole = view.free(placed)
     for _ in range(48 if in_front else 16):
         if table is None:
-            one = _draw_afloat(solid, placed[0], in_front, rng)
+            one = _draw_floating(solid, placed[0], in_front, rng)
         else:
             one = _draw_on_table(solid, placed[0], table.camera_from_spot, in_front, rng)
             if not table.carries(one):
                 continue
-        if one.hull[:, 2].min() < _NEAREST or not all(apart(one, other) for other in placed):
+        if one.hull[:, 2].min() < _NEAREST or not all(are_separate(one, other) for other in placed):
             continue
         nearer = one.center[2] < placed[0].center[2]
         share = float((free & ~view.mask(one)).sum() / whole) if nearer else free.sum() / whole
@@ -185,7 +187,7 @@ def _draw_on_table(
     solid: Solid, target: Placed, frame: np.ndarray, in_front: bool, rng: np.random.Generator
 ) -> Placed:
     """Stand a solid somewhere on the table."""
-    rest = _draw_rest(solid, rng, 0.6)
+    rest = _draw_stable_rotation(solid, rng, 0.6)
     reach = target.solid.radius + solid.radius
     if in_front:
         towards = -(frame[:3, :2].T @ frame[:3, 3])
@@ -194,33 +196,35 @@ def _draw_on_table(
         spot = towards * reach * rng.uniform(0.25, 1.4) + across * reach * rng.uniform(-0.6, 0.6)
     else:
         spot = rng.uniform(-1, 1, 2) * (rng.uniform(0.08, 0.3) + 0.5 * reach)
-    return _stand(solid, rest, spot, frame)
+    return _place_on_table(solid, rest, spot, frame)
 
 
-def _draw_afloat(solid: Solid, target: Placed, in_front: bool, rng: np.random.Generator) -> Placed:
+def _draw_floating(
+    solid: Solid, target: Placed, in_front: bool, rng: np.random.Generator
+) -> Placed:
     """Hang a solid somewhere near the target, or before it."""
     rotation = Rotation.random(rng=rng).as_matrix()
     z = target.center[2] * rng.uniform(0.6, 0.95 if in_front else 1.3)
     spread = 0.5 * target.solid.radius + 0.5 * solid.radius if in_front else 0.16
     where = target.center + rng.normal(0, 1, 3) * [spread, spread, 0]
-    return _hang(solid, rotation, where * (z / where[2]))
+    return _place_floating(solid, rotation, where * (z / where[2]))
 
 
-def _draw_rest(solid: Solid, rng: np.random.Generator, upright: float) -> np.ndarray:
+def _draw_stable_rotation(solid: Solid, rng: np.random.Generator, upright: float) -> np.ndarray:
     """Draw how a solid lies: as its mesh stands, or any rest (rare ones more often than chance), at
     any heading.
     """
     if rng.random() < upright:
-        down = -solid.rests[:, 2, :]  # the object's direction that each rest turns down
+        down = -solid.stable_rotations[:, 2, :]  # the object's direction that each rest turns down
         near = int((down @ np.array([0, 0, -1.0])).argmax())
-        rest = solid.rests[near]
+        rest = solid.stable_rotations[near]
     else:
-        weights = np.sqrt(solid.rest_weights)
-        rest = solid.rests[int(rng.choice(len(weights), p=weights / weights.sum()))]
+        weights = np.sqrt(solid.stable_weights)
+        rest = solid.stable_rotations[int(rng.choice(len(weights), p=weights / weights.sum()))]
     return Rotation.from_euler("z", rng.uniform(0, 360), degrees=True).as_matrix() @ rest
 
 
-def _stand(
+def _place_on_table(
     solid: Solid, rest: np.ndarray, spot: np.ndarray, camera_from_spot: np.ndarray
 ) -> Placed:
     """Return a solid in a resting rotation with its center over a spot of the table."""
@@ -235,7 +239,7 @@ def _stand(
     return Placed(solid, camera_from_spot @ table_from_object)
 
 
-def _hang(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:
+def _place_floating(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:
     """Return a solid with its center somewhere in the camera's frame."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, center - rotation @ solid.center

@@ -17,11 +17,11 @@ from posefilter.synthetic.placing import (
     Placed,
     Table,
     View,
-    face,
-    hang_target,
-    place,
+    compute_hiding_size,
+    place_distractor,
+    place_floating_target,
+    place_target_on_table,
     set_table,
-    stand_target,
 )
 from posefilter.synthetic.settle import settle
 from posefilter.synthetic.solids import Solid, make_solid
@@ -80,7 +80,7 @@ class Layout:
         return [Instance(p.solid.mesh, p.camera_from_object) for p in self.placed]
 
 
-class Library:
+class SolidStore:
     """The solids of a mesh store, each measured once."""
 
     def __init__(self, store: MeshStore) -> None:
@@ -102,8 +102,8 @@ def choose_distractors(
     return [others[i] for i in rng.permutation(len(others))[: settings.classes]]
 
 
-def draw_set(
-    library: Library, target: str, settings: SceneSettings, rng: np.random.Generator
+def draw_scene_set(
+    library: SolidStore, target: str, settings: SceneSettings, rng: np.random.Generator
 ) -> SceneSet:
     """Draw what the frames of one folder share."""
     chosen = choose_distractors(library.store, target, settings, rng)
@@ -179,19 +179,21 @@ def _draw_objects(
         low, high = settings.elevation_deg
         # from above nothing hides what stands behind it
         elevation = rng.uniform(low, min(high, max(_OCCLUDED_ELEVATION, low)) if occluded else high)
-        target, camera_from_spot = stand_target(scene.target, view, distance, elevation, rng)
+        target, camera_from_spot = place_target_on_table(
+            scene.target, view, distance, elevation, rng
+        )
         table = set_table(camera_from_spot, scene.table_half_extent, rng)
     else:
-        target = hang_target(scene.target, view, distance, rng)
+        target = place_floating_target(scene.target, view, distance, rng)
     if not view.holds(target, settings.largest_truncation):
         return [], table
     placed = [target]
     solids = _draw_solids(scene, settings, rng)
     if occluded:  # whatever can hide most is tried in front first
-        solids.sort(key=lambda solid: -face(solid))
+        solids.sort(key=lambda solid: -compute_hiding_size(solid))
     for solid in solids:
         in_front = occluded and view.visible(placed) > wanted + 0.06
-        one = place(solid, placed, view, table, wanted, in_front, rng)
+        one = place_distractor(solid, placed, view, table, wanted, in_front, rng)
         if one is not None:
             placed.append(one)
     if settings.settle and table is not None:
@@ -271,12 +273,12 @@ def shift_camera(layout: Layout, offset: float) -> Layout:
 
 __all__ = [
     "Layout",
-    "Library",
     "Placed",
     "SceneSet",
     "SceneSettings",
+    "SolidStore",
     "choose_distractors",
     "draw_layout",
-    "draw_set",
+    "draw_scene_set",
     "shift_camera",
 ]

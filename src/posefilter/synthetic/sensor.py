@@ -34,7 +34,7 @@ def sensor_model(name: str) -> SensorModel:
     return _MODELS[name]
 
 
-def sense(
+def simulate_sensor(
     rgb: np.ndarray, depth: np.ndarray, model: SensorModel, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the photograph (H, W, 3) uint8 RGB and the measured depth (H, W) float32 [m], 0 = no
@@ -42,12 +42,12 @@ def sense(
 
     rgb: (H, W, 3) float32, 1 = white; depth: (H, W) float32 [m], 0 = nothing there.
     """
-    photo = sense_color(rgb, rng) if model.color else np.clip(rgb, 0, 1)
-    measured = sense_depth(depth, photo, rng) if model.depth else depth
+    photo = simulate_color(rgb, rng) if model.color else np.clip(rgb, 0, 1)
+    measured = simulate_depth(depth, photo, rng) if model.depth else depth
     return (np.clip(photo, 0, 1) * 255 + 0.5).astype(np.uint8), measured
 
 
-def sense_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def simulate_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the picture as a cheap color camera gives it.
 
     (H, W, 3) float32 -> (H, W, 3) float32 in [0, 1].
@@ -71,7 +71,7 @@ def sense_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(out, 0, 1)
 
 
-def sense_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def simulate_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the depth as a structured-light camera measures it.
 
     (H, W) [m], 0 = nothing; photo (H, W, 3) in [0, 1] -> (H, W) float32 [m], 0 = no reading.

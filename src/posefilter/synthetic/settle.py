@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
-from posefilter.synthetic.placing import Placed, Table, apart
+from posefilter.synthetic.placing import Placed, Table, are_separate
 from posefilter.synthetic.solids import Solid
 
 _STEP = 0.004  # [s]
@@ -29,17 +29,17 @@ def load_mujoco() -> Any:
 
 
 def settle(
-    placed: Sequence[Placed], table: Table, rng: np.random.Generator, tossed: float = 0.5
+    placed: Sequence[Placed], table: Table, rng: np.random.Generator, dropped: float = 0.5
 ) -> list[Placed]:
     """Return the objects as they come to rest; those that end beyond the table's edge are left out,
     never the first.
 
-    Of the others, a share `tossed` is first turned anyhow and let fall from a hand's height.
+    Of the others, a share `dropped` is first turned anyhow and let fall from a hand's height.
     """
     mujoco = load_mujoco()
     start = [
         placed[0],
-        *(_toss(one, placed, table, rng) if rng.random() < tossed else one for one in placed[1:]),
+        *(_drop(one, placed, table, rng) if rng.random() < dropped else one for one in placed[1:]),
     ]
     spot_from_camera = np.linalg.inv(table.camera_from_spot)
     model = mujoco.MjModel.from_xml_string(_world([one.solid for one in start]))
@@ -65,7 +65,7 @@ def settle(
     return out
 
 
-def _toss(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Generator) -> Placed:
+def _drop(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Generator) -> Placed:
     """Return an object turned anyhow and held up to 12 cm over its place; as it was where that
     would touch another.
     """
@@ -78,7 +78,7 @@ def _toss(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Ge
     ).min()
     pose[:3, 3] += up * (rng.uniform(0.01, 0.12) - lowest)
     held = Placed(one.solid, pose)
-    return held if all(other is one or apart(held, other) for other in placed) else one
+    return held if all(other is one or are_separate(held, other) for other in placed) else one
 
 
 def _world(solids: Sequence[Solid]) -> str:

@@ -16,21 +16,21 @@ class Solid:
     hull: np.ndarray  # (V, 3) the vertices that reach farthest in 300 directions [m]
     center: np.ndarray  # (3,) of the bounding box [m]
     radius: float  # of the hull round the center [m]
-    rests: np.ndarray  # (R, 3, 3) table_from_object rotations in which it rests, z up
-    rest_weights: np.ndarray  # (R,) how likely each is when dropped, sums to 1
+    stable_rotations: np.ndarray  # (R, 3, 3) table_from_object rotations in which it rests, z up
+    stable_weights: np.ndarray  # (R,) how likely each is when dropped, sums to 1
 
 
 def make_solid(mesh: Mesh) -> Solid:
     """Measure a mesh."""
     hull = mesh.vertices[np.unique((fibonacci_sphere(300) @ mesh.vertices.T).argmax(1))]
     center = mesh.bounds.mean(0)
-    rests, weights = resting_rotations(hull)
+    rests, weights = find_stable_rotations(hull)
     return Solid(
         mesh, hull, center, float(np.linalg.norm(hull - center, axis=1).max()), rests, weights
     )
 
 
-def resting_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.ndarray, np.ndarray]:
+def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.ndarray, np.ndarray]:
     """Find how a convex body lies still.  (V, 3) -> rotations (R, 3, 3) that turn a resting
     direction down, weights (R,).
 
@@ -57,12 +57,12 @@ def resting_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.ndarr
             counts.append(1)
     weights = np.array(counts, float)
     keep = weights > 0.01 * directions
-    return np.stack([turn_down(d) for d in np.stack(ends)[keep]]), weights[keep] / weights[
+    return np.stack([rotation_down(d) for d in np.stack(ends)[keep]]), weights[keep] / weights[
         keep
     ].sum()
 
 
-def turn_down(direction: np.ndarray) -> np.ndarray:
+def rotation_down(direction: np.ndarray) -> np.ndarray:
     """Return the least rotation that takes a unit direction to -z.  (3,) -> (3, 3)."""
     target = np.array([0.0, 0.0, -1.0])
     axis, cosine = np.cross(direction, target), float(direction @ target)

@@ -148,16 +148,16 @@ def random_texture(
     weights: of plain, checker, marble, wood, carpet, stripes, label; equal if not given.
     """
     if len(photos) and rng.random() < 0.15:
-        out = cutting(rng, photos[int(rng.integers(len(photos)))], size)
+        out = crop_texture(rng, photos[int(rng.integers(len(photos)))], size)
     else:
         share = np.ones(len(_KINDS)) if weights is None else np.asarray(weights, float)
         kind = int(rng.choice(len(_KINDS), p=share / share.sum()))
         out = _KINDS[kind](rng, size)
     grain = rng.choice([0.0, 0.02, 0.06]) * rng.standard_normal((size, size, 1))
-    return as_bytes(out + grain)
+    return to_uint8(out + grain)
 
 
-def cutting(rng: np.random.Generator, photo: np.ndarray, size: int) -> np.ndarray:
+def crop_texture(rng: np.random.Generator, photo: np.ndarray, size: int) -> np.ndarray:
     """Cut a square out of a mesh's texture, colors permuted half of the time.  -> (size, size, 3)
     float in [0, 1].
     """
@@ -178,7 +178,7 @@ def recolor(rng: np.random.Generator, texture: np.ndarray) -> np.ndarray:
     return 255 - out if rng.random() < 0.15 else np.ascontiguousarray(out)
 
 
-def typical_color(texture: np.ndarray) -> Color:
+def find_dominant_color(texture: np.ndarray) -> Color:
     """Return the color that most of a texture has: the fullest cell of a coarse histogram that is
     not black.  -> (3,).
     """
@@ -188,6 +188,6 @@ def typical_color(texture: np.ndarray) -> Color:
     return small[cell == np.bincount(cell).argmax()].mean(0) / 255
 
 
-def as_bytes(colors: np.ndarray) -> np.ndarray:
+def to_uint8(colors: np.ndarray) -> np.ndarray:
     """Round colors in [0, 1] to bytes."""
     return np.ascontiguousarray(np.clip(colors * 255 + 0.5, 0, 255).astype(np.uint8))

@@ -17,7 +17,7 @@ _RATIO_TOLERANCE = 0.05
 # of pictures whose intrinsics may have been mixed up
 _WIDTHS = (160, 320, 480, 640, 720, 960, 1280, 1920)
 _POWERS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
-_UNITS = {0.001: "are in millimeters", 0.01: "are in centimeters", 0.1: "are in decimetres"}
+_UNITS = {0.001: "are in millimeters", 0.01: "are in centimeters", 0.1: "are in decimeters"}
 
 
 @dataclass(frozen=True)

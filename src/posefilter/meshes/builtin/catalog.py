@@ -15,7 +15,7 @@ from posefilter.meshes.builtin import round as builtin_round
 from posefilter.meshes.builtin import vessels as builtin_vessels
 from posefilter.meshes.builtin.shapes import Rect, box, weld
 from posefilter.meshes.mesh import Mesh
-from posefilter.meshes.symmetries import symmetry_group, turn_about
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
 TEXTURE = 512  # [px] width and height of every texture
 
@@ -30,7 +30,9 @@ def build(name: str) -> Mesh:
     return _BUILDERS[name]()
 
 
-def boxed(name: str, size: tuple[float, float, float], prints: dict[str, np.ndarray]) -> Mesh:
+def make_printed_box(
+    name: str, size: tuple[float, float, float], prints: dict[str, np.ndarray]
+) -> Mesh:
     """Make a printed box from its six faces' pictures."""
     w, d, h = size
     # Front and back side by side, the two narrow sides stacked beside them, lid and base below.
@@ -62,11 +64,13 @@ def boxed(name: str, size: tuple[float, float, float], prints: dict[str, np.ndar
 
 def _brick() -> Mesh:
     """Make the foam brick, which half turns about its three axes leave as it is."""
-    mesh = boxed("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
+    mesh = make_printed_box("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
     center = mesh.bounds.mean(0)
     return replace(
         mesh,
-        symmetries=np.stack([np.eye(4), *(turn_about(axis, np.pi, center) for axis in np.eye(3))]),
+        symmetries=np.stack(
+            [np.eye(4), *(rotation_about(axis, np.pi, center) for axis in np.eye(3))]
+        ),
     )
 
 
@@ -83,9 +87,9 @@ _BUILDERS: dict[str, Callable[[], Mesh]] = {
     "bleach_bottle": builtin_round.bleach_bottle,
     "bowl": _bowl,
     "brick": _brick,
-    "carton": lambda: boxed("carton", builtin_carton.SIZE, builtin_carton.faces()),
+    "carton": lambda: make_printed_box("carton", builtin_carton.SIZE, builtin_carton.faces()),
     "coffee_can": builtin_round.coffee_can,
-    "gelatin_carton": lambda: boxed(
+    "gelatin_carton": lambda: make_printed_box(
         "gelatin_carton", builtin_boxes.GELATIN_SIZE, builtin_boxes.gelatin_faces()
     ),
     "marker": builtin_vessels.marker,
@@ -93,7 +97,7 @@ _BUILDERS: dict[str, Callable[[], Mesh]] = {
     "mustard_bottle": builtin_round.mustard_bottle,
     "pitcher": builtin_vessels.pitcher,
     "soup_can": builtin_round.soup_can,
-    "sugar_carton": lambda: boxed(
+    "sugar_carton": lambda: make_printed_box(
         "sugar_carton", builtin_boxes.SUGAR_SIZE, builtin_boxes.sugar_faces()
     ),
     "tuna_can": builtin_round.tuna_can,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 Color = tuple[int, int, int]  # RGB
-BoxHead = tuple[float, float, float, float]  # x0, y0, x1, y1 [mm], y down
+Box = tuple[float, float, float, float]  # x0, y0, x1, y1 [mm], y down
 
 BLACK, WHITE, CREAM, RED = (20, 20, 22), (250, 250, 246), (246, 234, 202), (196, 24, 34)
 NAVY, BLUE, SKY, GREEN, LIME = (
@@ -39,7 +39,7 @@ class Canvas:
     def _at(self, x_mm: float, y_mm: float) -> tuple[int, int]:
         return round(x_mm * self.px), round(y_mm * self.px)
 
-    def rect(self, box: BoxHead, color: Color, line_mm: float = 0) -> "Canvas":
+    def rect(self, box: Box, color: Color, line_mm: float = 0) -> "Canvas":
         """Fill a rectangle, or draw its frame."""
         (x0, y0), (x1, y1) = self._at(*box[:2]), self._at(*box[2:])
         width = max(1, round(line_mm * self.px)) if line_mm else -1
@@ -81,7 +81,7 @@ class Canvas:
         )
         return self
 
-    def fade(self, box: BoxHead, top: Color, bottom: Color) -> "Canvas":
+    def fade(self, box: Box, top: Color, bottom: Color) -> "Canvas":
         """Fill a rectangle with a vertical gradient."""
         (x0, y0), (x1, y1) = self._at(*box[:2]), self._at(*box[2:])
         area = self.image[y0:y1, x0:x1]
@@ -90,9 +90,9 @@ class Canvas:
         return self
 
     def text(
-        self, words: str, box: BoxHead, color: Color, weight: float = 0.1, turned: bool = False
+        self, words: str, box: Box, color: Color, weight: float = 0.1, turned: bool = False
     ) -> "Canvas":
-        """Print words as large as the box allows, centerd; `weight` is stroke over letter height;
+        """Print words as large as the box allows, centered; `weight` is stroke over letter height;
         `turned` reads upwards.
         """
         (x0, y0), (x1, y1) = self._at(*box[:2]), self._at(*box[2:])
@@ -111,7 +111,7 @@ class Canvas:
         area[:] = np.round(area * (1 - alpha) + np.array(color) * alpha).astype(np.uint8)
         return self
 
-    def lines(self, box: BoxHead, color: Color, pitch_mm: float = 3.2, seed: int = 0) -> "Canvas":
+    def lines(self, box: Box, color: Color, pitch_mm: float = 3.2, seed: int = 0) -> "Canvas":
         """Print small text that no camera could read: rows of word-long strokes."""
         rng = np.random.default_rng(seed)
         y = box[1] + pitch_mm / 2
@@ -125,7 +125,7 @@ class Canvas:
             y += pitch_mm
         return self
 
-    def barcode(self, box: BoxHead, seed: int) -> "Canvas":
+    def barcode(self, box: Box, seed: int) -> "Canvas":
         """Print a barcode on white."""
         rng = np.random.default_rng(seed)
         self.rect(box, WHITE)
@@ -136,7 +136,7 @@ class Canvas:
             x += bar + float(rng.choice([0.5, 0.9]))
         return self
 
-    def nutrition(self, box: BoxHead, seed: int = 0) -> "Canvas":
+    def nutrition(self, box: Box, seed: int = 0) -> "Canvas":
         """Print a table of nutrition facts."""
         x0, y0, x1, y1 = box
         width, height = x1 - x0, y1 - y0

@@ -42,7 +42,7 @@ def weld(name: str, soup: Soup, texture: np.ndarray, symmetries: np.ndarray | No
     )
 
 
-def moved(soup: Soup, linear: np.ndarray, shift: np.ndarray) -> Soup:
+def transform(soup: Soup, linear: np.ndarray, shift: np.ndarray) -> Soup:
     """Map every corner by x -> linear @ x + shift; `linear` must not mirror.  (3, 3), (3,) [m]."""
     return Soup(soup.corners @ linear.T + shift, soup.uv)
 

@@ -15,7 +15,7 @@ from posefilter.meshes.builtin.printing import (
     Canvas,
 )
 from posefilter.meshes.builtin.round import BASE, LID, RADIUS, SIDE, SWATCH, Profile, texture
-from posefilter.meshes.builtin.shapes import Rect, Soup, disc, join, lathe, moved, tube, weld
+from posefilter.meshes.builtin.shapes import Rect, Soup, disc, join, lathe, transform, tube, weld
 from posefilter.meshes.mesh import Mesh
 
 
@@ -174,7 +174,7 @@ def marker() -> Mesh:
     lying = np.array([[0, 0, 1.0], [-1.0, 0, 0], [0, -1.0, 0]])  # z to x, front (-y) to above
     return weld(
         "marker",
-        moved(upright, lying, np.array([-length / 2, 0, r])),
+        transform(upright, lying, np.array([-length / 2, 0, r])),
         texture(page, plain, plain, plain),
     )
 
@@ -187,11 +187,11 @@ def banana() -> Mesh:
     thick = 0.0184 * np.clip(1 - np.abs(t) ** 3.2, 0, None) ** 0.6
     stem = np.where(t > 0.78, 0.0052, 0.0042)
     soup = tube(path, np.maximum(thick, stem), SIDE, segments=14, sides=np.full(25, 1.05))
-    flat = moved(soup, np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), np.zeros(3))
+    flat = transform(soup, np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), np.zeros(3))
     low, high = flat.corners.reshape(-1, 3).min(0), flat.corners.reshape(-1, 3).max(0)
-    flat = moved(flat, np.diag(np.array([0.197, 0.074, 0.0387]) / (high - low)), np.zeros(3))
+    flat = transform(flat, np.diag(np.array([0.197, 0.074, 0.0387]) / (high - low)), np.zeros(3))
     low, high = flat.corners.reshape(-1, 3).min(0), flat.corners.reshape(-1, 3).max(0)
-    flat = moved(
+    flat = transform(
         flat, np.eye(3), -np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
     )
     page = Canvas(120, 210, (240, 204, 60))

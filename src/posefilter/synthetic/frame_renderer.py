@@ -16,14 +16,14 @@ from posefilter.rendering.surfaces import Rendered, Renderer
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.scenes import (
     Layout,
-    Library,
     SceneSet,
     SceneSettings,
+    SolidStore,
     draw_layout,
-    draw_set,
+    draw_scene_set,
     shift_camera,
 )
-from posefilter.synthetic.sensor import sense, sensor_model
+from posefilter.synthetic.sensor import sensor_model, simulate_sensor
 
 ATTEMPTS = 400
 RENDERERS = ("embree", "opengl")
@@ -85,7 +85,7 @@ def make_renderer(name: str) -> Renderer:
     raise UserError(f"renderer={name}: unknown; choose from {', '.join(RENDERERS)}")
 
 
-class Painter:
+class FrameRenderer:
     """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
 
     def __init__(self, job: Job, out: Path, store: MeshStore | None = None) -> None:
@@ -98,7 +98,7 @@ class Painter:
         """
         self.job, self.out = job, out
         self.K = np.array(job.K)
-        self.library = Library(store or MeshStore(job.meshes, scale=job.mesh_scale))
+        self.library = SolidStore(store or MeshStore(job.meshes, scale=job.mesh_scale))
         self.renderer = make_renderer(job.renderer)
         self.sensor = sensor_model(job.sensor)
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
@@ -107,7 +107,7 @@ class Painter:
         """Return a folder's set, and its classes by name; write the folder's settings."""
         if self._scene is None or self._scene[0] != number:
             rng = self.job.scene_generator(number)
-            scene = draw_set(self.library, self.job.object, self.job.scenes, rng)
+            scene = draw_scene_set(self.library, self.job.object, self.job.scenes, rng)
             solids = (scene.target, *scene.distractors, *scene.lookalikes)
             step = min(12, 255 // len(solids))
             exported = [fat.export_object(s.mesh, step * (k + 1)) for k, s in enumerate(solids)]
@@ -167,7 +167,7 @@ class Painter:
 
     def _shows_target(self, picture: Rendered) -> bool:
         """Tell whether enough of the target is seen."""
-        seen, alone = int((picture.index == 0).sum()), int(picture.alone[0])
+        seen, alone = int((picture.index == 0).sum()), int(picture.unoccluded[0])
         least = 0.002 * self.job.width * self.job.height
         return alone >= least and seen >= (1 - self.job.scenes.occlusion) * alone
 
@@ -180,13 +180,13 @@ class Painter:
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
         """Return a camera's color, depth and segment images, and its record."""
-        photo, depth = sense(picture.rgb, picture.depth, self.sensor, rng)
+        photo, depth = simulate_sensor(picture.rgb, picture.depth, self.sensor, rng)
         ids = np.array([*(exported[p.solid.mesh.name].seg_id for p in layout.placed), 0], np.uint8)
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
         objects = []
         for k, one in enumerate(layout.placed):
             if k == 0 or seen[k] > 0:
-                share = float(seen[k] / max(int(picture.alone[k]), 1))
+                share = float(seen[k] / max(int(picture.unoccluded[k]), 1))
                 truncated = self._truncated(one.hull)
                 objects.append(
                     fat.ObjectInFrame(
