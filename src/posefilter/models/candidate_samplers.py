@@ -1,7 +1,4 @@
-"""What the pose-space method is trained on: clouds whose scores its loss judges.
-
-A lesson returns a Trace of one step.
-"""
+"""Candidates that the pose-space method's likelihood is trained on, as a trace of one step."""
 
 import math
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -25,31 +22,31 @@ from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particl
 
 @runtime_checkable
 class ScoresSamples(Protocol):
-    """A likelihood that judges colored points by themselves: labeled rays ask for it."""
+    """A likelihood that scores colored points by themselves; required by labeled rays."""
 
     def score_samples(self, position: Tensor, color: Tensor) -> Tensor:
-        """Judge points (*, 3) in the object frame [m] with colors (*, 3) in [0, 1].  -> (*)."""
+        """Score points (*, 3) in the object frame [m] with colors (*, 3) in [0, 1].  -> (*)."""
         ...
 
 
 class ScoredMethod(Protocol):
-    """What a sampler asks of the method that it draws candidates for."""
+    """The method that candidates are drawn for."""
 
     likelihood: Any
 
     @property
     def model(self) -> ObjectModel:
-        """Return what the method knows of its object."""
+        """The object."""
         ...
 
     @property
     def space(self) -> PoseSpace:
-        """Return where its particles live."""
+        """The space of its particles."""
         ...
 
     @property
     def capabilities(self) -> frozenset[str]:
-        """Return what it provides."""
+        """What it provides; see capabilities.py."""
         ...
 
     def measure(
@@ -59,30 +56,43 @@ class ScoredMethod(Protocol):
         ...
 
     def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
-        """Return likely poses, (B, particles, 4, 4) camera_from_object."""
+        """Draw likely poses, (B, particles, 4, 4) camera_from_object [m]."""
         ...
 
 
 class CandidateSampler(Protocol):
-    """Make one training cloud of a batch."""
+    """Draw and score the candidates of one batch."""
 
     def __call__(
         self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
     ) -> Trace:
-        """Return a trace of one step, its scores differentiable."""
+        """Return a trace of one step whose scores are differentiable.
+
+        Args:
+            method: Scores the candidates.
+            scene: Its encoded images.
+            batch: B images with their truth.
+            generator: Source of randomness.
+        """
         ...
 
     def state(self) -> dict[str, Tensor]:
-        """Return what it remembers from batch to batch, for a run that is to be resumed."""
+        """Return what is kept from batch to batch, for checkpoints."""
         ...
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Remember what `state` returned."""
+        """Restore what `state` returned."""
         ...
 
 
 def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) -> Trace:
-    """Wrap a scored cloud of poses as a trace whose belief is the softmax of the scores."""
+    """Wrap scored poses as a trace whose belief is the softmax of the scores.
+
+    Args:
+        particles: B x N particles.
+        output: Their scores and poses.
+        sigma: (B,) noise level [m].
+    """
     log_weights = torch.log_softmax(output.log_likelihood, dim=1)
     top = log_weights.argmax(1)
     best = output.pose[torch.arange(len(top), device=top.device), top]
@@ -91,7 +101,7 @@ def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) 
 
 
 def make_uniform_particles(state: Tensor) -> Particles:
-    """Wrap states (B, N, *S) as an evenly weighted cloud without latent."""
+    """Return particles of equal weight without latent.  (B, N, *S) -> N particles per image."""
     B, N = state.shape[:2]
     weights = state.new_full((B, N), -math.log(N))
     return Particles(
@@ -100,14 +110,17 @@ def make_uniform_particles(state: Tensor) -> Particles:
 
 
 class CandidatePoses:
-    """Candidates from everywhere, at one noise level an image: the working variant's lesson.
+    """Draw candidates of several kinds, all of an image at one noise level.
 
-    each: candidates of each kind around the truth; proposed: poses from the proposal network, where
-    there is one; particles: the filter's own persistent particles (0 puts self-generated negatives
-    back to none); sigma: range of noise levels [m]; start: level at which those particles leave
-    proposals, as they do at test time [m] (without proposals they leave from depth, at the
-    broadest); levels: their steps from there to the sharpest; own_level: share of images read at
-    their level.
+    Args:
+        each: Candidates of each kind around the truth.
+        proposed: Poses from the proposal network, where there is one.
+        particles: Persistent particles of the filter's own, which are hard negatives; 0 for none.
+        sigma: Lowest and highest noise level [m].
+        start: Noise level at which persistent particles start from proposals, as they do at test
+            time [m]. Without proposals they start from depth, at the highest level.
+        levels: Steps of the persistent particles from there to the lowest level.
+        own_level: Fraction of images that are scored at the level of their persistent particles.
     """
 
     provides: ClassVar[Capabilities] = ("candidates",)
@@ -136,7 +149,7 @@ class CandidatePoses:
     def __call__(
         self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
     ) -> Trace:
-        """Draw candidates, read them, and let the persistent particles take a step."""
+        """Draw and score candidates, and advance the persistent particles by a step."""
         B, device = len(batch.rgb), batch.rgb.device
         model = method.model
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
@@ -167,11 +180,11 @@ class CandidatePoses:
         return one_step_trace(particles, output, sigma)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the persistent particles."""
+        """Return the state of the persistent particles."""
         return self.persistent.state() if self.persistent is not None else {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Take persistent particles back."""
+        """Restore the persistent particles."""
         if self.persistent is not None:
             self.persistent.restore(state)
 
@@ -198,13 +211,16 @@ def pick_pixels(usable: Tensor, count: int | None, generator: Generator) -> tupl
 
 
 class LabeledRays:
-    """The paper's lesson: points along the rays of the object's pixels, scored one by one (section
-    5).
+    """The paper's samples: points along the rays of the object's pixels, scored singly (section 5).
 
-    rays: mask pixels an image and step, drawn with replacement (null: all of them once, as in the paper); samples: points a
-    ray, evenly spaced from `start` in front of the camera to `past` behind the observed point;
-    tolerance: the half width of the surface, where a second sample keeps the observed color. Colors
-    are random otherwise.
+    Args:
+        rays: Mask pixels of an image, drawn with replacement; None: all of them once, as in the
+            paper.
+        samples: Points on a ray, evenly spaced.
+        start: Depth of the first [m].
+        past: How far the last lies behind the observed point [m].
+        tolerance: Half width of the surface [m]; on it a second sample has the observed color.
+            Other colors are random.
     """
 
     provides: ClassVar[Capabilities] = ("ray_samples",)
@@ -229,14 +245,17 @@ class LabeledRays:
     def __call__(
         self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
     ) -> Trace:
-        """Draw samples and read each; the cloud's states are (B, N, 4): u, v, offset behind the
-        surface [m], own color.
+        """Draw and score samples.
+
+        Returns:
+            A trace whose states are (B, N, 4): u, v [px], offset behind the surface [m], and 1
+            where the color is the observed one.
         """
         net = method.likelihood
         if not isinstance(net, ScoresSamples):
             raise UserError(
-                "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood only; choose "
-                "model/likelihood=paper or model/candidate_sampler=candidates"
+                "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood "
+                "only; choose model/likelihood=paper or model/candidate_sampler=candidates"
             )
         B, _, _, W = batch.depth.shape
         device = batch.rgb.device
@@ -263,20 +282,20 @@ class LabeledRays:
             for own in (0.0, 1.0)
         ]
         weight = torch.cat([valid, near], dim=1).float()
-        judged = net.score_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
+        scores = net.score_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
         log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
         particles = make_uniform_particles(torch.cat(state, dim=1))._replace(
             log_weights=log_weights
         )
-        pose = batch.camera_from_object[:, None].expand(-1, judged.shape[1], -1, -1)
+        pose = batch.camera_from_object[:, None].expand(-1, scores.shape[1], -1, -1)
         output = ParticleOutput(
-            judged, judged.new_zeros(B, judged.shape[1], 6), pose, particles.latent
+            scores, scores.new_zeros(B, scores.shape[1], 6), pose, particles.latent
         )
         return one_step_trace(particles, output, torch.full((B,), self.tolerance, device=device))
 
     def state(self) -> dict[str, Tensor]:
-        """Return nothing: every batch is new to it."""
+        """Return nothing: no state is kept between batches."""
         return {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
-        """Remember nothing."""
+        """Restore nothing."""

@@ -1,6 +1,4 @@
-"""What the four image-space methods share: a particle is a pixel, and reads the image where it
-stands.
-"""
+"""Base class of the four image-space methods: a particle is a pixel and sees the image around it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 @dataclass(frozen=True)
 class ImageScene:
-    """What an image-space method keeps of B images."""
+    """B encoded images."""
 
     image: Tensor  # (B, 4, H, W): color in [-1, 1], depth [m]
     depth: Tensor  # (B, 2, H, W): depth with its holes filled [m], and 1 where it was measured
@@ -38,23 +36,32 @@ class ImageScene:
 
 @dataclass(frozen=True)
 class RelevantScene(ImageScene):
-    """The same, where the context also tells which regions matter."""
+    """Encoded images with a relevance map."""
 
-    relevance: Tensor  # (B, 1, h, w), the chance that the cell shows the object
+    relevance: Tensor  # (B, 1, h, w), the probability that the cell shows the object
 
 
 class ImageSpace(PoseEstimator):
-    """Observe images and read particles off them; the networks, and what their outputs mean, are
-    injected.
+    """A particle filter over pixels, with an injected network and output heads.
 
-    net: given the patch's size, how many extra numbers a particle is told and how many make a pose;
-    bounds: how particles bound the object in the image; lessons: losses beside the chosen one, by
-    name; stages: factors on all of them as training proceeds (null: 1 throughout); relevance:
-    weight of the loss on the context's map, if it tells one; detach_position: whether what is read
-    at a position has no gradient with respect to the displacement that led there; truncate: cut the gradient through
-    places that are looked at, and through the latent, every so many steps (null: never), which
-    changes no value. A place still hands its own gradient on to the next, so that over a long
-    roll-out this damps the growth; only 1, a cut at every step, ends it.
+    Args:
+        net: Builds the network from the patch's size, the number of extra inputs and the width of
+            the pose output.
+        glimpse: Crops the image patch at each particle.
+        encoder: Computes feature maps of the whole image once; sampled at each particle.
+        pose_head: Turns network outputs into a pose.
+        displacement: Turns network outputs into a displacement [px].
+        box_head: Computes the object's bounding box from the particles.
+        aux_losses: Losses that are added to the chosen one, by name; None: switched off.
+        loss_schedule: Factors on the losses as training proceeds; None: 1 throughout.
+        relevance: Weight of the loss on the encoder's relevance map, where it has one.
+        detach_position: Block the gradient of what is seen at a position with respect to the
+            displacement that led there.
+        truncate: Truncate backpropagation through positions and latents at every so many steps;
+            None: never. Values do not change. A position still passes its own gradient on to the
+            next, so over a long roll-out this damps the growth of gradients; only 1 ends it.
+        object_model: The object, if it is known already.
+        **base: Arguments of `PoseEstimator`.
     """
 
     provides: ClassVar[Capabilities] = (
@@ -65,7 +72,7 @@ class ImageSpace(PoseEstimator):
         "surface_points",
     )
 
-    position_width: ClassVar[int] = 0  # numbers that tell a particle its own location
+    position_width: ClassVar[int] = 0  # inputs that hold a particle's own position
     net: Any
     glimpse: Any
     encoder: Any
@@ -111,36 +118,33 @@ class ImageSpace(PoseEstimator):
             detach_position,
             truncate,
         )
-        if object_model is not None:  # not in the base, where the pose code is not there yet
+        if object_model is not None:  # not in the base, where the pose head does not exist yet
             self.set_object(object_model)
 
     @property
     def space(self) -> PixelSpace:
-        """Return the image plane."""
+        """The image plane."""
         return PixelSpace()
 
     @property
     def latent_width(self) -> int:
-        """Return L."""
+        """Width L of a particle's latent."""
         return int(self.net.latent_width)
 
     def encode(self, batch: Batch) -> ImageScene:
-        """Encode the images once."""
-        seen = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
+        """Encode the images."""
+        context = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
-        if seen.relevance is None:
-            return ImageScene(image, depth, batch.intrinsics, seen)
-        return RelevantScene(
-            image, depth, batch.intrinsics, seen, torch.sigmoid(seen.relevance)[:, None]
-        )
+        if context.relevance is None:
+            return ImageScene(image, depth, batch.intrinsics, context)
+        relevance = torch.sigmoid(context.relevance)[:, None]
+        return RelevantScene(image, depth, batch.intrinsics, context, relevance)
 
     def measure(
         self, scene: ImageScene, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
-        """Look at each particle's patch and place, and tell likelihood, displacement, pose and
-        latent.
-        """
+        """Compute likelihood, displacement, pose and latent of each particle from what it sees."""
         state, latent = particles.state, particles.latent
         if self.truncate and step.number % self.truncate == 0:
             state, latent = state.detach(), latent.detach()
@@ -165,11 +169,17 @@ class ImageSpace(PoseEstimator):
         )
 
     def surface_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
-        N) bool.
+        """Return the measured point at each particle.
 
-        Depth is read at the particle's whole pixel: between pixels of two surfaces there is
-        nothing. Off the frame it is the nearest pixel's, and not measured.
+        Depth is taken at the nearest pixel, not interpolated: between the pixels of two surfaces
+        there is no surface. A particle off the frame gets the depth of the nearest pixel in it.
+
+        Args:
+            scene: Encoded images.
+            state: (B, N, 2) particles [px].
+
+        Returns:
+            Points in the camera (B, N, 3) [m], and whether their depth was measured (B, N) bool.
         """
         H, W = scene.depth.shape[-2:]
         corner = torch.tensor([W - 1, H - 1], device=state.device)
@@ -181,24 +191,32 @@ class ImageSpace(PoseEstimator):
         ).all(-1)
 
     def image_patches(self, scene: ImageScene, state: Tensor) -> Tensor:
-        """Return what particles see where they stand: (B, N, 2) [px] -> (B, N, 4, k, k), as `image`."""
+        """Crop the patch at each particle.  (B, N, 2) [px] -> (B, N, 4, k, k), channels as `image`."""
         patches: Tensor = self.glimpse(scene.image, state)
         return patches
 
     def position_features(self, scene: ImageScene, state: Tensor) -> Tensor:
-        """Return what a particle is told of its own place: (B, N, 0) nothing, or (B, N, 2) its
-        location in [-1, 1].
+        """Return a particle's own position as network input.
+
+        Args:
+            scene: Encoded images.
+            state: (B, N, 2) particles [px].
+
+        Returns:
+            (B, N, 2) in [-1, 1] within the frame, or (B, N, 0) where the network does not take it.
         """
         if not self.position_width:
-            # nothing to learn: else all that decided the place would be asked for zeros
+            # without gradient: the graph behind the positions would be traversed for nothing
             return state.detach()[..., :0]
         height, width = scene.image.shape[-2:]
         half = state.new_tensor([(width - 1) / 2, (height - 1) / 2])
         return (state / half - 1)[..., : self.position_width]
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the chosen loss, each lesson's and the context's, of one roll-out: one value an
-        image each, weighted.
+        """Return the weighted losses of one roll-out, by name.
+
+        Returns:
+            The chosen loss, the auxiliary losses and the relevance loss, (B,) each.
         """
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
@@ -213,37 +231,35 @@ class ImageSpace(PoseEstimator):
         return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
 
     def progress(self) -> float:
-        """Return the share of the training's steps that are done; 0 where no trainer counts them."""
+        """Return the fraction of the training's steps done; 0 without a trainer or a schedule."""
         if self._trainer is None or not self.loss_schedule:
             return 0.0
         return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
 
     def set_object(self, model: ObjectModel) -> None:
-        """Tell the pose code about the object, and watch for signs of failure beside the metrics."""
+        """Set the object of the pose head too, and add the filter diagnostics to the metrics."""
         super().set_object(model)
         self.pose_head.set_object(model)
         self.scores["diagnostics"] = FilterDiagnostics()
 
     def score(self, trace: Trace, batch: Batch) -> None:
-        """Add a batch's errors, and its signs of failure."""
+        """Add a batch's errors and diagnostics."""
         super().score(trace, batch)
         cast(FilterDiagnostics, self.scores["diagnostics"]).update(trace, batch)
 
     def results(self) -> dict[str, Any]:
-        """Return the metrics, and the signs of failure."""
+        """Return the metrics, with the filter diagnostics."""
         return super().results() | {
             "diagnostics": cast(FilterDiagnostics, self.scores["diagnostics"]).compute()
         }
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
-        """Return how the particles bound the object, (B, 4) [px]."""
+        """Return the bounding box that the box head computes, (B, 4) [px]."""
         return self.box_head(trace, batch, self.model)
 
 
 class _EncodedMethod:
-    """A method that has looked at its images already, so that a roll-out and a loss on the scene
-    share one look.
-    """
+    """A method whose images are encoded already: the roll-out and the relevance loss share them."""
 
     def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
         self.method, self.scene = method, scene
@@ -255,26 +271,36 @@ class _EncodedMethod:
         self.surface_points, self.model = method.surface_points, method.model
 
     def encode(self, batch: Batch) -> ImageScene:
-        """Return what was seen."""
+        """Return the scene that was encoded before."""
         return self.scene
 
 
-def check_latent_width(width: int, read: int | None) -> None:
-    """Raise UserError unless a latent is as wide as a piece that reads it takes it to be (None: any)."""
-    if read not in (None, width):
+def check_latent_width(width: int, required: int | None) -> None:
+    """Check that the latent has the width that a component requires.
+
+    Args:
+        width: Width of the latent.
+        required: Width that the component requires; None: any.
+
+    Raises:
+        UserError: They differ.
+    """
+    if required not in (None, width):
         raise UserError(
-            f"model.net.latent_width={width}: model/box_head=votes needs {read}, one for each of "
+            f"model.net.latent_width={width}: model/box_head=votes needs {required}, one for each of "
             "the box's sides"
         )
 
 
 def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
-    """Raise UserError unless a training roll-out's steps are of one size: losses judge them side by
-    side.
+    """Check that all steps of a training roll-out have the same number of particles.
 
     Args:
         rolled: The filter that is rolled out.
-        name: What it is called in the settings.
+        name: Its key in the settings.
+
+    Raises:
+        UserError: They differ; losses stack the steps into one tensor.
     """
     if rolled.steps > 1 and rolled.first_particles != rolled.particles:
         raise UserError(
@@ -285,8 +311,14 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
 
 
 def relevance_loss(context: ContextMap, mask: Tensor) -> Tensor:
-    """Cross-entropy of the map against whether its cells show the object, half of the weight on
-    those that do.  -> (B,).
+    """Return the balanced binary cross-entropy of the relevance map.
+
+    Args:
+        context: Feature maps with a relevance map.
+        mask: (B, 1, H, W) bool, the object.
+
+    Returns:
+        (B,), half of the weight on the cells that show the object.
     """
     logit = context.relevance
     assert logit is not None

@@ -1,6 +1,4 @@
-"""The paper's fifth method: particles are poses, and a learned likelihood judges each by the image
-points it explains.
-"""
+"""The paper's fifth method: particles are poses, weighted by a learned likelihood."""
 
 from typing import Any, ClassVar, NamedTuple
 
@@ -23,9 +21,7 @@ from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 
 class PoseScene(NamedTuple):
-    """What is kept of an image: its pixels, and what the proposal network makes of it (None without
-    one).
-    """
+    """Encoded images: their pixels, and the output of the proposal network (None without one)."""
 
     image: Pixels
     coordinates: Coordinates | None
@@ -33,32 +29,42 @@ class PoseScene(NamedTuple):
 
     @property
     def relevance(self) -> Tensor:
-        """Return where the object is likely to be, (B, 1, h, w)."""
+        """The probability that each cell shows the object, (B, 1, h, w).
+
+        Raises:
+            UserError: There is no proposal network.
+        """
         if self.coordinates is None:
             raise UserError(
-                "filter/initialize=from_relevance needs the proposal network; choose model/proposals=dense"
+                "filter/initialize=from_relevance needs the proposal network; "
+                "choose model/proposals=dense"
             )
         return torch.sigmoid(self.coordinates.logit)[:, None]
 
     def first(self, count: int) -> "PoseScene":
-        """Return the first so many images."""
+        """Return the first `count` images."""
         return PoseScene(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
 
 
 class PosePF(PoseEstimator):
     """A particle filter over SE(3) with a learned likelihood.
 
-    likelihood: scores poses (nets/likelihood.py, or the paper's); proposals: the dense network that
-    the filter starts from, or None; lesson: what the likelihood is trained on; pixels: image points
-    a pose reads at each filter step; train_pixels: the same in training; likelihood_batch_size: of
-    a batch that the likelihood learns from (the proposal network, which needs more of them, learns
-    from all; None: all); proposal_weight: of the proposal network's loss.
+    Args:
+        likelihood: Scores poses (nets/likelihood.py, or the paper's).
+        candidate_sampler: Draws the candidates that the likelihood is trained on.
+        proposals: Network of dense object coordinates that initial poses are drawn from, or None.
+        pixels: Image points that each pose is scored from, at each step of the filter.
+        train_pixels: The same in training.
+        likelihood_batch_size: Images of a batch that the likelihood is trained on; None: all. The
+            proposal network, which needs more of them, is always trained on all.
+        proposal_weight: Weight of the proposal network's loss.
+        **base: Arguments of `PoseEstimator`.
     """
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
     test_only_settings = ("filter", "train_filter", "pixels")  # training rolls out no filter
-    # for comparing the estimate with the truth: image points, noise level [m]
-    judged_pixels, judged_at = 4096, 0.004
+    # for comparing the scores of estimate and truth: image points, noise level [m]
+    comparison_pixels, comparison_sigma = 4096, 0.004
 
     def __init__(
         self,
@@ -86,17 +92,17 @@ class PosePF(PoseEstimator):
 
     @property
     def space(self) -> PoseSpace:
-        """Return SE(3) about the object's center."""
+        """SE(3) about the object's center."""
         x, y, z = self.model.center.tolist()
         return PoseSpace((x, y, z), self.model.radius)
 
     @property
     def latent_width(self) -> int:
-        """Return 0: these particles remember nothing."""
+        """0: particles have no latent."""
         return 0
 
     def encode(self, batch: Batch) -> PoseScene:
-        """Lay the image out, and run the proposal network once."""
+        """Flatten the images, and run the proposal network once."""
         if self.proposals is None:
             return PoseScene(flatten_images(batch.rgb, batch.depth, batch.intrinsics), None, None)
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
@@ -109,24 +115,42 @@ class PosePF(PoseEstimator):
     ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
         count = self.train_pixels if self.training else self.pixels
-        # bfloat16 halves the time of a step, and its error is far below what drawing so few pixels
-        # makes
+        # bfloat16 halves the time of a step; its error is far below the noise of so few pixels
         with torch.autocast(self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)):
             score = self._score(scene, particles.state, step.sigma, generator, count).float()
-        still = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
-        return ParticleOutput(score, still, particles.state, particles.latent)
+        no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
+        return ParticleOutput(score, no_move, particles.state, particles.latent)
 
     def score_poses(
         self, scene: PoseScene, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
-        """Score any poses (B, N, 4, 4) at a noise level [m].  -> (B, N)."""
+        """Score any poses at a noise level.
+
+        Args:
+            scene: Encoded images.
+            poses: (B, N, 4, 4) camera_from_object [m].
+            sigma: Noise level [m].
+            generator: Draws the image points.
+            pixels: Image points that each pose is scored from.
+
+        Returns:
+            Log-likelihoods up to a constant for each image, (B, N).
+        """
         return self._score(scene, poses, poses.new_tensor(sigma), generator, pixels)
 
     def propose_poses(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
-        """Draw poses from the proposal network's votes.  -> (B, particles, 4, 4)."""
+        """Draw poses from the votes of the proposal network.
+
+        Returns:
+            camera_from_object (B, particles, 4, 4) [m].
+
+        Raises:
+            UserError: There is no proposal network, or an image without any depth.
+        """
         if scene.coordinates is None or scene.cells is None:
             raise UserError(
-                "filter/initialize=from_proposals needs the proposal network; choose model/proposals=dense"
+                "filter/initialize=from_proposals needs the proposal network; "
+                "choose model/proposals=dense"
             )
         if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
             raise UserError(
@@ -142,17 +166,12 @@ class PosePF(PoseEstimator):
         )
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
-        """Return the likelihood's loss and the proposal network's, one value an image each, from
-        one look at the images.
-        """
+        """Return the losses of likelihood and proposal network, one value for each image."""
         scene = self.encode(batch)
         count = self.likelihood_batch_size or len(batch.rgb)
-        part, seen = Batch(*(x[:count] for x in batch)), scene.first(count)
-        losses = {
-            "likelihood": self.loss(
-                self.candidate_sampler(self, seen, part, generator), part, self.model
-            )
-        }
+        part = Batch(*(x[:count] for x in batch))
+        candidates = self.candidate_sampler(self, scene.first(count), part, generator)
+        losses = {"likelihood": self.loss(candidates, part, self.model)}
         if scene.coordinates is not None and scene.cells is not None:
             assert self.proposals is not None
             size = (self._center(), self.model.radius, float(self.proposals.reach))
@@ -164,7 +183,7 @@ class PosePF(PoseEstimator):
         return losses
 
     def set_object(self, model: ObjectModel) -> None:
-        """Learn which object it is about; count, too, how often the truth is outscored."""
+        """Set the object of the proposal network too, and count how often the truth is outscored."""
         super().set_object(model)
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
@@ -174,15 +193,16 @@ class PosePF(PoseEstimator):
     def score(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
 
-        An estimate that climbed the score outscores the truth by a little even where it is right;
-        what tells of a bad likelihood is an estimate that does so and is wrong (ADD of 0.1
-        diameters or more).
+        A refined estimate outscores the truth by a little even where it is right. The likelihood is
+        at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more).
         """
         super().score(trace, batch)
         scene = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
-        scores = self.score_poses(scene, pair, self.judged_at, generator, self.judged_pixels)
+        scores = self.score_poses(
+            scene, pair, self.comparison_sigma, generator, self.comparison_pixels
+        )
         outscored = scores[:, 0] > scores[:, 1]
         wrong = (
             add(trace.belief.best, batch.camera_from_object, self.model.points)
@@ -192,21 +212,19 @@ class PosePF(PoseEstimator):
         self.scores["truth_outscored_by_wrong"].update((outscored & wrong).float())
 
     def results(self) -> dict[str, Any]:
-        """Return the metrics, with the shares of images in which the truth was outscored."""
+        """Return the metrics, with the fractions of images in which the truth was outscored."""
         out = super().results()
         for name in ("truth_outscored", "truth_outscored_by_wrong"):
             out["belief"][name] = float(self.scores[name].compute())
         return out
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Carry along what the lesson remembers, so that a resumed run ends as one that was not
-        cut.
-        """
+        """Save the candidate sampler's state, so that a resumed run ends as one not interrupted."""
         super().on_save_checkpoint(checkpoint)
         checkpoint["candidate_sampler"] = self.candidate_sampler.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Give the candidate sampler its state back."""
+        """Restore the candidate sampler's state."""
         super().on_load_checkpoint(checkpoint)
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 

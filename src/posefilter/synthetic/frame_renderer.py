@@ -89,7 +89,7 @@ class FrameRenderer:
     """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
 
     def __init__(self, job: Job, out: Path, store: MeshStore | None = None) -> None:
-        """Make a painter.
+        """Set up the renderer, the meshes and the sensor.
 
         Args:
             job: What to render.
