@@ -68,7 +68,7 @@ def measure(method: PoseEstimator, frames: Dataset[Batch]) -> dict[str, Any]:
     with torch.no_grad():
         for number, batch in enumerate(DataLoader(frames, batch_size=4)):
             method.test_step(batch, number)
-    return method.results()
+    return method.compute_metrics()
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:

@@ -111,7 +111,7 @@ class Knows(PoseLikelihood):
 
     place = torch.tensor([0.03, -0.01, 0.02])
 
-    def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
+    def score_at_level(self, points: Points, level: Tensor, radius: float) -> Tensor:
         return 1 - (points.position - self.place).norm(dim=-1) / radius
 
 
@@ -206,7 +206,7 @@ def test_ticks_are_round() -> None:
 
 def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() -> None:
     class Told(PoseLikelihood):
-        def judge(self, points: Points, level: Tensor, radius: float) -> Tensor:
+        def score_at_level(self, points: Points, level: Tensor, radius: float) -> Tensor:
             assert points.context is not None
             return points.context[..., 0]  # log of the share of the fragment there
 

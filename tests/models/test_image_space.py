@@ -141,13 +141,13 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     method = working(kind, size)
     with torch.no_grad():
         method.eval().test_step(scenes(4), 0)
-    before = method.results()
+    before = method.compute_metrics()
     assert before["particles_on_object"] < 0.4
     method._reset()
     teach(method, 240)
     with torch.no_grad():
         method.test_step(scenes(4), 0)
-    after = method.results()
+    after = method.compute_metrics()
     assert after["particles_on_object"] > 0.85
     assert after["iou"] > 0.7
     assert after["diagnostics"]["auroc"] > 0.8
@@ -229,7 +229,7 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
         method.filter = run_filter(64, 3, initialize, resample)
         with torch.no_grad():
             method.test_step(batch, 0)
-        return method.results()["diagnostics"]["on_object"]
+        return method.compute_metrics()["diagnostics"]["on_object"]
 
     uniform = share(UniformPixels(), NoResampling())
     assert share(FromRelevance(), NoResampling())[0] > uniform[0] + 0.3

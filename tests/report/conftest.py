@@ -45,8 +45,8 @@ def run(tmp_path: Path) -> Path:
     """Return the folder of a whole run."""
     folder = tmp_path / "run <1>"
     (folder / ".hydra").mkdir(parents=True)
-    signs = {"off_frame": [0.0, 0.1, 0.625], "pairwise_cosine": 0.95, "offset_r2": 0.5}
-    (folder / "metrics.json").write_text(json.dumps(metrics(87.5, signs=signs)))
+    diagnostics = {"off_frame": [0.0, 0.1, 0.625], "pairwise_cosine": 0.95, "offset_r2": 0.5}
+    (folder / "metrics.json").write_text(json.dumps(metrics(87.5, diagnostics=diagnostics)))
     (folder / "data.json").write_text(
         json.dumps({"objects": ["carton"], "source": "scenes", "root": "data/x"})
     )

@@ -45,7 +45,7 @@ def list_numbers(content: object, name: str = "") -> list[str]:
     return (
         [name]
         if isinstance(content, int | float)
-        or (isinstance(content, list) and name.startswith("signs"))
+        or (isinstance(content, list) and name.startswith("diagnostics"))
         else []
     )
 

@@ -102,7 +102,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         job.name,
         job.swept,
     )
-    return record(method.results(), told, data.describe(), Path(job.cfg.checkpoint)), files
+    return record(method.compute_metrics(), told, data.describe(), Path(job.cfg.checkpoint)), files
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:

@@ -115,7 +115,7 @@ def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
     except Stopped:
         say_stopped(run)
         raise
-    return method.results()
+    return method.compute_metrics()
 
 
 def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[str, Any]:

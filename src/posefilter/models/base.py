@@ -1,6 +1,4 @@
-"""What every method shares as a LightningModule: every Lightning hook lives here, so that a
-method's own file is short.
-"""
+"""The base class of all methods: every Lightning hook, so that a method's own file is short."""
 
 import logging
 import math
@@ -35,13 +33,17 @@ _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 
 
 class PoseEstimator(LightningModule):
-    """A method, the filter that runs it, and the loss it learns from.
+    """A method with its particle filter, loss and optimizer, as a LightningModule.
 
-    filter: run at validation and test; train_filter: rolled out in training where that differs;
-    loss: judges a training trace, one value an image; optimizer: given (name, parameter) pairs;
-    scheduler: given the optimizer and the number of steps, advanced each step; seed: with the epoch
-    and the batch's number it decides every random draw. Which object it is about, `set_object`
-    tells.
+    `set_object` must be called before any batch: metrics and heads depend on the object.
+
+    Args:
+        filter: Run in validation and test.
+        loss: Given a training trace; returns one value for each image.
+        optimizer: Given (name, parameter) pairs.
+        scheduler: Given the optimizer and the number of steps; advanced at each step.
+        train_filter: Rolled out in training; None: `filter`.
+        seed: Decides every random draw, together with the epoch and the batch's number.
     """
 
     provides: ClassVar[Capabilities] = ("rollout",)
@@ -63,49 +65,66 @@ class PoseEstimator(LightningModule):
         self._object_model: ObjectModel | None = None
         self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
         self.seconds_per_image: list[float] = []
-        self.lost = self.skipped_in_a_row = 0  # steps whose gradient was not finite
+        self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
 
     @cached_property
     def capabilities(self) -> frozenset[str]:
-        """Return what the method and its pieces provide: metrics and figures go by it."""
+        """What the method and its components provide; metrics and figures are chosen by it."""
         return collect_provided(self)
 
     @property
     def space(self) -> Space:
-        """Return where particles live."""
-        raise NotImplementedError(f"{type(self).__name__} must say where its particles live")
+        """The space of the particles."""
+        raise NotImplementedError(f"{type(self).__name__} must implement space")
 
     @property
     def latent_width(self) -> int:
-        """Return L, the width of a particle's latent."""
+        """L, the width of a particle's latent."""
         return 0
 
     def encode(self, batch: Batch) -> Any:
-        """Look at the images once."""
-        raise NotImplementedError(f"{type(self).__name__} must say what it keeps of an image")
+        """Encode the images; called once for each batch.
+
+        Args:
+            batch: B images. `mask` and `camera_from_object` must not be used.
+
+        Returns:
+            What `measure` is given as `scene`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement encode()")
 
     def measure(
         self, scene: Any, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
-        """Judge every particle of a cloud."""
-        raise NotImplementedError(f"{type(self).__name__} must say what it makes of a particle")
+        """Compute likelihood, displacement, pose and latent of each particle.
+
+        Args:
+            scene: Returned by `encode`.
+            particles: N particles of each image.
+            step: The step's number and noise level.
+            generator: Source of randomness.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement measure()")
 
     @property
     def model(self) -> ObjectModel:
-        """Return what the method knows of its object.  Raises UserError before it was told."""
+        """The object.
+
+        Raises:
+            UserError: `set_object` has not been called.
+        """
         if self._object_model is None:
             raise UserError(
-                "the method does not know its object yet: give it data, or a "
-                "checkpoint that holds one"
+                "the method has no object yet: give it data, or a checkpoint that holds one"
             )
         return self._object_model
 
     def set_object(self, model: ObjectModel) -> None:
-        """Learn which object it is about, and make the metrics for it.
+        """Set the object, and create its metrics.
 
         Raises:
-            UserError: Its parts do not fit each other (see `capabilities`).
+            UserError: The method's components do not fit each other; see capabilities.py.
         """
         check_parts(self)
         self._object_model = model
@@ -117,7 +136,7 @@ class PoseEstimator(LightningModule):
             self.scores["belief"] = BeliefQuality([model])
 
     def generator(self, stage: str, batch_number: int) -> Generator:
-        """Return the generator of one batch: it depends on seed, stage, epoch and number alone."""
+        """Return the random generator of a batch: a function of seed, stage, epoch and number."""
         epoch = self.current_epoch if stage == "train" else 0
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
         return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
@@ -127,12 +146,16 @@ class PoseEstimator(LightningModule):
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the losses by name, (B,) each; their sum is minimized.
 
-        Here: the chosen one, of one roll-out.
+        The default is the chosen loss of one roll-out.
         """
         return {"loss": self.loss(self.train_filter(batch, self, generator), batch, self.model)}
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
-        """Return the sum of the losses' means."""
+        """Return the sum of the losses' means.
+
+        Raises:
+            FloatingPointError: It is not finite.
+        """
         losses = self.training_losses(batch, self.generator("train", batch_number))
         means = {name: value.mean() for name, value in losses.items()}
         total = torch.stack(list(means.values())).sum()
@@ -148,7 +171,7 @@ class PoseEstimator(LightningModule):
         return total
 
     def log_scalar(self, name: str, value: Tensor) -> None:
-        """Log a training scalar, where a trainer listens."""
+        """Log a training scalar, if there is a trainer."""
         if self._trainer is not None:
             self.log(f"train/{name}", value)
 
@@ -171,62 +194,61 @@ class PoseEstimator(LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip each part's gradient by its own norm: a wild step of one network must not shrink
-        another's.
+        """Clip the gradient of each submodule by its own norm.
 
-        A part whose gradient's norm is not finite is left as it is by this step, with a warning;
-        also where nothing is clipped. Raises FloatingPointError after 20 such steps in a row, of
-        any part, since no more would be learned.
+        A large gradient of one network then does not shrink another's. A submodule whose gradient
+        is not finite is not updated by this step, with a warning; also where nothing is clipped.
+
+        Raises:
+            FloatingPointError: 20 steps in a row had such a gradient in any submodule.
         """
-        lost = []
+        skipped = []
         for name, part in self.named_children():
             parameters = [p for p in part.parameters() if p.grad is not None]
             if parameters and not bool(
                 nn.utils.clip_grad_norm_(parameters, gradient_clip_val or math.inf).isfinite()
             ):
-                lost.append(name)
+                skipped.append(name)
                 for parameter in parameters:
                     parameter.grad = None  # zeros would still move it, by momentum
-        self.lost += bool(lost)
-        self.skipped_in_a_row = self.skipped_in_a_row + 1 if lost else 0
-        if lost and self.lost in (1, 10, 100, 1000, 10_000):
-            at = self.global_step
+        self.skipped_steps += bool(skipped)
+        self.skipped_in_a_row = self.skipped_in_a_row + 1 if skipped else 0
+        if skipped and self.skipped_steps in (1, 10, 100, 1000, 10_000):
             log.warning(
-                "step %d does not teach %s, the %d. so far: its gradient is not finite",
-                at,
-                ", ".join(lost),
-                self.lost,
+                "step %d does not update %s, whose gradient is not finite (%d such steps so far)",
+                self.global_step,
+                ", ".join(skipped),
+                self.skipped_steps,
             )
         if self.skipped_in_a_row == _PATIENCE:
             raise FloatingPointError(
-                f"the gradient of {', '.join(lost)} was not finite in {_PATIENCE} steps in a row: "
-                f"a roll-out's can grow "
-                "with each step; choose model.detach_position=true or "
-                "model/train_rollout=truncated (image space), or fewer filter.steps"
+                f"the gradient of {', '.join(skipped)} was not finite in {_PATIENCE} steps in a "
+                "row: in a roll-out it can grow with each step; choose model.detach_position=true "
+                "or model/train_rollout=truncated (image space), or fewer filter.steps"
             )
 
     # -- validation and test ----------------------------------------------------------------------
 
-    def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]  # callbacks look at it
-        """Run the filter and collect its errors."""
-        return self._judge(batch, "validate", batch_number)
+    def validation_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
+        """Run the filter and update the metrics; callbacks are given the trace."""
+        return self._evaluate(batch, "validate", batch_number)
 
     def test_step(self, batch: Batch, batch_number: int) -> Trace:  # type: ignore[override]
-        """Run the filter and collect its errors; callbacks write the belief down."""
-        return self._judge(batch, "test", batch_number)
+        """Run the filter and update the metrics; callbacks are given the trace."""
+        return self._evaluate(batch, "test", batch_number)
 
     def predict_step(self, batch: Batch, batch_number: int) -> Trace:
-        """Run the filter; mask and pose of the batch are not looked at."""
+        """Run the filter; mask and pose of the batch are not used."""
         return self.filter(batch, self, self.generator("predict", batch_number))
 
-    def _judge(self, batch: Batch, stage: str, batch_number: int) -> Trace:
+    def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()
         trace: Trace = self.filter(batch, self, self.generator(stage, batch_number))
         self.seconds_per_image.append((time.perf_counter() - start) / len(batch.rgb))
-        self.score(trace, batch)
+        self.update_metrics(trace, batch)
         return trace
 
-    def score(self, trace: Trace, batch: Batch) -> None:
+    def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors to the metrics."""
         height, width = batch.rgb.shape[-2:]
         truth = box_of_pose(
@@ -247,15 +269,14 @@ class PoseEstimator(LightningModule):
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
-        """Return the bounding box that the run ends with, (B, 4) [px]: where the estimate puts the
-        object's hull.
-        """
+        """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
         height, width = batch.rgb.shape[-2:]
         return box_of_pose(trace.belief.best, self.model.hull, batch.intrinsics, height, width)
 
     def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
-        """Return where in the image particles are, (B, N, 2) [px]: a pose is where it puts the
-        object's center.
+        """Return where particles are in the image, (B, N, 2) [px].
+
+        A pose is where it puts the object's center.
         """
         if not isinstance(self.space, PoseSpace):
             return particles.state
@@ -264,8 +285,8 @@ class PoseEstimator(LightningModule):
             batch.intrinsics,
         )
 
-    def results(self) -> dict[str, Any]:
-        """Return what was collected since the last reset, in the form of metrics.json."""
+    def compute_metrics(self) -> dict[str, Any]:
+        """Return the metrics since the last reset, in the form of metrics.json."""
         out: dict[str, Any] = {"instances": 0, "missed": 0}
         out |= dict.fromkeys(("add", "add_s", "mssd", "mspd"))
         if "poses" in self.scores:
@@ -288,27 +309,28 @@ class PoseEstimator(LightningModule):
             metric.reset()
 
     def on_validation_epoch_start(self) -> None:
-        """Forget what was collected before."""
+        """Reset the metrics."""
         self._reset()
 
     def on_test_epoch_start(self) -> None:
-        """Forget what was collected before."""
+        """Reset the metrics."""
         self._reset()
 
     def on_validation_epoch_end(self) -> None:
-        """Log the metrics; `val/score` is what the best checkpoint has most of."""
-        results = self.results()
+        """Log the metrics; the best checkpoint has the highest `val/score`."""
+        results = self.compute_metrics()
         self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
         self.log("val/score", compute_checkpoint_score(results), prog_bar=True)
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
-        self.log_dict({f"test/{name}": value for name, value in flatten(self.results()).items()})
+        results = self.compute_metrics()
+        self.log_dict({f"test/{name}": value for name, value in flatten(results).items()})
 
     # -- checkpoints ------------------------------------------------------------------------------
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Carry the object along, as plain tensors, numbers and strings."""
+        """Save the object and the recipe, as plain tensors, numbers and strings."""
         checkpoint["recipe"] = self.recipe
         checkpoint["object_model"] = dict(self.model._asdict())
         checkpoint["state_dict"] = {
@@ -316,18 +338,18 @@ class PoseEstimator(LightningModule):
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take the object from the checkpoint."""
+        """Set the object that the checkpoint holds."""
         self.set_object(ObjectModel(**checkpoint["object_model"]))
 
 
 def compute_checkpoint_score(results: dict[str, Any]) -> float:
-    """Return the one figure of results in the form of metrics.json (see `overall`)."""
+    """Return the score by which checkpoints are compared, from metrics.json (see `overall`)."""
     auc = float(results["add"]["auc"]) if results["add"] else None
     return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
 
 
 def flatten(results: dict[str, Any], prefix: str = "") -> dict[str, float]:
-    """Return nested numbers under joined names, those that are not numbers (or are None) left out."""
+    """Return nested numbers by joined names; values that are no numbers are left out."""
     out: dict[str, float] = {}
     for name, value in results.items():
         if isinstance(value, dict):

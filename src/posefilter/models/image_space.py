@@ -242,14 +242,14 @@ class ImageSpace(PoseEstimator):
         self.pose_head.set_object(model)
         self.scores["diagnostics"] = FilterDiagnostics()
 
-    def score(self, trace: Trace, batch: Batch) -> None:
+    def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors and diagnostics."""
-        super().score(trace, batch)
+        super().update_metrics(trace, batch)
         cast(FilterDiagnostics, self.scores["diagnostics"]).update(trace, batch)
 
-    def results(self) -> dict[str, Any]:
+    def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics, with the filter diagnostics."""
-        return super().results() | {
+        return super().compute_metrics() | {
             "diagnostics": cast(FilterDiagnostics, self.scores["diagnostics"]).compute()
         }
 

@@ -190,13 +190,13 @@ class PosePF(PoseEstimator):
         self.scores["truth_outscored"] = MeanMetric()
         self.scores["truth_outscored_by_wrong"] = MeanMetric()
 
-    def score(self, trace: Trace, batch: Batch) -> None:
+    def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
 
         A refined estimate outscores the truth by a little even where it is right. The likelihood is
         at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more).
         """
-        super().score(trace, batch)
+        super().update_metrics(trace, batch)
         scene = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
@@ -211,9 +211,9 @@ class PosePF(PoseEstimator):
         self.scores["truth_outscored"].update(outscored.float())
         self.scores["truth_outscored_by_wrong"].update((outscored & wrong).float())
 
-    def results(self) -> dict[str, Any]:
+    def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics, with the fractions of images in which the truth was outscored."""
-        out = super().results()
+        out = super().compute_metrics()
         for name in ("truth_outscored", "truth_outscored_by_wrong"):
             out["belief"][name] = float(self.scores[name].compute())
         return out
