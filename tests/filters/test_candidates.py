@@ -11,7 +11,7 @@ from posefilter.filters.candidates import (
     sample_around_truth,
     sample_from_depth,
 )
-from posefilter.filters.propagate import half_turns
+from posefilter.filters.propagate import HalfTurns, half_turns
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
@@ -26,7 +26,7 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_candidates_hold_the_truth_and_every_kind() -> None:
     batch = scenes(3)
-    poses = sample_around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator())
+    poses = sample_around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator(), HalfTurns(1.0))
     assert poses.shape == (3, 1 + 4 * 8 + 4, 4, 4)
     torch.testing.assert_close(poses[:, 0], batch.camera_from_object)
     distance = SPACE.distance(poses, batch.camera_from_object[:, None])

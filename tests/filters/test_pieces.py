@@ -8,7 +8,14 @@ from torch import Generator, Tensor
 
 from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax, DensestMode, DensestPose, Mean, kernel_mass
-from posefilter.filters.propagate import Chain, Gaussian, HalfTurns, Identity, LearnedDisplacement
+from posefilter.filters.propagate import (
+    AxisTurns,
+    Chain,
+    Gaussian,
+    HalfTurns,
+    Identity,
+    LearnedDisplacement,
+)
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between, random_rotation
@@ -100,6 +107,37 @@ def test_half_turns_turn_a_share_about_the_center() -> None:
     assert counts.min() > 0.28 * counts.sum()
     with pytest.raises(UserError, match="pixels"):
         HalfTurns(0.3)(torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator())
+
+
+def test_axis_turns_are_about_the_axes_of_the_box() -> None:
+    askew = torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])  # axes in rows
+    space = PoseSpace(tuple(CENTER.tolist()), POSES.radius, axes=tuple(map(tuple, askew.tolist())))
+    poses = some_poses(2, 4000)
+    still = torch.zeros(2, 4000, 6)
+
+    def turn(share: float, any_angle: float) -> tuple[torch.Tensor, torch.Tensor]:
+        kernel = AxisTurns(share, any_angle)
+        moved = kernel(poses, still, step(0.1), space, Generator().manual_seed(0))
+        assert is_rigid(moved, 1e-4)
+        torch.testing.assert_close(
+            origin_of(moved, CENTER), origin_of(poses, CENTER), atol=1e-5, rtol=0
+        )
+        relative = rotation_of(poses).mT @ rotation_of(moved)
+        return relative, angle_between(rotation_of(moved), rotation_of(poses))
+
+    relative, angle = turn(0.3, 0.0)
+    turned = angle > 1
+    assert float(turned.float().mean()) == pytest.approx(0.3, abs=0.02)
+    torch.testing.assert_close(
+        angle[turned], torch.full_like(angle[turned], math.pi), atol=2e-3, rtol=0
+    )
+    # in the frame of the box, a half turn about an axis flips the signs of the other two
+    signs = (askew @ relative[turned] @ askew.T).round().abs()
+    torch.testing.assert_close(signs, torch.eye(3).expand_as(signs))
+    _, angle = turn(1.0, 1.0)  # angles are uniform
+    assert angle.mean() == pytest.approx(math.pi / 2, abs=0.03)
+    with pytest.raises(UserError, match="pixels"):
+        AxisTurns()(torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator())
 
 
 class Poses:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.random import Generator
 
 from posefilter.data.frames import Sample
+from posefilter.errors import UserError
 
 Draw = Callable[[Generator], Sample]
 Augment = Callable[[Sample, Draw, Generator], Sample]
@@ -38,14 +39,20 @@ class RollAndZoom:
     images.
 
     roll: spread of the usual roll [rad]; any_roll: share of samples with a uniform roll; zoom:
-    range of the factor on the focal length. A draw that would push most of the object out of the
-    frame is given up.
+    range of the factor on the focal length; about: the point of the image that stays, `center` (the
+    principal point) or `object` (the middle of its mask, so that it may be magnified and stay in
+    the frame). A draw that would push most of the object out of the frame is given up.
     """
 
     roll: float = 0.15
     any_roll: float = 0.25
     zoom: tuple[float, float] = (0.75, 1.3)
     keep: float = 0.7
+    about: str = "center"
+
+    def __post_init__(self) -> None:
+        if self.about not in ("center", "object"):
+            raise UserError(f"data.augment: about={self.about}: choose center or object")
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as the turned and zoomed camera sees it."""
@@ -58,6 +65,9 @@ class RollAndZoom:
         K_new = np.diag([zoom, zoom, 1.0]) @ K
         K_new[:2, 2] = K[:2, 2]
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        if self.about == "object" and sample.mask.any():
+            middle = np.append(np.argwhere(sample.mask).mean(0)[::-1], 1.0)  # u, v, 1 [px]
+            K_new[:2, 2] += middle[:2] - (K_new @ turn @ np.linalg.inv(K) @ middle)[:2]
         warp = (K_new @ turn @ np.linalg.inv(K))[:2]
         size = sample.mask.shape[::-1]
         mask = cv2.warpAffine(sample.mask.astype(np.uint8), warp, size, flags=cv2.INTER_NEAREST) > 0

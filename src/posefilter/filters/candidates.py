@@ -14,11 +14,11 @@ from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.filters.initialize import draw_from_depth
-from posefilter.filters.propagate import half_turns
 from posefilter.geometry.pose import invert, origin_of, pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.types import Batch, ObjectModel
+from posefilter.protocols import Propagate
+from posefilter.types import Batch, ObjectModel, Step
 
 
 def sample_from_depth(
@@ -57,12 +57,13 @@ def sample_around_truth(
     each: int,
     sigma: Sequence[float],
     generator: Generator,
+    turns: Propagate,
 ) -> Tensor:
     """Draw the candidates that need the truth.
 
     The truth itself comes first. Then follow, `each` of them unless stated otherwise: perturbations
     of the truth at every scale; poses from depth on the object; poses from depth anywhere; random
-    rotations near the true center (`each // 2`); slightly perturbed half turns.
+    rotations near the true center (`each // 2`); turns of the truth, slightly perturbed.
 
     Args:
         batch: Images with their true poses.
@@ -71,6 +72,7 @@ def sample_around_truth(
         each: Candidates of a kind.
         sigma: Lowest and highest noise level [m]; levels are drawn log-uniformly.
         generator: Source of randomness.
+        turns: The kernel that turns the truth, such as half turns of every particle.
 
     Returns:
         Poses (B, 1 + 4 each + each // 2, 4, 4), camera_from_object.
@@ -92,7 +94,9 @@ def sample_around_truth(
         origin_of(shifted, center),
         center,
     )
-    flipped = perturb(half_turns(copies, space, generator), size * 0.3, space, generator)
+    still = copies.new_zeros(B, each, space.dimensions)
+    turned = turns(copies, still, Step(0, 1, size[:, 0]), space, generator)
+    flipped = perturb(turned, size * 0.3, space, generator)
     return torch.cat([truth, nearby, on_object, anywhere, rotated, flipped], dim=1)
 
 

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Propagate, Space
 from posefilter.types import Step
 
@@ -81,6 +82,45 @@ class HalfTurns:
     ) -> Tensor:
         """Return the states, some rotated."""
         return half_turns(state, space, generator, self.share)
+
+
+class AxisTurns:
+    """Rotate a share of the poses about a random axis of the object's smallest box.
+
+    By pi, or by any angle: a move between the modes of what is nearly symmetric, such as the faces
+    of a carton, or a mug whose handle is hidden.
+
+    Args:
+        share: Probability that a particle is rotated.
+        any_angle: Share of the rotations that are by any angle rather than by pi.
+    """
+
+    requires: ClassVar[Capabilities] = ("pose_space",)
+
+    def __init__(self, share: float = 0.1, any_angle: float = 0.5) -> None:
+        self.share, self.any_angle = share, any_angle
+
+    def __call__(
+        self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
+    ) -> Tensor:
+        """Return the states, some rotated.
+
+        Raises:
+            UserError: The particles are not poses.
+        """
+        if not isinstance(space, PoseSpace):
+            raise UserError(
+                "propagate: turns about an axis need particles that are poses; leave them out for a "
+                "method on pixels"
+            )
+        size, device = state.shape[:2], state.device
+        axis = torch.randint(3, size, generator=generator, device=device)
+        moves = torch.rand(size, generator=generator, device=device) < self.share
+        free = torch.rand(size, generator=generator, device=device) < self.any_angle
+        angle = 2 * math.pi * torch.rand(size, generator=generator, device=device)
+        angle = torch.where(free, angle, torch.full_like(angle, math.pi)) * moves
+        turn = state.new_tensor(space.axes)[axis] * angle[..., None]
+        return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
 def half_turns(poses: Tensor, space: Space, generator: Generator, share: float = 1.0) -> Tensor:

@@ -46,12 +46,14 @@ class PoseSpace:
         radius: Radius of its bounding sphere [m].
         dimensions: Width of a tangent vector.
         max_turn: Largest standard deviation of a rotation [rad].
+        axes: The object's axes in its own frame, one a row (of `box_axes`, one a column).
     """
 
     center: tuple[float, float, float]
     radius: float
     dimensions: int = 6
     max_turn: float = 1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
         """Move poses about the object's center.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""

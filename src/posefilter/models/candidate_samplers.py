@@ -13,10 +13,11 @@ from posefilter.filters.candidates import (
     sample_around_truth,
     sample_from_depth,
 )
+from posefilter.filters.propagate import HalfTurns
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Scene
+from posefilter.protocols import Propagate, Scene
 from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
@@ -121,6 +122,8 @@ class CandidatePoses:
             time [m]. Without proposals they start from depth, at the highest level.
         levels: Steps of the persistent particles from there to the lowest level.
         own_level: Fraction of images that are scored at the level of their persistent particles.
+        turns: Kernel that turns the truth, for hard negatives. By default half turns about the
+            axes of the mesh's frame.
     """
 
     provides: ClassVar[Capabilities] = ("candidates",)
@@ -134,6 +137,7 @@ class CandidatePoses:
         start: float = 0.05,
         levels: int = 12,
         own_level: float = 0.5,
+        turns: Propagate | None = None,
     ) -> None:
         self.each, self.proposed, self.sigma, self.own_level = (
             each,
@@ -142,6 +146,7 @@ class CandidatePoses:
             own_level,
         )
         self.start = float(start)
+        self.turns = turns or HalfTurns(1.0)
         self.persistent = (
             PersistentParticles(particles, levels, self.sigma[0]) if particles else None
         )
@@ -154,7 +159,11 @@ class CandidatePoses:
         model = method.model
         low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
-        groups = [sample_around_truth(batch, model, method.space, self.each, self.sigma, generator)]
+        groups = [
+            sample_around_truth(
+                batch, model, method.space, self.each, self.sigma, generator, self.turns
+            )
+        ]
         proposals = "propose_poses" in method.capabilities
         if self.proposed and proposals:
             groups.append(method.propose_poses(scene, self.proposed, generator))

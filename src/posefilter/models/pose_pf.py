@@ -8,6 +8,7 @@ from torchmetrics import MeanMetric
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.geometry.axes import box_axes
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
@@ -94,7 +95,7 @@ class PosePF(PoseEstimator):
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
         x, y, z = self.model.center.tolist()
-        return PoseSpace((x, y, z), self.model.radius)
+        return PoseSpace((x, y, z), self.model.radius, axes=self._axes)
 
     @property
     def latent_width(self) -> int:
@@ -185,6 +186,7 @@ class PosePF(PoseEstimator):
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the proposal network too, and count how often the truth is outscored."""
         super().set_object(model)
+        self._axes = tuple(tuple(axis) for axis in box_axes(model.points).T.tolist())
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
         self.scores["truth_outscored"] = MeanMetric()
