@@ -16,3 +16,13 @@ def test_axes_of_a_box_that_lies_askew() -> None:
         axes = box_axes(torch.cat([points, corners]) @ R.T)
         # the same axes, but for their signs, the shortest side first
         torch.testing.assert_close((R.T @ axes).abs(), torch.eye(3), atol=1e-3, rtol=0)
+
+
+def test_axes_of_a_sheet() -> None:
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(500, 3, generator=generator) * torch.tensor([0.2, 0.0, 0.1])
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3) * torch.tensor([0.2, 0, 0.1])
+    R = random_rotation(1, generator=generator)[0]
+    axes = box_axes(torch.cat([points, corners]) @ R.T)
+    expected = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    torch.testing.assert_close((R.T @ axes).abs(), expected, atol=1e-3, rtol=0)
