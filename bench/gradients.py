@@ -1,7 +1,7 @@
 """How the gradient of a roll-out grows with its length, before any training: a table of
 docs/analysis/failures.md.
 
-    python bench/gradients.py [train.py's settings ...]
+    python bench/gradients.py [--only ABLATION] [train.py's settings ...]   # --only may be repeated
 
 Each row is a method at an ablation; each figure the norm of
 its network's gradient on the first batch of `experiment=memorize`, in units of one step's.
@@ -60,7 +60,7 @@ def gradient(model: str, ablation: str, steps: int, more: Sequence[str]) -> floa
     return float(torch.stack(parts).norm())
 
 
-def table(more: Sequence[str]) -> str:
+def table(more: Sequence[str], shown: Sequence[str] = SHOWN) -> str:
     """Return all rows as Markdown; each is printed to stderr as soon as it is measured."""
     lines = [
         f"| method | ablation | {' | '.join('1 step' if n == 1 else f'{n} steps' for n in STEPS)} "
@@ -68,7 +68,7 @@ def table(more: Sequence[str]) -> str:
         "| --- " * (2 + len(STEPS)) + "|",
     ]
     for model in SIZES:
-        for ablation in SHOWN:
+        for ablation in shown:
             norms = [gradient(model, ablation, steps, more) for steps in STEPS]
             cells = [written(norm / norms[0]) for norm in norms]
             lines.append(f"| {model} | {DESCRIPTIONS[ablation]} | {' | '.join(cells)} |")
@@ -94,9 +94,10 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("more", nargs="*")
+    parser.add_argument("--only", action="append", choices=SHOWN)
     options = parser.parse_args()
     quiet()
-    print(table(options.more))
+    print(table(options.more, options.only or SHOWN))
     return 0
 
 

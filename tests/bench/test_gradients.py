@@ -38,6 +38,23 @@ def test_each_ablation_is_a_row_of_ratios(
     assert all(row.endswith("| 1.0 | 2.0 | 4.0 | 8.0 | 16 | 30 |") for row in rows)
 
 
+def test_single_ablations_can_be_asked_for(
+    gradients, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = []
+    monkeypatch.setattr(gradients, "gradient", lambda *args: asked.append(args) or 1.0)
+    unit = "model.displacement.unit=1"
+    monkeypatch.setattr(
+        sys, "argv", ["gradients.py", unit, "--only", "paper", "--only", "s2_bounded"]
+    )
+    assert gradients.main() == 0
+    assert {(ablation, *more) for _, ablation, _, more in asked} == {
+        ("paper", unit),
+        ("s2_bounded", unit),
+    }
+    assert capsys.readouterr().out.count("| 1.0 |") >= 4
+
+
 @pytest.mark.slow
 def test_a_detached_position_ends_the_growth(gradients, tmp_path: Path) -> None:
     """Through smooth glimpses each step multiplies the gradient; detached, it only adds up."""
