@@ -9,7 +9,8 @@ A table stands between two comments of a page:
 
 `table`, `method`, `variant` and `changed` choose rows; `changed` takes shell patterns, separated by
 `|`. `show` lists the figures, `changed` and `variant` are left out where all rows agree. Runs that
-differ in their seed alone become one row: the mean, and the sample standard deviation over seeds.
+differ in their seed alone become one row: the mean, and the sample standard deviation over seeds;
+with `spread=interval` the 95 % confidence interval of the mean (Student's t) in its place.
 Rows keep the order of the file. A table of more than ten rows is refused. `--check` writes
 nothing, and fails where a page is not up to date.
 """
@@ -24,9 +25,12 @@ from fnmatch import fnmatch
 from pathlib import Path
 from statistics import mean, stdev
 
+from scipy.stats import t as student_t
+
 HOME = Path(__file__).parents[1]
 RUNS = HOME / "docs" / "results" / "runs.csv"
 MOST_ROWS = 10
+INTERVAL = "interval"
 MARK = re.compile(
     r"(?P<mark><!-- runs (?P<words>.*?) -->)\n(?P<body>.*?)(?P<end><!-- end -->)", re.DOTALL
 )
@@ -42,8 +46,9 @@ def parse_mark(words: str) -> dict[str, str]:
     """
     found = re.findall(r"(\w+)=(.*?)(?=\s+\w+=|$)", words.strip())
     settings = {name: value.strip() for name, value in found}
-    known = {"table", "method", "variant", "changed", "show"}
-    if set(settings) - known or not {"table", "show"} <= set(settings):
+    known = {"table", "method", "variant", "changed", "show", "spread"}
+    missing = not {"table", "show"} <= set(settings)
+    if set(settings) - known or missing or settings.get("spread", INTERVAL) != INTERVAL:
         raise ValueError(f"a mark takes {', '.join(sorted(known))}, and not: {words}")
     return settings
 
@@ -61,17 +66,23 @@ def select_runs(rows: Iterable[Row], settings: dict[str, str]) -> list[Row]:
     return [row for row in rows if fits(row)]
 
 
-def format_cell(values: list[float]) -> str:
-    """Return the mean, and the sample standard deviation where there is more than one value."""
+def format_cell(values: list[float], interval: bool = False) -> str:
+    """Return the mean, and the sample standard deviation where there is more than one value; or
+    the 95 % confidence interval of the mean.
+    """
     if not values:
         return "–"
     middle = mean(values)
     digits = 1 if abs(middle) >= 5 else 2
+    if interval and len(values) > 1:
+        n = len(values)
+        half = float(student_t.ppf(0.975, n - 1)) * stdev(values) / n**0.5
+        return f"{middle:.{digits}f} [{middle - half:.{digits}f}, {middle + half:.{digits}f}]"
     spread = f" ± {stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{middle:.{digits}f}{spread}"
 
 
-def make_table(rows: list[Row], show: list[str]) -> str:
+def make_table(rows: list[Row], show: list[str], interval: bool = False) -> str:
     """Return a Markdown table, one row for the runs that differ in their seed alone.
 
     Raises:
@@ -95,7 +106,8 @@ def make_table(rows: list[Row], show: list[str]) -> str:
     }
     for name in show:
         columns[name] = [
-            format_cell([float(run[name]) for run in runs if run[name]]) for runs in groups.values()
+            format_cell([float(run[name]) for run in runs if run[name]], interval)
+            for runs in groups.values()
         ]
     for name in ("method", "variant", "changed"):
         if len(set(columns[name])) == 1 and (len(groups) > 1 or name != "method"):
@@ -110,7 +122,9 @@ def fill_page(text: str, rows: list[Row]) -> str:
     def fill(found: re.Match[str]) -> str:
         try:
             settings = parse_mark(found["words"])
-            table = make_table(select_runs(rows, settings), settings["show"].split("|"))
+            table = make_table(
+                select_runs(rows, settings), settings["show"].split("|"), "spread" in settings
+            )
         except ValueError as error:
             raise ValueError(f"{found['mark']}: {error}") from error
         return f"{found['mark']}\n\n{table}\n\n{found['end']}"

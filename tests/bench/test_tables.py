@@ -35,6 +35,15 @@ def test_seeds_become_one_row_with_their_standard_deviation(tables: ModuleType) 
     assert single.endswith("– |")
 
 
+def test_an_interval_covers_the_mean_as_students_t_says(tables: ModuleType) -> None:
+    rows = [make_row(seed=seed, auc=value) for seed, value in enumerate([10.0, 12.0, 17.0])]
+    page = "<!-- runs table=t show=auc spread=interval -->\n<!-- end -->"
+    # t with two degrees of freedom: 4.303
+    half = 4.303 * stdev([10.0, 12.0, 17.0]) / 3**0.5
+    assert f"| 13.0 [{13 - half:.1f}, {13 + half:.1f}] |" in tables.fill_page(page, rows)
+    assert "| 10.0 |" in tables.fill_page(page, rows[:1])
+
+
 def test_patterns_choose_rows(tables: ModuleType) -> None:
     rows = [
         make_row(f"ablation={name}", auc=1.0) for name in ("c1_a", "c10_b", "pose_c11_c", "m1_d")
@@ -51,6 +60,7 @@ def test_patterns_choose_rows(tables: ModuleType) -> None:
         ("table=t show=auc", "11 rows"),
         ("table=t color=red show=auc", "a mark takes"),
         ("table=t", "a mark takes"),
+        ("table=t show=auc spread=range", "a mark takes"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(tables: ModuleType, mark: str, words: str) -> None:
