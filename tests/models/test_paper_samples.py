@@ -20,7 +20,7 @@ from posefilter.models.image_space import ImageSpace
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
 from posefilter.nets.glimpse import SmoothGlimpse
-from posefilter.nets.heads import SurfacePointSixD
+from posefilter.nets.heads import SurfacePointSixD, Unbounded
 
 
 def taught(method: ImageSpace) -> ImageSpace:
@@ -42,6 +42,12 @@ def learns(method: ImageSpace, part: str) -> bool:
         # as they were drawn
         (lambda: paper(PixelPF, 1), {"latent", "pose"}),
         (lambda: paper(PixelPF, 1, loss=Bce(OnObject())), {"latent", "likelihood"}),
+        # whatever the unit of the displacement, which the paper does not state
+        (lambda: paper(PixelPF, 1, displacement=Unbounded(1)), {"latent", "pose"}),
+        (
+            lambda: paper(PixelPF, 1, loss=Bce(OnObject()), displacement=Unbounded("learned")),
+            {"latent", "likelihood"},
+        ),
         # the place is told, so that the displacement learns what place is best to be told; the pose
         # learns to serve it
         (
@@ -55,7 +61,15 @@ def learns(method: ImageSpace, part: str) -> bool:
             {"latent", "likelihood", "displacement", "pose"},
         ),
     ],
-    ids=["pixel_pf add", "pixel_pf bce", "patch_pf bce", "patch_pf add", "pixel_pf add, smooth"],
+    ids=[
+        "pixel_pf add",
+        "pixel_pf bce",
+        "pixel_pf add, 1 px",
+        "pixel_pf bce, learned",
+        "patch_pf bce",
+        "patch_pf add",
+        "pixel_pf add, smooth",
+    ],
 )
 def test_which_networks_learn(method, learning: set[str]) -> None:
     made = taught(method())
@@ -83,8 +97,9 @@ def test_a_stopped_place_keeps_the_likelihoods_loss_out_of_the_motion() -> None:
         assert learns(method, "latent")
 
 
-def test_the_detectors_likelihood_is_never_taught() -> None:
-    method = taught(paper(CnnPatch, 9))
+@pytest.mark.parametrize("unit", ["half_frame", 1])
+def test_the_detectors_likelihood_is_never_taught(unit: str | float) -> None:
+    method = taught(paper(CnnPatch, 9, displacement=Unbounded(unit)))
     likelihood, u, v = method.net.tell.weight.grad.abs().sum(1)
     assert likelihood == 0
     assert u > 0
