@@ -29,6 +29,8 @@ REFUSED = {
     "predict checkpoint=003_cracker_box rgb=a.png depth=b.png intrinsics=1,1,1,1": "rgb=a.png: no",
     "generate meshes=nowhere": "meshes=nowhere: no such folder",
     "check_data meshes=nowhere": "meshes=nowhere: no such folder",
+    "onboard": "mesh: is missing; name an .obj, .ply or .glb file",
+    "onboard mesh=nowhere.obj": "mesh=nowhere.obj: no such file",
     "report run=nowhere": "run=nowhere: no such folder",
     "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, 003_cracker_box",
     "fly": "fly: there is no such command; choose train, evaluate",

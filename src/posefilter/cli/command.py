@@ -7,11 +7,13 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from hydra.types import RunMode
@@ -176,9 +178,12 @@ def register_resolvers() -> None:
 
 
 def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Job:
-    """Compose a job as the command line would, for tests and tools."""
+    """Compose a job as the command line would, for tests, tools, and commands that run others."""
     register_resolvers()
-    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+    running = GlobalHydra.instance().is_initialized()
+    with (
+        nullcontext() if running else initialize_config_dir(str(conf.resolve()), version_base="1.3")
+    ):
         cfg = compose(name, [*overrides], return_hydra_config=True)
     choices = {str(k): str(v) for k, v in cfg.hydra.runtime.choices.items()}
     OmegaConf.set_struct(cfg, False)

@@ -31,20 +31,30 @@ def export(job: Job) -> None:
     recipe = stripped["recipe"]
     recipe["settings"] = changed(recipe["settings"], changes(job.cfg))
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
-    method_of(stripped)  # raises where it could not be used
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.name}.part")
-    torch.save(stripped, partial)
-    size = partial.stat().st_size / 1e6
-    if size > job.cfg.most_mb:
-        partial.unlink()
-        raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={job.cfg.most_mb}")
-    partial.replace(out)
+    size = write_weights(stripped, out, job.cfg.most_mb)
     following = [
         f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
         f"intrinsics=fx,fy,cx,cy depth_scale=10000"
     ]
     ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
+
+
+def write_weights(stripped: dict[str, Any], out: Path, most_mb: float) -> float:
+    """Write a stripped checkpoint; return its size [MB].
+
+    Raises:
+        UserError: It cannot be used, or is larger than `most_mb`.
+    """
+    method_of(stripped)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{out.name}.part")
+    torch.save(stripped, partial)
+    size = partial.stat().st_size / 1e6
+    if size > most_mb:
+        partial.unlink()
+        raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={most_mb}")
+    partial.replace(out)
+    return size
 
 
 def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dict[str, Any]:

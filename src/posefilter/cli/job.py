@@ -6,7 +6,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from posefilter.errors import UserError
 
@@ -23,6 +23,16 @@ class Job:
     folder: Path  # where its files go
     name: str  # of the command
     swept: bool  # one of several that `-m` started
+
+
+def write_job(job: Job) -> None:
+    """Write a job's settings into its folder, as Hydra does for what is typed."""
+    folder = job.folder / ".hydra"
+    folder.mkdir(parents=True, exist_ok=True)
+    own = {"runtime": {"choices": job.choices}, "overrides": {"task": job.overrides}}
+    OmegaConf.save(job.cfg, folder / "config.yaml")
+    OmegaConf.save(OmegaConf.create(job.overrides), folder / "overrides.yaml")
+    OmegaConf.save(OmegaConf.create({"hydra": own}), folder / "hydra.yaml")
 
 
 def first(*values: Any) -> Any:

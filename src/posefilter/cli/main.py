@@ -13,6 +13,7 @@ COMMANDS = {
     "generate": "render a dataset",
     "check_data": "check a dataset: its meshes drawn over its images",
     "report": "explain a run or a sweep on one page",
+    "onboard": "from a mesh to trained weights and a report",
     "export": "strip a checkpoint to what predicts",
 }
 _USAGE = "usage: posefilter COMMAND [setting=value ...]; posefilter COMMAND --help for its settings"

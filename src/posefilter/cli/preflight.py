@@ -37,6 +37,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
         _check_view(cfg.view)
     if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
         find_weights(cfg.checkpoint)
+    if command == "onboard":
+        _check_mesh(cfg.mesh)
     for key in _NEEDED.get(command, ()):
         if cfg[key] is None:
             raise UserError(
@@ -52,6 +54,14 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if key == "data.root" and _select(cfg, "data.generate") is not None:
             continue  # it is rendered
         raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+
+
+def _check_mesh(mesh: Any) -> None:
+    """Raise UserError where there is no mesh; a name without an ending may be a builtin one's."""
+    if mesh is None:
+        raise UserError("mesh: is missing; name an .obj, .ply or .glb file")
+    if not Path(str(mesh)).is_file() and Path(str(mesh)).suffix:
+        raise UserError(f"mesh={mesh}: no such file")
 
 
 def _check_view(view: Any) -> None:

@@ -1,0 +1,54 @@
+"""How long a step of a training and an image of its test take, measured before it begins."""
+
+import shutil
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from lightning import Callback, LightningModule, Trainer
+
+from posefilter.cli.job import Job
+from posefilter.cli.train import build, rehearse
+
+_STEPS, _SKIPPED = 7, 3  # the first steps fill caches
+
+
+class Speed(NamedTuple):
+    """Of a training on this machine."""
+
+    step: float  # [s]
+    image: float  # of the filter, [s]
+
+
+class _Clock(Callback):
+    """Take the time at the end of each step."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Take it."""
+        self.times.append(time.perf_counter())
+
+
+def measure_speed(job: Job) -> Speed:
+    """Measure a training by some steps that are thrown away, with all that it wrote.
+
+    Args:
+        job: Its trainer writes into a folder that is removed.
+    """
+    cfg = job.cfg.copy()
+    cfg.trainer.max_steps = cfg.trainer.val_check_interval = _STEPS
+    cfg.trainer.limit_val_batches = 0
+    cfg.callbacks, cfg.logger = {}, {}
+    trial = Job(cfg, job.choices, job.overrides, job.folder, job.name, False)
+    try:
+        run, clock = build(trial), _Clock()
+        began = time.perf_counter()
+        rehearse(run.method, run.data)
+        image = time.perf_counter() - began
+        run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
+        run.trainer.fit(run.method, datamodule=run.data)
+    finally:
+        shutil.rmtree(job.folder, ignore_errors=True)
+    return Speed(float(np.median(np.diff(clock.times)[_SKIPPED - 1 :])), image)

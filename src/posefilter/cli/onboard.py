@@ -1,0 +1,300 @@
+"""From a mesh to trained weights and a report, in stages; interrupted and typed again, it goes on."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.cli.build import build_data
+from posefilter.cli.checkpoints import read_checkpoint
+from posefilter.cli.command import compose_job
+from posefilter.cli.console import ended, say, typed
+from posefilter.cli.export import strip, write_weights
+from posefilter.cli.job import Job, write_job
+from posefilter.cli.machine import settle
+from posefilter.cli.measure_speed import Speed, measure_speed
+from posefilter.cli.onboarded_mesh import find_and_draw, read_onboarded, write_meshes
+from posefilter.cli.report import compared
+from posefilter.cli.stages import Stages
+from posefilter.cli.train import build, finish, fit, test
+from posefilter.errors import UserError
+from posefilter.meshes.inspect_mesh import list_concerns
+from posefilter.meshes.mesh import Mesh
+from posefilter.paths import find_conf
+from posefilter.report.diagnostics import format_duration
+from posefilter.report.gather import read_json, read_run
+from posefilter.report.onboarding_page import make_onboarding_page
+
+RECORD = "onboarding.json"
+_FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 40, 200, 2000
+_FEWEST_STEPS, _MOST_STEPS = 100, 8000
+_VALIDATED = 8  # images, once at the end
+_REST = 45.0  # [s] reserved for figures, weights and report
+
+
+class Stage(NamedTuple):
+    """A part of the work."""
+
+    name: str
+    doing: str  # in words
+    settings: tuple[str, ...]  # of the work, which decide its result
+    do: Callable[["Onboarding"], None]
+    costly: bool = False
+
+
+@dataclass
+class Onboarding:
+    """What is asked for, and where it goes."""
+
+    cfg: DictConfig
+    mesh: Mesh
+    out: Path
+    stages: Stages
+
+    @property
+    def data(self) -> Path:
+        """The renders' folder."""
+        return self.out / "data"
+
+    @property
+    def training(self) -> Path:
+        """The training's run folder."""
+        return self.out / "training"
+
+    @property
+    def weights(self) -> Path:
+        """The file that predicts."""
+        return self.out / f"{self.mesh.name}.ckpt"
+
+    @cached_property
+    def frames(self) -> int:
+        """How many frames are rendered."""
+        if self.cfg.frames is not None:
+            return int(self.cfg.frames)
+        wanted = round(_FRAMES_A_MINUTE * self.cfg.budget_minutes)
+        return min(_MOST_FRAMES, max(_FEWEST_FRAMES, wanted))
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """What stages depend on beside settings: the mesh, and the symmetries that are in use."""
+        file = self.out / "meshes" / self.mesh.name / "symmetries.json"
+        parts = (self.mesh.vertices, self.mesh.faces, self.mesh.texture, self.mesh.corner_colors)
+        content = b"".join(np.asarray(part).tobytes() for part in parts if part is not None)
+        own = str(self.cfg.symmetries)
+        if Path(own).is_file():
+            own = Path(own).read_text()
+        return {
+            "mesh": sha256(content).hexdigest()[:16],
+            "symmetries": sha256(own.encode()).hexdigest()[:16],
+            "used": sha256(file.read_bytes()).hexdigest()[:16] if file.is_file() else "",
+        }
+
+    def settings_of(self, stage: Stage) -> dict[str, Any]:
+        """Return all that decides a stage's result."""
+        known = {**self.digests, "frames": self.frames, "name": self.mesh.name}
+        return {
+            key: known[key] if key in known else _plain(self.cfg.get(key)) for key in stage.settings
+        }
+
+    def job(self, folder: Path, *more: str) -> Job:
+        """Return the training, as one of a sweep: begun before, it is gone on with."""
+        quoted = {"data.object": self.mesh.name, "data.root": self.data}
+        quoted |= {"data.meshes": self.out / "meshes"}
+        words = [
+            "model=pose_pf",
+            "data=scenes",
+            "data/augment=camera",
+            *(f"{key}='{value}'" for key, value in quoted.items()),
+            f"data.generate.frames={self.frames}",
+            f"data.generate.workers={self.cfg.workers}",
+            f"data.generate.seed={self.cfg.seed}",
+            "data.split={train: 0.7, val: 0.1, test: 0.2}",
+            f"data.limit_val={_VALIDATED}",
+            f"data.limit_test={self.cfg.test_frames}",
+            f"seed={self.cfg.seed}",
+            f"threads={'null' if self.cfg.threads is None else self.cfg.threads}",
+            f"console={self.cfg.console}",
+        ]
+        if self.cfg.warm_start is not None:
+            words.append(f"warm_start='{self.cfg.warm_start}'")
+        words += [*map(str, self.cfg.settings), *more]
+        composed = compose_job("train", find_conf(), words, folder)
+        return Job(composed.cfg, composed.choices, words, folder, "train", True)
+
+    @cached_property
+    def run(self) -> Any:
+        """The training, built: its steps are known by then."""
+        steps = int(self.stages.values["steps"])
+        words = (f"trainer.max_steps={steps}", f"trainer.val_check_interval={steps}")
+        job = self.job(self.training, *words)
+        write_job(job)
+        return build(job)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """How long the rest will take, as far as it is known [s]."""
+        values, spent = self.stages.values, sum(self.stages.seconds.values())
+        if "seconds_per_step" not in values:
+            known = self.cfg.steps is None
+            return max(0.0, 60 * self.cfg.budget_minutes - spent) if known else None
+        speed = Speed(values["seconds_per_step"], values["seconds_per_image"])
+        training = values["steps"] * speed.step - self.stages.seconds.get("train", 0.0)
+        tested = self.stages.seconds.get("test", 0.0) > 0
+        return max(0.0, training) + (0.0 if tested else self.rest(speed))
+
+    def rest(self, speed: Speed) -> float:
+        """Return how long all that follows the training takes [s]."""
+        return float(speed.image * (_VALIDATED + self.cfg.test_frames) + _REST)
+
+
+def onboard(job: Job) -> None:
+    """Write weights, symmetries, renders, the training's run and a report."""
+    cfg = job.cfg
+    settle(cfg.threads, cfg.seed)
+    check(cfg)
+    mesh = read_onboarded(cfg)
+    out = Path(cfg.out) if cfg.out else Path("outputs") / "onboard" / mesh.name
+    work = Onboarding(cfg, mesh, out, Stages(out / RECORD))
+    for number, stage in enumerate(STAGES, 1):
+        settings = work.settings_of(stage)
+        head = f"[{number}/{len(STAGES)}] {stage.doing}"
+        if work.stages.is_done(stage.name, settings):
+            say(cfg.console, "stage", f"{head}: done before", stage=stage.name, done=True)
+            continue
+        left = work.seconds_left
+        tail = "" if left is None else f"; about {format_duration(left)} left"
+        say(cfg.console, "stage", head + tail, stage=stage.name, done=False, seconds_left=left)
+        work.stages.run(stage.name, settings, partial(stage.do, work), stage.costly)
+    tell(work)
+
+
+def check(cfg: DictConfig) -> None:
+    """Raise UserError where a number cannot be meant."""
+    for key in ("budget_minutes", "steps", "frames", "test_frames", "workers", "mesh_scale"):
+        value = cfg[key]
+        whole = key not in ("budget_minutes", "mesh_scale")
+        if value is None and key not in ("budget_minutes", "test_frames", "workers"):
+            continue
+        good = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+        if not good or not 0 < value < math.inf:
+            raise UserError(f"{key}={value}: must be a positive {'whole ' if whole else ''}number")
+
+
+def store_meshes(work: Onboarding) -> None:
+    """Write the object and what stands beside it; say what may be wrong with the object."""
+    facts = write_meshes(work.mesh, work.cfg, work.out / "meshes")
+    concerns = list_concerns(facts)
+    work.stages.keep(facts=facts._asdict(), concerns=concerns)
+    size = " x ".join(f"{x:.0f}" for x in facts.size_mm)
+    sentence = f"{work.mesh.name}: {size} mm, {facts.faces} triangles"
+    say(work.cfg.console, "mesh", "\n".join([sentence, *concerns]), **facts._asdict())
+
+
+def use_symmetries(work: Onboarding) -> None:
+    """Find the object's symmetries, or take those given; draw them."""
+    told = find_and_draw(work.mesh, str(work.cfg.symmetries), work.cfg.mesh_scale, work.out)
+    work.stages.keep(symmetries=told)
+    picture = work.out / "symmetries.png"
+    sentence = f"{told}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
+    say(work.cfg.console, "symmetries", sentence, found=told, picture=str(picture))
+
+
+def render(work: Onboarding) -> None:
+    """Render what is missing."""
+    build_data(work.job(work.training).cfg.data, work.cfg.console)
+
+
+def train(work: Onboarding) -> None:
+    """Train for as many steps as fit, from where it was interrupted if it was."""
+    values, console = work.stages.values, work.cfg.console
+    if "steps" not in values:
+        speed = measure_speed(work.job(work.out / ".trial"))
+        steps = work.cfg.steps
+        if steps is None:
+            spent = sum(work.stages.seconds.values())
+            room = 60 * work.cfg.budget_minutes - spent - work.rest(speed)
+            steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / speed.step)))
+        work.stages.keep(
+            steps=int(steps), seconds_per_step=speed.step, seconds_per_image=speed.image
+        )
+        duration = format_duration(steps * speed.step)
+        sentence = f"{steps} steps of {speed.step:.2f} s each: {duration}"
+        say(console, "steps", sentence, steps=steps, seconds_per_step=speed.step)
+    work.stages.keep(training=fit(work.run))
+
+
+def evaluate(work: Onboarding) -> None:
+    """Test on held-out renders."""
+    checkpoint = read_checkpoint(work.run.best)
+    training = {**work.stages.values["training"], "tested_step": int(checkpoint["global_step"])}
+    finish(work.run, training, test(work.run, checkpoint))
+
+
+def export(work: Onboarding) -> None:
+    """Write the weights that predict."""
+    checkpoint = read_checkpoint(work.training / "checkpoints" / "best.ckpt")
+    write_weights(strip(checkpoint, points=200, compact=True), work.weights, most_mb=5)
+
+
+def report(work: Onboarding) -> None:
+    """Write the page."""
+    record = read_run(work.training)
+    page = make_onboarding_page(
+        record,
+        compared(record),
+        typed("onboard", mesh=work.cfg.mesh, out=work.out),
+        work.stages.values,
+        work.stages.seconds,
+        work.out / "symmetries.png",
+    )
+    folder = work.out / "report"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.html").write_text(page.render())
+    for name, png in page.files().items():
+        (folder / name).write_bytes(png)
+
+
+def tell(work: Onboarding) -> None:
+    """Say what came of it."""
+    metrics = read_json(work.training / "metrics.json")
+    minutes = {name: s / 60 for name, s in work.stages.seconds.items()}
+    files = {
+        "weights": work.weights,
+        "report": work.out / "report" / "report.html",
+        "symmetries": work.out / "symmetries.png",
+        "training": work.training,
+    }
+    shown = ", ".join(f"{name} {m:.1f}" for name, m in minutes.items())
+    say(work.cfg.console, "minutes", f"minutes: {shown}", minutes=minutes)
+    following = typed("predict", checkpoint=work.weights)
+    told = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
+    ended(
+        work.cfg.console,
+        "onboarded",
+        files,
+        [f"{following} rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"],
+        object=work.mesh.name,
+        **told,
+    )
+
+
+def _plain(value: Any) -> Any:
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+
+
+_TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "settings", "seed")
+STAGES = (
+    Stage("mesh", "checking the mesh", ("mesh", "name", "clutter"), store_meshes),
+    Stage("symmetries", "finding symmetries", ("mesh", "symmetries"), use_symmetries),
+    Stage("render", "rendering", ("mesh", "name", "clutter", "seed", "frames"), render, True),
+    Stage("train", "training", ("mesh", *_TRAINED), train, True),
+    Stage("test", "testing on held-out renders", ("mesh", *_TRAINED, "test_frames"), evaluate),
+    Stage("export", "writing the weights", ("mesh", *_TRAINED), export),
+    Stage("report", "writing the report", ("mesh", *_TRAINED, "test_frames"), report),
+)

@@ -1,0 +1,122 @@
+"""The object that is onboarded: its mesh, what stands beside it, and its symmetries."""
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from omegaconf import DictConfig
+
+from posefilter.errors import UserError
+from posefilter.figures.canvas import save_image
+from posefilter.figures.symmetries import describe_turn, draw_symmetries
+from posefilter.meshes.builtin import catalog
+from posefilter.meshes.files import read_mesh
+from posefilter.meshes.find_symmetries import (
+    describe_symmetries,
+    find_symmetries,
+    make_group,
+    select,
+)
+from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
+from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.store import BUILTIN, MeshStore
+from posefilter.meshes.symmetries import read_symmetries
+from posefilter.meshes.write import write_obj
+
+_UNNAMED = ("textured", "mesh", "model", "google_16k", "meshes", "visual")
+_MOST_CLUTTER = 20
+_STEPS = 36  # that a continuous symmetry is cut into
+
+
+def read_onboarded(cfg: DictConfig) -> Mesh:
+    """Read the mesh that is to be onboarded, in meters.
+
+    Raises:
+        UserError: There is none, its name is no name, or its size is not one of an object.
+    """
+    source = str(cfg.mesh)
+    if Path(source).is_file():
+        scale = 1.0 if cfg.mesh_scale is None else float(cfg.mesh_scale)
+        name = str(cfg.name or name_of(Path(source)))
+        mesh = read_mesh(Path(source), name, scale)
+        if cfg.mesh_scale is None:
+            check_size(inspect_mesh(mesh), source)
+    elif source in catalog.names():
+        mesh = replace(catalog.build(source), name=str(cfg.name or source))
+    else:
+        known = ", ".join(catalog.names())
+        raise UserError(f"mesh={source}: no such file, and no builtin mesh ({known})")
+    if not re.fullmatch(r"\w[\w\-]{0,63}", mesh.name):
+        raise UserError(f"name={mesh.name}: letters, digits, - and _ alone; give name=...")
+    return mesh
+
+
+def name_of(path: Path) -> str:
+    """Return an object's name by its file: `.../035_power_drill/google_16k/textured.obj` is one
+    of 035_power_drill.
+    """
+    parts = [path.stem, *(parent.name for parent in path.absolute().parents)]
+    name = next(part for part in parts if part.lower() not in _UNNAMED)
+    return re.sub(r"[^\w\-]+", "_", name).strip("_") or "object"
+
+
+def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> MeshFacts:
+    """Write the object, and what stands beside it, into a folder of meshes in meters.
+
+    Returns:
+        What is known of the object's mesh.
+    """
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    write_obj(mesh, folder / mesh.name)
+    clutter = str(cfg.clutter)
+    scale = 1.0 if cfg.mesh_scale is None or clutter == BUILTIN else float(cfg.mesh_scale)
+    store = MeshStore(clutter, scale=scale)
+    names = [name for name in store.names() if name != mesh.name]
+    order = np.random.default_rng(cfg.seed).permutation(len(names))[:_MOST_CLUTTER]
+    for index in sorted(order.tolist()):
+        write_obj(store.load(names[index]), folder / names[index])
+    return inspect_mesh(mesh)
+
+
+def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> str:
+    """Write an object's symmetries beside its mesh, and draw them.
+
+    Args:
+        mesh: The object.
+        wanted: `found`, `geometry`, `none`, or a file in the BOP challenge's format.
+        scale: Meters a unit of that file; None: 1.
+        out: The folder that holds `meshes`; gets `symmetries.png`.
+
+    Returns:
+        What they are, in words.
+
+    Raises:
+        UserError: The file is not there or not in the format.
+    """
+    size, turns = diameter(mesh.vertices), find_symmetries(mesh)
+    if wanted in ("found", "geometry"):
+        used = select(turns, texture=wanted == "found")
+        entry = describe_symmetries(used, size)
+        group = make_group(used, size, _STEPS)
+        told = ", ".join(map(describe_turn, used)) or "no symmetries"
+    elif wanted == "none":
+        entry, group, told = {"symmetries_discrete": []}, np.eye(4)[None], "no symmetries"
+    else:
+        if not Path(wanted).is_file():
+            raise UserError(f"symmetries={wanted}: no such file; or choose found, geometry or none")
+        group = read_symmetries(Path(wanted), mesh.name, scale or 1.0, _STEPS)
+        entry = {"symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in group[1:]]}
+        told = f"{len(group)} symmetries of {wanted}"
+    file = out / "meshes" / mesh.name / "symmetries.json"
+    file.write_text(json.dumps(entry, indent=1) + "\n")
+    source = {
+        "found": "found on shape and texture",
+        "geometry": "found on the shape alone",
+        "none": "left out by symmetries=none",
+    }.get(wanted, f"of {Path(wanted).name}")
+    save_image(draw_symmetries(mesh, turns, group, source), out / "symmetries.png")
+    return told

@@ -1,0 +1,105 @@
+"""Work in stages that is gone on with where it was interrupted: what is done is kept in a file."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from posefilter.cli.results import write_json
+from posefilter.errors import UserError
+
+
+class Stages:
+    """Which stages are done, with what settings, and how long each took.
+
+    Args:
+        file: Where it is kept, as JSON.
+
+    Raises:
+        UserError: The file is there and is no such record.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.content: dict[str, Any] = {"stages": {}, "values": {}}
+        if file.is_file():
+            try:
+                found = json.loads(file.read_text())
+                self.content = {"stages": dict(found["stages"]), "values": dict(found["values"])}
+            except (OSError, ValueError, TypeError, KeyError) as error:
+                raise UserError(
+                    f"{file}: is no record of an onboarding any more; choose another out="
+                ) from error
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What stages have found out, by name; `keep` writes it."""
+        values: dict[str, Any] = self.content["values"]
+        return values
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """How long each stage took, in all its sittings [s]."""
+        return {name: one["seconds"] for name, one in self.content["stages"].items()}
+
+    def keep(self, **values: Any) -> None:
+        """Write down what a stage has found out."""
+        self.values.update(values)
+        self._write()
+
+    def is_done(self, name: str, settings: Mapping[str, Any]) -> bool:
+        """Tell whether a stage was finished with these settings."""
+        one = self.content["stages"].get(name)
+        return bool(one and one["done"] and one["settings"] == _plain(settings))
+
+    def run(
+        self, name: str, settings: Mapping[str, Any], work: Callable[[], None], costly: bool = False
+    ) -> None:
+        """Do a stage; those that come later are to be done again.
+
+        Args:
+            name: Of the stage.
+            settings: All that decides its result.
+            work: Does it; interrupted, it is called again.
+            costly: Refuse to begin it anew with other settings.
+
+        Raises:
+            UserError: It was begun with other settings, and is costly.
+        """
+        stages = self.content["stages"]
+        before = stages.get(name)
+        same = before is not None and before["settings"] == _plain(settings)
+        if before is not None and costly and not same:
+            other = ", ".join(_differing(before["settings"], _plain(settings)))
+            raise UserError(
+                f"out={self.file.parent}: its stage '{name}' was begun with other settings "
+                f"({other}); choose another out="
+            )
+        names = list(stages)
+        for later in names[names.index(name) + 1 :] if before is not None else ():
+            stages[later]["done"] = False
+        spent = before["seconds"] if same else 0.0
+        stages[name] = {"settings": _plain(settings), "done": False, "seconds": spent}
+        self._write()
+        began = time.perf_counter()
+        try:
+            work()
+            stages[name]["done"] = True
+        finally:
+            stages[name]["seconds"] = spent + time.perf_counter() - began
+            self._write()
+
+    def _write(self) -> None:
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(self.file, self.content)
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings as a JSON file gives them back."""
+    plain: dict[str, Any] = json.loads(json.dumps(dict(settings), default=str))
+    return plain
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    return sorted(key for key in {*a, *b} if a.get(key) != b.get(key))

@@ -1,0 +1,109 @@
+"""Look at a mesh before hours are spent on it: its size, its texture, whether it is closed."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh, diameter, face_areas
+
+# [m] across: what is larger or smaller is likely in another unit than meters
+LARGEST, SMALLEST = 2.0, 0.01
+_UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254}
+_COARSE = 0.5  # [px / mm] of texture
+_OPEN = 0.01  # share of edges that belong to one face
+
+
+class MeshFacts(NamedTuple):
+    """What is known of a mesh.
+
+    Attributes:
+        diameter_mm: Largest distance between two points.
+        size_mm: Of the box along the file's axes.
+        faces: Number of triangles.
+        open_edges: Share of the edges that do not belong to two triangles.
+        volume_cm3: Of a closed surface; negative where its faces look inward.
+        texture_px_per_mm: Of the texture on the surface; 0 without texture.
+        colored: Whether texture or vertices have more than one color.
+    """
+
+    diameter_mm: float
+    size_mm: tuple[float, float, float]
+    faces: int
+    open_edges: float
+    volume_cm3: float
+    texture_px_per_mm: float
+    colored: bool
+
+
+def inspect_mesh(mesh: Mesh) -> MeshFacts:
+    """Measure a mesh."""
+    low, high = mesh.bounds
+    _, weld = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)
+    faces = weld.reshape(-1)[mesh.faces]
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - (low + high) / 2 for i in range(3))
+    volume = float((a * np.cross(b, c)).sum() / 6)
+    resolution = 0.0
+    if mesh.corner_uv is not None and max(mesh.texture.shape[:2]) > 1:
+        size = np.array(mesh.texture.shape[1::-1])
+        u, v = (
+            (mesh.corner_uv[:, i] - mesh.corner_uv[:, 0]).astype(np.float64) * size for i in (1, 2)
+        )
+        pixels = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
+        area = face_areas(mesh.vertices, mesh.faces).sum()
+        resolution = math.sqrt(pixels / max(area, 1e-12)) / 1000
+    printed = resolution > 0 and float(mesh.texture.reshape(-1, 3).std(0).max()) > 2
+    painted = mesh.corner_colors is not None and float(mesh.corner_colors.std()) > 0.01
+    x, y, z = (1000 * (high - low)).tolist()
+    return MeshFacts(
+        1000 * diameter(mesh.vertices),
+        (x, y, z),
+        len(mesh.faces),
+        float((count != 2).mean()),
+        1e6 * volume,
+        resolution,
+        printed or painted,
+    )
+
+
+def check_size(facts: MeshFacts, source: str) -> None:
+    """Raise UserError, naming the unit that would fit, where an object cannot be so large or small.
+
+    Args:
+        facts: Of the mesh as it was read, its file's unit taken as meters.
+        source: The file, for the message.
+    """
+    across = facts.diameter_mm / 1000
+    if SMALLEST <= across <= LARGEST:
+        return
+    fitting = [
+        f"mesh_scale={scale:g} ({unit}: {1000 * across * scale:.3g} mm across)"
+        for unit, scale in _UNITS.items()
+        if SMALLEST <= across * scale <= LARGEST
+    ]
+    advice = f"is it {' or '.join(fitting)}?" if fitting else "is the file damaged?"
+    raise UserError(f"{source}: {across:.3g} m across; {advice} If it is right, give mesh_scale=1")
+
+
+def list_concerns(facts: MeshFacts) -> list[str]:
+    """Return what may spoil renders of a mesh, a sentence each."""
+    out = []
+    if facts.open_edges > _OPEN:
+        share = 100 * facts.open_edges
+        out.append(
+            f"The surface is not closed ({share:.0f} % of its edges belong to one face): renders "
+            "may show its inside."
+        )
+    elif facts.volume_cm3 < 0:
+        out.append("The faces look inward: renders are lit from the wrong side.")
+    if not facts.colored:
+        out.append("It has one color: what is printed on the real object is not learned.")
+    elif 0 < facts.texture_px_per_mm < _COARSE:
+        out.append(
+            f"The texture is coarse ({facts.texture_px_per_mm:.2f} pixels a millimeter): small "
+            "print is not learned."
+        )
+    return out

@@ -1,0 +1,53 @@
+"""Stages: what is done is not done again, what follows a change is, and what is costly is kept."""
+
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli.stages import Stages
+from posefilter.errors import UserError
+
+
+def test_what_follows_a_change_is_done_again(tmp_path: Path) -> None:
+    file, done = tmp_path / "record.json", list[str]()
+    for name in ("look", "render", "train"):
+        Stages(file).run(name, {"size": 1}, lambda name=name: done.append(name))
+    kept = Stages(file)
+    assert all(kept.is_done(name, {"size": 1}) for name in ("look", "render", "train"))
+    assert not kept.is_done("look", {"size": 2})
+    kept.run("look", {"size": 2}, lambda: None)
+    again = Stages(file)
+    assert [again.is_done(name, {"size": 1}) for name in ("render", "train")] == [False, False]
+    assert again.is_done("look", {"size": 2})
+    assert done == ["look", "render", "train"]
+
+
+def test_an_interrupted_stage_is_not_done_and_its_time_counts(tmp_path: Path) -> None:
+    stages = Stages(tmp_path / "record.json")
+
+    def stop() -> None:
+        stages.keep(steps=7)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stages.run("train", {}, stop)
+    spent = stages.seconds["train"]
+    again = Stages(tmp_path / "record.json")
+    assert not again.is_done("train", {})
+    assert again.values == {"steps": 7}
+    again.run("train", {}, lambda: None)
+    assert again.is_done("train", {})
+    assert again.seconds["train"] > spent > 0
+
+
+def test_a_costly_stage_is_not_begun_anew(tmp_path: Path) -> None:
+    stages = Stages(tmp_path / "record.json")
+    stages.run("train", {"steps": 5, "seed": 0}, lambda: None, costly=True)
+    with pytest.raises(UserError, match=r"'train' was begun with other settings \(steps\)"):
+        stages.run("train", {"steps": 6, "seed": 0}, lambda: None, costly=True)
+
+
+def test_a_damaged_record_is_named(tmp_path: Path) -> None:
+    (tmp_path / "record.json").write_text("[]")
+    with pytest.raises(UserError, match=r"record\.json: is no record"):
+        Stages(tmp_path / "record.json")

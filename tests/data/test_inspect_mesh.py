@@ -1,0 +1,62 @@
+"""Meshes written and read again, and what a look at a mesh tells."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.errors import UserError
+from posefilter.meshes.builtin import catalog
+from posefilter.meshes.files import read_mesh
+from posefilter.meshes.inspect_mesh import check_size, inspect_mesh, list_concerns
+from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface_points
+from posefilter.meshes.write import write_obj
+
+
+@pytest.fixture(scope="module")
+def brick() -> Mesh:
+    return catalog.build("brick")
+
+
+@pytest.mark.parametrize("kind", ["textured", "painted", "plain"])
+def test_a_written_mesh_is_read_as_it_was(kind: str, brick: Mesh, tmp_path: Path) -> None:
+    mesh = brick
+    if kind != "textured":
+        gray = np.full((1, 1, 3), 255, np.uint8)
+        mesh = replace(mesh, corner_uv=None, texture=gray)
+    if kind == "painted":
+        colors = np.random.default_rng(0).random((len(mesh.faces), 3, 3)).astype(np.float32)
+        mesh = replace(mesh, corner_colors=colors)
+    again = read_mesh(write_obj(mesh, tmp_path / "one"), mesh.name)
+    face, weights = sample_surface(mesh, 500)
+    for read in (surface_points, surface_colors):
+        np.testing.assert_allclose(read(again, face, weights), read(mesh, face, weights), atol=1e-5)
+    np.testing.assert_allclose(again.corner_normals, mesh.corner_normals, atol=1e-6)
+
+
+def test_what_a_closed_printed_box_is(brick: Mesh) -> None:
+    facts = inspect_mesh(brick)
+    width, depth, height = facts.size_mm
+    assert facts.open_edges == 0
+    assert facts.volume_cm3 == pytest.approx(width * depth * height / 1000, rel=1e-6)
+    assert facts.diameter_mm == pytest.approx(np.linalg.norm(facts.size_mm))
+    assert facts.colored
+    assert list_concerns(facts) == []
+
+
+def test_a_hole_a_turned_surface_and_a_lost_texture_are_told(brick: Mesh) -> None:
+    halved = replace(brick, faces=brick.faces[: len(brick.faces) // 2])
+    inward = replace(brick, faces=brick.faces[:, ::-1])
+    plain = replace(brick, corner_uv=None, texture=brick.texture[:1, :1])
+    for mesh, word in ((halved, "not closed"), (inward, "inward"), (plain, "one color")):
+        (concern,) = list_concerns(inspect_mesh(mesh))
+        assert word in concern
+
+
+@pytest.mark.parametrize(("scale", "advice"), [(1000, "0.001"), (100, "0.01")])
+def test_another_unit_is_named(scale: float, advice: str, brick: Mesh) -> None:
+    facts = inspect_mesh(replace(brick, vertices=brick.vertices * scale))
+    with pytest.raises(UserError, match=f"mesh_scale={advice}"):
+        check_size(facts, "drill.obj")
+    check_size(inspect_mesh(brick), "drill.obj")

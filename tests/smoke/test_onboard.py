@@ -1,0 +1,80 @@
+"""Onboarding, the whole way at toy size: it is gone on with where it was interrupted."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli import onboard as command
+from posefilter.cli import run_command
+from posefilter.errors import Stopped
+
+HOME = Path(__file__).parents[2]
+TOY = [
+    "mesh=brick",
+    "frames=30",
+    "steps=4",
+    "test_frames=2",
+    "warm_start=null",
+    "threads=1",
+    "workers=1",
+    "console=json",
+    "settings=['data.image_width=160','data.generate.size=[160,120]','data.batch_size=2',"
+    "'data.batch_size_test=2','data.workers=0','data.limit_train=8','filter.particles=16',"
+    "'filter.first_particles=null','filter.steps=2','data.generate.distractors=[1,2]',"
+    "'data.points=200','logger=none','data.limit_val=2']",
+]
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> list[dict]:
+    return [json.loads(line) for line in capsys.readouterr().out.splitlines() if line[:1] == "{"]
+
+
+def test_it_goes_on_after_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "brick"
+    typed = [*TOY, f"out={out}"]
+
+    def interrupted(run: object) -> dict:
+        raise Stopped(2)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(command, "fit", interrupted)
+        assert run_command("onboard", HOME, typed) == 130
+    record = json.loads((out / "onboarding.json").read_text())
+    assert [name for name, one in record["stages"].items() if one["done"]] == [
+        "mesh",
+        "symmetries",
+        "render",
+    ]
+    frame = next((out / "data").rglob("*.left.json"))
+    written = frame.stat().st_mtime_ns
+    capsys.readouterr()
+
+    assert run_command("onboard", HOME, typed) == 0
+    events = told(capsys)
+    stages = {event["stage"]: event["done"] for event in events if event["event"] == "stage"}
+    assert [name for name, done in stages.items() if done] == ["mesh", "symmetries", "render"]
+    assert frame.stat().st_mtime_ns == written
+    assert events[-1]["event"] == "onboarded"
+    assert all(Path(file).exists() for file in events[-1]["files"].values())
+    metrics = json.loads((out / "training" / "metrics.json").read_text())
+    assert metrics["training"]["steps"] == 4
+    assert metrics["instances"] == 2
+    page = (out / "report" / "report.html").read_text()
+    assert "The mesh" in page
+    assert "Where the time went" in page
+
+    # typed a third time, nothing is left to do; with other settings, nothing is overwritten
+    assert run_command("onboard", HOME, typed) == 0
+    assert all(event["done"] for event in told(capsys) if event["event"] == "stage")
+    assert run_command("onboard", HOME, [*typed, "seed=1"]) == 2
+    assert "'render' was begun with other settings (seed)" in capsys.readouterr().err
+
+    # the weights know the symmetries that were found
+    from posefilter import load
+
+    (model,) = load(out / "brick.ckpt").models
+    assert model.name == "brick"
+    assert len(model.symmetries) == 8
