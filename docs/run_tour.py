@@ -42,11 +42,30 @@ def call(words: Sequence[str], more: Mapping[str, Sequence[str]]) -> int:
     return 0
 
 
+def go_on(words: Sequence[str], home: Path) -> list[str]:
+    """Return what to type for a command where an earlier tour may have been: a training is gone on
+    with, and a finished one left as it is (then it is nothing).
+
+    The other commands go on by themselves, or write the same again.
+    """
+    run = settings(words).get("out", "")
+    if words[1] != "train.py" or not (home / run / "checkpoints").is_dir():
+        return list(words)
+    if (home / run / "metrics.json").is_file():
+        return []
+    return [*words[:2], f"resume={run}"]
+
+
 def main() -> int:
     """Run the whole tour in processes of their own, each command shown before it runs; stop at the
-    first that fails.
+    first that fails. Called again, it goes on with an earlier tour.
     """
-    for words in commands(PAGE.read_text()):
+    for page in commands(PAGE.read_text()):
+        words = go_on(page, HOME)
+        if not words:
+            run = settings(page)["out"]
+            print(f"\n{run}: trained before; delete {run} to train it again", flush=True)
+            continue
         print(f"\n$ {shlex.join(words)}", flush=True)
         if status := subprocess.run([sys.executable, *words[1:]], cwd=HOME, check=False).returncode:
             return status

@@ -68,6 +68,21 @@ def test_a_command_that_fails_at_once_leaves_no_folder(command: str, tmp_path: P
     assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize("typed", [["seed=-1"], ["model=pose_pf", "loss=bce"]])
+def test_what_is_above_the_folder_goes_with_it_where_it_is_ours(
+    typed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_command("train", HOME, typed) == 2
+    assert [*tmp_path.iterdir()] == []
+    (tmp_path / "outputs" / "data").mkdir(parents=True)
+    assert run_command("train", HOME, typed) == 2
+    assert [path.name for path in (tmp_path / "outputs").iterdir()] == ["data"]
+    (tmp_path / "empty").mkdir()  # somebody else's
+    assert run_command("train", HOME, [*typed, f"out={tmp_path / 'empty' / 'run'}"]) == 2
+    assert (tmp_path / "empty").is_dir()
+
+
 def test_a_sweep_of_predictions_stays_in_its_folder_and_tells_what_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

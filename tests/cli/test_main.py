@@ -73,6 +73,37 @@ def test_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == f"posefilter {posefilter.__version__}\n"
 
 
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("posefilter pre", "predict"),
+        ("posefilter train model=pose", "model=pose_pf"),
+        ("posefilter train model/prop", "model/proposals="),
+        ("posefilter predict depth_s", "depth_scale="),
+    ],
+)
+def test_a_shell_completes_what_is_typed(
+    line: str, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COMP_LINE", line)
+    assert main(["-sc", "query=bash"]) == 0
+    assert told in capsys.readouterr().out.split()
+
+
+def test_bash_completes_a_script(tmp_path: Path) -> None:
+    """As docs/architecture.md says, with the function that Hydra writes for it."""
+    program = (
+        f"cd {HOME}; PATH={Path(sys.executable).parent}:$PATH\n"
+        'eval "$(python train.py -sc install=bash)"\n'
+        'COMP_LINE="python train.py model=pose"; COMP_POINT=${#COMP_LINE}; COMP_CWORD=2\n'
+        'hydra_bash_completion; echo "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(
+        ["bash", "-c", program], env=OWN, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["model=pose_pf"]
+
+
 def test_each_command_has_its_script_and_its_settings() -> None:
     for name in COMMANDS:
         script = (HOME / f"{name}.py").read_text()

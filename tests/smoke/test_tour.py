@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from docs.run_tour import HOME, PAGE, call, commands, settings
+from docs.run_tour import HOME, PAGE, call, commands, go_on, settings
 
 from posefilter.data.splits import split_records
 
@@ -74,6 +74,20 @@ def test_the_tour(
     assert (
         json.loads((tmp_path / "outputs/tour/prediction/pose.json").read_text())["object"] == "duck"
     )
+
+
+def test_a_second_tour_goes_on_with_the_first(tmp_path: Path) -> None:
+    """A run's folder is protected, so that the same command would be refused."""
+    every = commands(PAGE.read_text())
+    assert [go_on(words, tmp_path) for words in every] == every
+    run = tmp_path / "outputs" / "tour" / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    again = [go_on(words, tmp_path) for words in every]
+    assert [a for a, b in zip(again, every, strict=True) if a != b] == [
+        ["python", "train.py", "resume=outputs/tour/run"]
+    ]
+    (run / "metrics.json").write_text("{}")
+    assert [go_on(words, tmp_path) for words in every].count([]) == 1
 
 
 def test_a_command_that_breaks_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from posefilter.cli.job import Job
 from posefilter.errors import Carrier, UserError
 
 FAILED = "failed.json"  # in the folder of a sweep's job
+OUTPUTS = "outputs"  # where commands write unless told otherwise
 _BY_HYDRA = ("config.yaml", "hydra.yaml", "overrides.yaml")
 
 
@@ -55,7 +56,7 @@ def holds_evaluation(folder: Path) -> bool:
 
 def remove_if_empty(folder: Path, command: str) -> None:
     """Remove the folder of a command that has failed at once: nothing is in it but what Hydra wrote,
-    the settings and the command's log.
+    the settings and the command's log. With it go the folders from `outputs` on that are empty then.
     """
     hydra, log = folder / ".hydra", folder / f"{command}.log"
     if not folder.is_dir() or folder.samefile(".") or {*folder.iterdir()} - {hydra, log}:
@@ -67,6 +68,11 @@ def remove_if_empty(folder: Path, command: str) -> None:
     for empty in (hydra, folder):
         if empty.is_dir():
             empty.rmdir()
+    if OUTPUTS in folder.parts:  # these folders are ours; others may be empty on purpose
+        for parent in [one for one in folder.parents if OUTPUTS in one.parts]:
+            if any(parent.iterdir()):
+                return
+            parent.rmdir()
 
 
 def note_failure(job: Job, cause: str) -> None:

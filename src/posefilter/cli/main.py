@@ -1,5 +1,6 @@
 """The console command: `posefilter train ...` does what `python train.py ...` does in a clone."""
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -33,6 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given[0] == "--version":
         print(f"posefilter {version('posefilter')}")
         return 0
+    if given[0] in ("-sc", "--shell_completion"):
+        given = complete(given, os.environ.get("COMP_LINE", ""))
+        if not given:
+            return 0
     name = given[0].removesuffix(".py").replace("-", "_")
     if name not in COMMANDS:
         print(
@@ -43,6 +48,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from posefilter.cli.command import run_command  # Hydra: the list of commands needs none
 
     return run_command(name, arguments=given[1:])
+
+
+def complete(given: Sequence[str], line: str) -> list[str]:
+    """Return the command that completes a line of a shell; print the names of commands, and return
+    nothing, where the line has none yet.
+
+    Args:
+        given: What Hydra's completion calls the program with.
+        line: What was typed so far, such as `posefilter train mod`.
+    """
+    program, *words = line.split() or [""]
+    if not words or (len(words) == 1 and not line.endswith(" ")):
+        print(*(name for name in COMMANDS if name.startswith("".join(words))))
+        return []
+    os.environ["COMP_LINE"] = line.replace(f"{program} {words[0]}", program, 1)
+    return [words[0], *given]
 
 
 if __name__ == "__main__":
