@@ -5,7 +5,7 @@ import warnings
 
 import torch
 from lightning import Callback, Trainer
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.tensorboard_layout import TensorBoardLayout
@@ -70,6 +70,9 @@ def build_trainer(job: Job) -> Trainer:
     loggers: list[Logger] = [
         made for made in (instantiate(cfg.logger, "logger") or {}).values() if made
     ]
+    for logger in loggers:
+        if not isinstance(logger, TensorBoardLogger):  # which TensorBoardLayout tells
+            logger.log_hyperparams(comparable(job))
     return make_trainer(cfg.trainer, callbacks, loggers)
 
 

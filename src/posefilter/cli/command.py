@@ -48,6 +48,7 @@ from posefilter.paths import find_conf
 Work = Callable[[Job], Any]
 EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
 _FAILED = (FloatingPointError, ProblemsFound)  # nothing is wrong with the command line
+_EXTRA = ("optuna", "submitit_local", "submitit_slurm")  # choices that packages of others bring
 _MULTIRUN = ("-m", "--multirun")
 
 
@@ -217,6 +218,8 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         and error.missing_cfg_file
     ):
         group, _, choice = error.missing_cfg_file.rpartition("/")
+        if choice in _EXTRA:
+            return f"{group}={choice}: its package is missing; pip install 'posefilter[sweep]'"
         options = sorted(one for one in error.options if not one.startswith("_"))
         return (
             f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "

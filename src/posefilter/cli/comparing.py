@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from posefilter.cli.job import Job
 
 # by whose change nothing else comes out
-HANDS = ("out", "console", "threads", "data.workers", "data.generate.workers")
+HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
 _PLACES = ("data.root", "data.cache_dir")
 _PASSING = (
     "callbacks",

@@ -6,7 +6,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
 
@@ -76,5 +76,8 @@ def check_settings(cfg: DictConfig) -> None:
             not isinstance(value, int) or isinstance(value, bool) or value < 0
         ):
             raise UserError(f"{key}={value}: must be a whole number, 0 or more")
+    tags = cfg.get("tags") or []
+    if not (isinstance(tags, ListConfig | list) and all(isinstance(tag, str) for tag in tags)):
+        raise UserError(f"tags={tags}: must be a list of words, such as tags=[first]")
     if cfg.get("console", "json") not in ("rich", "json"):
         raise UserError(f"console={cfg.console}: choose rich or json")

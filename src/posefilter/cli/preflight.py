@@ -1,5 +1,6 @@
 """Whether the files that a command is told to read are there; torch is not needed for it."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,11 @@ _FOLDERS = {
     "report": ("run", "sweep_folder"),
     "train": ("data.root", "data.meshes"),
 }
+# by the class of a logger: the package that it needs, which is an extra of ours by the same name
+_LOGGERS = {
+    "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
+    "lightning.pytorch.loggers.WandbLogger": "wandb",
+}
 _SHOWN = {"sweep_folder": "sweep"}  # as it is typed
 _NEEDED = {"predict": ("rgb", "depth", "intrinsics")}
 
@@ -35,6 +41,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
     """
     if command == "predict":
         _check_view(cfg.view)
+    if command == "train":
+        _check_loggers(cfg.logger)
     if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
         find_weights(cfg.checkpoint)
     if command == "onboard":
@@ -62,6 +70,17 @@ def _check_mesh(mesh: Any) -> None:
         raise UserError("mesh: is missing; name an .obj, .ply or .glb file")
     if not Path(str(mesh)).is_file() and Path(str(mesh)).suffix:
         raise UserError(f"mesh={mesh}: no such file")
+
+
+def _check_loggers(loggers: Any) -> None:
+    """Raise UserError where a logger's package is not installed."""
+    for name, node in (loggers or {}).items():
+        package = _LOGGERS.get(node.get("_target_", "")) if isinstance(node, DictConfig) else None
+        if package is not None and find_spec(package) is None:
+            raise UserError(
+                f"logger={name}: the package {package} is missing; "
+                f"pip install 'posefilter[{package}]' (in a clone: pip install -e '.[{package}]')"
+            )
 
 
 def _check_view(view: Any) -> None:

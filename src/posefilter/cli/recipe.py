@@ -30,6 +30,7 @@ NOT_KEPT = (
     "debug",
     "console",
     "plugins",
+    "tags",
     "hydra",
 )
 # settings that name files to start a training from: the checkpoint has what came of them

@@ -39,6 +39,7 @@ def record(
         "loss": job.choices.get("loss"),
         "variant": job.choices.get("variant"),
         "seed": job.cfg.get("seed"),
+        "tags": [*(job.cfg.get("tags") or [])],
         "data": data,
         "checkpoint": str(checkpoint) if checkpoint else None,
         "git": git_state(),

@@ -14,6 +14,7 @@ _DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
 _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 # that a run writes to
 _PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
+_SENDING = ("mlflow", "wandb")  # loggers
 _LONGEST, _MOST = 1 << 16, 1000  # of a file of overrides [bytes], and of its lines
 
 
@@ -83,8 +84,8 @@ def check_override(override: str, folder: Path) -> None:
     """Raise UserError where a setting that a run's folder brings is one that only the user may
     type.
 
-    Such are Hydra's own, interpolations that call something, and places outside of the working
-    folder.
+    Such are Hydra's own, interpolations that call something, places outside of the working folder,
+    and loggers that send what a run finds to a server.
     """
     found = _OVERRIDE.fullmatch(override)
     if found is None or not override.isprintable() or re.match(r"hydra\b", found[2]):
@@ -97,6 +98,11 @@ def check_override(override: str, folder: Path) -> None:
         raise UserError(
             f"resume={folder}: its {key} calls a function; if that is right, type "
             f"{key}=... yourself"
+        )
+    if (key == "logger" and value in _SENDING) or key.startswith("logger."):
+        raise UserError(
+            f"resume={folder}: its {key}={value} may send results elsewhere; if it is right, "
+            f"type it as well"
         )
     words = [word for word in re.split(r"[\[\]{},\s'\"]|:(?!//)", value) if word]
     place = key.rpartition(".")[2] in _PLACES and value not in ("", "null")
