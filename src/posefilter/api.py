@@ -11,6 +11,7 @@ from posefilter.cli.components import changes
 from posefilter.cli.job import Job
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
+from posefilter.weights import expand_weights
 
 if TYPE_CHECKING:
     from posefilter.data.module import PoseDataModule
@@ -29,7 +30,8 @@ def load(
 
     Args:
         weights: A checkpoint, a run's folder, or the name of weights that ship with posefilter,
-            such as `003_cracker_box`; or a list of these, one an object.
+            such as `003_cracker_box`; a list of these, one an object; a pattern such as
+            `weights/*.ckpt`; or `all` for those that ship.
         overrides: What to change of the filter, as typed on the command line: such as
             `filter.particles=1000` or `filter/refine=none`.
         device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
@@ -41,8 +43,7 @@ def load(
         UserError: A file is missing or holds no checkpoint, or an override does not fit it.
     """
     wanted = changes(compose(overrides, "predict")) if overrides else {}
-    several = [weights] if isinstance(weights, str | Path) else list(weights)
-    methods = [method_of(read_checkpoint(one), wanted) for one in several]
+    methods = [method_of(read_checkpoint(one), wanted) for one in expand_weights(weights)]
     return Estimator(methods, device)
 
 

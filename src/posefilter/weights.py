@@ -1,6 +1,8 @@
 """Find trained weights by path or by name, and fetch those that are elsewhere."""
 
 import os
+from collections.abc import Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from urllib.parse import urlparse
 
@@ -11,6 +13,7 @@ from posefilter.paths import is_plain_name
 URL = "POSEFILTER_WEIGHTS_URL"
 # where what was fetched is kept; unset: the system's place for caches
 CACHE = "POSEFILTER_CACHE"
+ALL = "all"  # the weights that ship
 _REGISTRY, _TIMEOUT = "registry.txt", 30  # [s]
 _HERE = Path(__file__).parent
 # of an installed wheel, and of a clone
@@ -36,7 +39,7 @@ def find_weights(weights: str | Path | None) -> Path:
     path, name = Path(weights), str(weights)
     if path.exists():
         return path
-    shipped = {file.stem: file for folder in FOLDERS for file in folder.glob("*.ckpt")}
+    shipped = list_shipped()
     if name in shipped:
         return shipped[name]
     url = os.environ.get(URL, "")
@@ -44,6 +47,46 @@ def find_weights(weights: str | Path | None) -> Path:
         return fetch_weights(name, url)
     known = ", ".join(sorted(shipped)) or "none"
     raise UserError(f"checkpoint={weights}: no such file, and no weights of that name ({known})")
+
+
+def list_shipped() -> dict[str, Path]:
+    """Return the weights that ship, by name."""
+    files = [file for folder in FOLDERS for file in folder.glob("*.ckpt")]
+    return {file.stem: file for file in sorted(files, key=lambda file: file.stem)}
+
+
+def is_several(weights: object) -> bool:
+    """Tell whether a setting stands for a list of checkpoints: a sequence, `all`, or a pattern."""
+    if isinstance(weights, str | Path):
+        name = str(weights)
+        return not Path(name).exists() and (name == ALL or any(sign in name for sign in "*?["))
+    return isinstance(weights, Sequence)
+
+
+def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    """Return the checkpoints that a setting stands for, none of them twice.
+
+    Args:
+        weights: A checkpoint as `find_weights` takes it; `all` for those that ship; a pattern of
+            files or of names, such as `weights/00*.ckpt` or `00*`; or a list of such.
+
+    Raises:
+        UserError: There are none.
+    """
+    found: list[str | Path]
+    if not isinstance(weights, str | Path):
+        found = [one for part in weights for one in expand_weights(part)]
+    elif not is_several(weights):
+        found = [weights]
+    elif str(weights) == ALL:
+        found = [*list_shipped().values()]
+    else:
+        path = Path(weights)
+        found = [*sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))]
+        found += [file for name, file in list_shipped().items() if fnmatch(name, str(weights))]
+    if not found:
+        raise UserError(f"checkpoint={weights}: no weights there")
+    return list(dict.fromkeys(found))
 
 
 def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:

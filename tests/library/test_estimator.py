@@ -72,6 +72,38 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert sum(mode["mass"] for mode in told["belief"]["modes"]) == pytest.approx(1)
 
 
+def test_several_checkpoints_give_one_list_and_one_overlay(
+    small: posefilter.Estimator, tmp_path: Path
+) -> None:
+    rgb, depth, K = read_scene()
+    stem = SCENE / sorted(SCENE.glob("*.left.jpg"))[0].name.removesuffix(".left.jpg")
+    typed = [
+        f"checkpoint=[{NAME},025_mug]",
+        f"rgb={stem}.left.jpg",
+        f"depth={stem}.left.depth.png",
+        f"intrinsics={K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}",
+        f"out={tmp_path}",
+        "console=json",
+        *FEW,
+    ]
+    assert run_command("predict", arguments=typed) == 0
+    told = json.loads((tmp_path / "poses.json").read_text())
+    assert [one["object"] for one in told] == [NAME, "025_mug"]
+    alone = small.predict(rgb, depth, K)  # what it is asked beside changes no answer
+    assert told[0]["camera_from_object"] == alone.pose.tolist()
+    assert told[0]["score"] == alone.score
+    for one in told:
+        kept = posefilter.Belief.load(Path(one["belief_file"]))
+        assert kept.object == one["object"]
+    picture = cv2.imread(str(tmp_path / "overlay.png"))
+    height, width = rgb.shape[0] * max(640, rgb.shape[1]) // rgb.shape[1], picture.shape[1]
+    assert picture.shape[0] > height  # the legend
+    plain = cv2.resize(rgb[..., ::-1], (width, height), interpolation=cv2.INTER_CUBIC)
+    assert (np.abs(picture[:height].astype(int) - plain).max(-1) > 60).mean() > 0.002
+    assert run_command("predict", arguments=[*typed, "view=true"]) == 2
+    assert not (tmp_path / "pose.json").exists()
+
+
 def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     result = estimator.predict(rgb, depth, K)

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.weights import FOLDERS, fetch_weights, find_weights
+from posefilter.weights import (
+    FOLDERS,
+    expand_weights,
+    fetch_weights,
+    find_weights,
+    is_several,
+    list_shipped,
+)
 
 CONTENT = np.random.default_rng(0).bytes(300_000)
 SHA = hashlib.sha256(CONTENT).hexdigest()
@@ -137,3 +144,27 @@ def test_only_the_web_is_asked_and_only_for_names(
         with pytest.raises(UserError, match="no such file"):
             find_weights(name)
     assert server.asked == []
+
+
+def test_a_list_a_pattern_and_all_stand_for_several(tmp_path: Path) -> None:
+    shipped = [*list_shipped().values()]
+    assert len(shipped) > 5
+    assert expand_weights("all") == shipped
+    for name in ("b", "a"):
+        (tmp_path / f"{name}.ckpt").touch()
+    files = [tmp_path / "a.ckpt", tmp_path / "b.ckpt"]
+    assert expand_weights(f"{tmp_path}/*.ckpt") == files
+    assert expand_weights([str(tmp_path / "*.ckpt"), files[1]]) == files  # none of them twice
+    assert expand_weights("003*") == [list_shipped()["003_cracker_box"]]
+    assert expand_weights("003_cracker_box") == ["003_cracker_box"]
+    assert [is_several(one) for one in ("all", "00?", ["a"], "a.ckpt", files[0], None)] == [
+        True,
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+    for nothing in (f"{tmp_path}/*.pt", []):
+        with pytest.raises(UserError, match="no weights there"):
+            expand_weights(nothing)

@@ -10,7 +10,7 @@ from posefilter.errors import MISTAKE
 COMMANDS = {
     "train": "train a method and test it",
     "evaluate": "test a checkpoint, or poses from anywhere, on a dataset",
-    "predict": "find the object in one photograph",
+    "predict": "find one object or several in a photograph",
     "generate": "render a dataset",
     "check_data": "check a dataset: its meshes drawn over its images",
     "report": "explain a run or a sweep on one page",

@@ -1,4 +1,4 @@
-"""Find the object in one photograph: its pose, a picture of it, and the belief."""
+"""Find the object, or several, in one photograph: poses, a picture, and beliefs."""
 
 import shlex
 from pathlib import Path
@@ -17,10 +17,12 @@ from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator, Result, Run, collect_results
 from posefilter.figures.canvas import save_image
+from posefilter.figures.overlay import draw_overlays
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
+from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"
 _FRAME = (
@@ -34,9 +36,17 @@ _COVARIANCE = (
 
 
 def predict(job: Job) -> None:
+    """Find one object, or where several checkpoints are given, each of theirs."""
+    settle(job.cfg.threads, job.cfg.seed)
+    if is_several(job.cfg.checkpoint):
+        predict_several(job)
+    else:
+        predict_one(job)
+
+
+def predict_one(job: Job) -> None:
     """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
     cfg, folder = job.cfg, job.folder
-    settle(cfg.threads, cfg.seed)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg))
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
@@ -50,7 +60,7 @@ def predict(job: Job) -> None:
     save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     result.belief.save(folder / "belief.npz")
-    answer = describe(result, job)
+    answer = describe(result, cfg.checkpoint, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
         record_view(run, mesh if mesh is not None else method.model.hull, folder / VIEW)
@@ -73,6 +83,37 @@ def predict(job: Job) -> None:
     )
 
 
+def predict_several(job: Job) -> None:
+    """Write poses.json, a list with an object each, one overlay of all, and each one's belief."""
+    cfg, folder = job.cfg, job.folder
+    checkpoints = expand_weights(cfg.checkpoint)
+    wanted = changes(cfg)
+    estimator = Estimator([method_of(read_checkpoint(one), wanted) for one in checkpoints])
+    rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
+    K = read_intrinsics(cfg.intrinsics)
+    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
+    (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
+    shapes = [store.load(one.object) if store else one.model.hull for one in results]
+    marks = [
+        f"{one.object} ({'implausible' if one.warnings else f'{one.score:.1f}'})" for one in results
+    ]
+    beliefs = folder / "beliefs"
+    beliefs.mkdir(parents=True, exist_ok=True)
+    picture = draw_overlays(rgb, K, [one.pose for one in results], shapes, marks)
+    save_image(picture, folder / "overlay.png")
+    answers = []
+    for number, (checkpoint, result) in enumerate(zip(checkpoints, results, strict=True)):
+        file = beliefs / f"{number:02d}_{result.object}.npz"
+        result.belief.save(file)
+        answers.append({**describe(result, checkpoint, job), "belief_file": str(file)})
+        if cfg.console != JSON:
+            print_result(result)
+    write_json(folder / "poses.json", answers)
+    files = {"poses": "poses.json", "overlay": "overlay.png", "beliefs": "beliefs"}
+    paths = {name: folder / file for name, file in files.items()}
+    ended(cfg.console, "predicted", paths, [], poses=answers)
+
+
 def record_view(run: Run, shape: Any, path: Path) -> None:
     """Write the interactive 3-D view."""
     method = run.method
@@ -87,8 +128,8 @@ def print_result(result: Result) -> None:
         print(f"warning: {warning}")
 
 
-def describe(result: Result, job: Job) -> dict[str, Any]:
-    """Return pose.json."""
+def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]:
+    """Return pose.json, or an entry of poses.json."""
     belief, pose = result.belief, result.pose
     return {
         "object": result.object,
@@ -113,7 +154,7 @@ def describe(result: Result, job: Job) -> dict[str, Any]:
         },
         "seconds": result.seconds,
         "frame": _FRAME,
-        "checkpoint": str(job.cfg.checkpoint),
+        "checkpoint": str(checkpoint),
         "rgb": str(job.cfg.rgb),
         "depth": str(job.cfg.depth),
     }

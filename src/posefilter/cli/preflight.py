@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from posefilter.errors import UserError
-from posefilter.weights import find_weights
+from posefilter.weights import expand_weights, find_weights, is_several
 
 # by command: settings that name a file to be read
 _FILES = {"predict": ("rgb", "depth"), "evaluate": ("estimates",)}
@@ -40,11 +40,13 @@ def check_files(command: str, cfg: DictConfig) -> None:
         UserError: A file or folder is missing; the message names the setting.
     """
     if command == "predict":
-        _check_view(cfg.view)
+        _check_view(cfg.view, is_several(cfg.checkpoint))
     if command == "train":
         _check_loggers(cfg.logger)
     if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
-        find_weights(cfg.checkpoint)
+        several = command == "predict" and is_several(cfg.checkpoint)
+        for one in expand_weights(cfg.checkpoint) if several else [cfg.checkpoint]:
+            find_weights(one)
     if command == "onboard":
         _check_mesh(cfg.mesh)
     for key in _NEEDED.get(command, ()):
@@ -83,10 +85,12 @@ def _check_loggers(loggers: Any) -> None:
             )
 
 
-def _check_view(view: Any) -> None:
+def _check_view(view: Any, several: bool) -> None:
     """Raise UserError where the 3-D view cannot be written."""
     if not isinstance(view, bool):
         raise UserError(f"view={view}: choose true or false")
+    if view and several:
+        raise UserError("view=true: shows one object; give one checkpoint")
     if view:
         from posefilter.figures.recording import check_viewer  # slow to import, rarely asked for
 

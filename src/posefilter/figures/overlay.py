@@ -66,6 +66,45 @@ def draw_overlay(
     )
 
 
+def draw_overlays(
+    rgb: np.ndarray,
+    K: np.ndarray,
+    poses: Sequence[np.ndarray],
+    shapes: Sequence[Shape],
+    labels: Sequence[str],
+    width: int = WIDTH,
+) -> np.ndarray:
+    """Draw where poses put several objects, each in a color of its own, the nearest last.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        K: (3, 3) [px].
+        poses: (4, 4) camera_from_object [m] an object.
+        shapes: A mesh or hull an object.
+        labels: Its name in the legend.
+        width: Of the result at least [px].
+
+    Returns:
+        The picture (h, w, 3) uint8, with the legend below.
+    """
+    view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
+    picture, shown = view.show(rgb), view.camera(K)
+    colors = pick_colors(len(poses))
+    for i in sorted(range(len(poses)), key=lambda i: -poses[i][2, 3]):
+        draw_pose(picture, shown, np.asarray(poses[i], np.float64), shapes[i], colors[i])
+    entries = list(zip(labels, colors, strict=True))
+    rows = [draw_row(picture.shape[1], "", entries[i : i + 2]) for i in range(0, len(entries), 2)]
+    return np.concatenate([picture, *rows])
+
+
+def pick_colors(count: int) -> list[Color]:
+    """Return colors that are told apart, of hues that lie apart."""
+    hues = [(150 + 180 * 0.618034 * i) % 180 for i in range(count)]  # OpenCV's, of 180
+    hsv = np.array([[[hue, 190 if i % 2 else 230, 255] for i, hue in enumerate(hues)]], np.uint8)
+    rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if count else np.zeros((0, 3), np.uint8)
+    return [(int(r), int(g), int(b)) for r, g, b in rgb]
+
+
 def draw_poses(
     rgb: np.ndarray,
     K: np.ndarray,
