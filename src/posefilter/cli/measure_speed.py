@@ -41,6 +41,9 @@ def measure_speed(job: Job) -> Speed:
     cfg.trainer.max_steps = cfg.trainer.val_check_interval = _STEPS
     cfg.trainer.limit_val_batches = 0
     cfg.callbacks, cfg.logger = {}, {}
+    enough = (_STEPS + 1) * cfg.data.batch_size  # frames that are decoded for it
+    cfg.data.limit_train = min(enough, cfg.data.limit_train or enough)
+    cfg.data.limit_val = 1
     trial = Job(cfg, job.choices, job.overrides, job.folder, job.name, False)
     try:
         run, clock = build(trial), _Clock()

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from hashlib import sha256
@@ -21,6 +22,8 @@ from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
 from posefilter.cli.onboarded_mesh import find_and_draw, read_onboarded, write_meshes
 from posefilter.cli.report import compared
+from posefilter.cli.resume import LAST
+from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
 from posefilter.cli.train import build, finish, fit, test
 from posefilter.errors import UserError
@@ -144,9 +147,12 @@ class Onboarding:
             known = self.cfg.steps is None
             return max(0.0, 60 * self.cfg.budget_minutes - spent) if known else None
         speed = Speed(values["seconds_per_step"], values["seconds_per_image"])
-        training = values["steps"] * speed.step - self.stages.seconds.get("train", 0.0)
+        done = 0
+        with suppress(UserError):  # none yet, or a broken one
+            done = step_of(self.training / "checkpoints" / LAST)
         tested = self.stages.seconds.get("test", 0.0) > 0
-        return max(0.0, training) + (0.0 if tested else self.rest(speed))
+        training = speed.step * (values["steps"] - done)
+        return float(training) + (0.0 if tested else self.rest(speed))
 
     def rest(self, speed: Speed) -> float:
         """Return how long all that follows the training takes [s]."""

@@ -1,0 +1,73 @@
+"""The object that is onboarded: its name, its unit, and symmetries that are given."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.cli import onboarded_mesh
+from posefilter.cli.onboarded_mesh import find_and_draw, name_of, read_onboarded, write_meshes
+from posefilter.errors import UserError
+from posefilter.meshes.builtin import catalog
+from posefilter.meshes.store import MeshStore
+from posefilter.meshes.write import write_obj
+
+
+def settings(mesh: Path | str, **more: object) -> DictConfig:
+    given = {"mesh": str(mesh), "name": None, "mesh_scale": None, "clutter": "builtin", "seed": 0}
+    return OmegaConf.create({**given, **more})
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("drill.obj", "drill"),
+        ("my drill (2).ply", "my_drill_2"),
+        ("ycb/035_power_drill/google_16k/textured.obj", "035_power_drill"),
+        ("robot/meshes/gripper/visual/model.glb", "gripper"),
+    ],
+)
+def test_an_object_is_named_by_its_file(path: str, name: str) -> None:
+    assert name_of(Path(path)) == name
+
+
+def test_a_mesh_in_millimeters_is_refused_until_its_unit_is_given(tmp_path: Path) -> None:
+    brick = catalog.build("brick")
+    file = write_obj(replace(brick, vertices=1000 * brick.vertices), tmp_path / "brick")
+    with pytest.raises(UserError, match=r"textured\.obj: 107 m across; is it mesh_scale=0\.001"):
+        read_onboarded(settings(file))
+    mesh = read_onboarded(settings(file, mesh_scale=0.001))
+    assert mesh.name == "brick"
+    np.testing.assert_allclose(mesh.bounds, brick.bounds, atol=1e-6)
+    with pytest.raises(UserError, match=r"mesh=brik: no such file, and no builtin mesh \(banana"):
+        read_onboarded(settings("brik"))
+    with pytest.raises(UserError, match=r"name=\.\./up: letters"):
+        read_onboarded(settings("brick", name="../up"))
+
+
+def test_given_symmetries_beat_those_that_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(onboarded_mesh, "find_symmetries", lambda mesh: [])
+    file = tmp_path / "given.json"
+    half = [-1, 0, 0, 10.0, 0, -1, 0, 20.0, 0, 0, 1, 0, 0, 0, 0, 1]  # about z, in millimeters
+    file.write_text(json.dumps({"symmetries_discrete": [half]}))
+    mesh = catalog.build("brick")
+    cfg = settings("brick", clutter=tmp_path / "few")
+    write_obj(catalog.build("bowl"), tmp_path / "few" / "bowl")
+    write_meshes(mesh, cfg, tmp_path / "meshes")
+    store = tmp_path / "meshes"
+    assert MeshStore(store).names() == ["bowl", "brick"]
+
+    assert find_and_draw(mesh, str(file), 0.001, tmp_path) == f"2 symmetries of {file}"
+    read = MeshStore(store).load("brick").symmetries
+    np.testing.assert_allclose(
+        read[1], np.reshape([*half[:3], 0.01, *half[4:7], 0.02, *half[8:]], (4, 4))
+    )
+    find_and_draw(mesh, "none", None, tmp_path)
+    assert len(MeshStore(store).load("brick").symmetries) == 1
+    with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose found"):
+        find_and_draw(mesh, "nowhere", None, tmp_path)
