@@ -11,7 +11,8 @@ A table stands between two comments of a page:
 `|`. `show` lists the figures, `changed` and `variant` are left out where all rows agree. Runs that
 differ in their seed alone become one row: the mean, and the sample standard deviation over seeds;
 with `spread=interval` the 95 % confidence interval of the mean (Student's t) in its place.
-Rows keep the order of the file. A table of more than ten rows is refused. `--check` writes
+`omit` leaves settings out of the column `changed` by shell patterns: those that a command above the
+table has for all rows. Rows keep the order of the file. A table of more than ten rows is refused. `--check` writes
 nothing, and fails where a page is not up to date.
 """
 
@@ -46,7 +47,7 @@ def parse_mark(words: str) -> dict[str, str]:
     """
     found = re.findall(r"(\w+)=(.*?)(?=\s+\w+=|$)", words.strip())
     settings = {name: value.strip() for name, value in found}
-    known = {"table", "method", "variant", "changed", "show", "spread"}
+    known = {"table", "method", "variant", "changed", "show", "spread", "omit"}
     missing = not {"table", "show"} <= set(settings)
     if set(settings) - known or missing or settings.get("spread", INTERVAL) != INTERVAL:
         raise ValueError(f"a mark takes {', '.join(sorted(known))}, and not: {words}")
@@ -82,7 +83,14 @@ def format_cell(values: list[float], interval: bool = False) -> str:
     return f"{middle:.{digits}f}{spread}"
 
 
-def make_table(rows: list[Row], show: list[str], interval: bool = False) -> str:
+def shorten(changed: str, omit: str) -> str:
+    """Return what was changed without the settings that patterns, separated by `|`, leave out."""
+    patterns = omit.split("|")
+    kept = (w for w in changed.split() if not any(fnmatch(w, pattern) for pattern in patterns))
+    return " ".join(kept)
+
+
+def make_table(rows: list[Row], show: list[str], interval: bool = False, omit: str = "") -> str:
     """Return a Markdown table, one row for the runs that differ in their seed alone.
 
     Raises:
@@ -101,7 +109,7 @@ def make_table(rows: list[Row], show: list[str], interval: bool = False) -> str:
     columns: dict[str, list[str]] = {
         "method": [method for method, _, _ in groups],
         "variant": [variant for _, variant, _ in groups],
-        "changed": [f"`{changed}`" if changed else "" for _, _, changed in groups],
+        "changed": [f"`{short}`" if (short := shorten(c, omit)) else "" for _, _, c in groups],
         "seeds": [str(len(runs)) for runs in groups.values()],
     }
     for name in show:
@@ -123,7 +131,10 @@ def fill_page(text: str, rows: list[Row]) -> str:
         try:
             settings = parse_mark(found["words"])
             table = make_table(
-                select_runs(rows, settings), settings["show"].split("|"), "spread" in settings
+                select_runs(rows, settings),
+                settings["show"].split("|"),
+                "spread" in settings,
+                settings.get("omit", ""),
             )
         except ValueError as error:
             raise ValueError(f"{found['mark']}: {error}") from error

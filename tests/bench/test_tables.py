@@ -44,6 +44,16 @@ def test_an_interval_covers_the_mean_as_students_t_says(tables: ModuleType) -> N
     assert "| 10.0 |" in tables.fill_page(page, rows[:1])
 
 
+def test_settings_of_all_rows_can_be_left_out(tables: ModuleType) -> None:
+    rows = [make_row(f"lr=0 steps=2 unit={unit}", auc=1.0) for unit in ("1", "10")]
+    page = tables.fill_page("<!-- runs table=t show=auc omit=lr=*|steps=* -->\n<!-- end -->", rows)
+    assert [line.split("|")[1].strip() for line in page.splitlines()[4:6]] == [
+        "`unit=1`",
+        "`unit=10`",
+    ]
+    assert "lr=0" not in page.replace("<!-- runs table=t show=auc omit=lr=*|steps=* -->", "")
+
+
 def test_patterns_choose_rows(tables: ModuleType) -> None:
     rows = [
         make_row(f"ablation={name}", auc=1.0) for name in ("c1_a", "c10_b", "pose_c11_c", "m1_d")
