@@ -140,14 +140,14 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
 def list_units() -> list[Line]:
     """Return the runs of the paper's variant over the unit of its displacement: without training,
     then memorizing: the filter with a pose at the size of the ablations (a narrower network, ten
-    steps), detectors with 16 particles and 16 channels, for time, and the paper's 30 steps.
+    steps), detectors with 8 particles and 16 channels, for time, and the paper's 30 steps.
     """
     untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=none"
     lines = [Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2")]
     paper = "experiment=memorize ablation=paper callbacks=none"
     for model in ("patch_pf", "downsized", "cnn_patch"):
         size = (
-            "sweep=ablation_detect filter.particles=16 model.net.width=16"
+            "sweep=ablation_detect filter.particles=8 model.net.width=16"
             if model in DETECTORS
             else "sweep=ablation"
         )

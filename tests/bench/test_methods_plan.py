@@ -13,13 +13,7 @@ import pytest
 from posefilter.cli.command import compose_job
 
 HOME = Path(__file__).parents[2]
-NOT_SHOWN = {
-    "held_out_less",
-    "paper_longer",
-    "patch",
-    "unit",
-    "unit_untrained",
-}  # single runs, in runs.csv alone
+NOT_SHOWN = {"held_out_less", "paper_longer", "patch"}  # single runs, in runs.csv alone
 spec = importlib.util.spec_from_file_location("methods", HOME / "bench" / "methods.py")
 assert spec is not None
 assert spec.loader is not None
