@@ -63,6 +63,7 @@ def test_it_goes_on_after_an_interruption(
     assert metrics["training"]["steps"] == 4
     assert metrics["instances"] == 2
     page = (out / "report" / "report.html").read_text()
+    assert "brick: from a mesh to weights</h1>" in page
     assert "The mesh" in page
     assert "Where the time went" in page
 

@@ -43,10 +43,12 @@ def make_onboarding_page(
         Paragraph([f"In use: {values['symmetries']}."]),
         *show_images([image]),
     ]
-    rows = [[name, format_duration(spent)] for name, spent in seconds.items()]
+    rows = [[name, format_duration(spent)] for name, spent in seconds.items() if spent]
     times = Table(("stage", "time"), rows, numeric=(1,), form="narrow")
     own = [Section("The mesh", mesh), Section("Where the time went", [times])]
-    return replace(page, sections=[*first, *own, *rest.values()])
+    heading = f"{', '.join(run.data.get('objects') or [])}: from a mesh to weights"
+    sections = [*first, *own, *rest.values()]
+    return replace(page, title=heading, heading=heading, sections=sections)
 
 
 def list_facts(facts: Mapping[str, Any]) -> Table:
