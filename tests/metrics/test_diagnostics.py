@@ -68,7 +68,7 @@ def test_a_line_has_all_variance_along_it_and_a_round_cloud_half() -> None:
     g = torch.Generator().manual_seed(0)
     along = torch.randn(1, 50, 1, generator=g)
     line = torch.tensor([400.0, -90.0]) + along * torch.tensor([3.0, -7.0])
-    assert line_share(line).item() == pytest.approx(1.0, abs=1e-6)
+    assert line_share(line).item() == pytest.approx(1.0, abs=1e-5)
     cloud = torch.randn(1, 20000, 2, generator=g)
     assert line_share(cloud).item() == pytest.approx(0.5, abs=0.01)
     # 9 of 10 parts of the variance along an axis, wherever that points and whatever the unit
@@ -88,6 +88,8 @@ def test_particles_in_one_place_are_on_no_line_and_hide_no_other_image() -> None
         [torch.full((3, 2), 7.0), torch.tensor([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])]
     )
     assert line_share(state)[0].isnan()
+    diverged = torch.tensor([[[0.0, 0.0], [torch.inf, 1.0]], [[0.0, 0.0], [1.0, torch.nan]]])
+    assert line_share(diverged).isnan().all()
     mask = torch.ones(2, 1, 20, 20, dtype=torch.bool)
     signs = FilterDiagnostics()
     signs.update(

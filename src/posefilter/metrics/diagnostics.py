@@ -101,16 +101,16 @@ def line_share(state: Tensor) -> Tensor:
     """Return the share of the particles' variance that lies along their first principal axis.
 
     1: all on one line, whatever its direction; 0.5: no direction is preferred. Particles that are
-    uniform in a frame of 4:3 have 0.64. NaN where all particles coincide. All particles count,
-    those off the frame too.
+    uniform in a frame of 4:3 have 0.64. NaN where all particles coincide or are not finite. All
+    particles count, those off the frame too.
 
     (B, N, 2) [px] -> (B,).
     """
-    centered = (state - state.mean(1, keepdim=True)).double()
-    variances = torch.linalg.eigvalsh(centered.mT @ centered)  # ascending
-    total = variances.sum(-1)
-    share = variances[:, -1] / total.clamp_min(1e-12)
-    return torch.where(total > 1e-6, share, torch.nan).to(state.dtype)
+    u, v = (state - state.mean(1, keepdim=True)).unbind(-1)
+    uu, vv, uv = u.square().sum(1), v.square().sum(1), (u * v).sum(1)
+    # the larger eigenvalue of [[uu, uv], [uv, vv]] over their sum; a solver would refuse infinities
+    share = 0.5 + torch.hypot((uu - vv) / 2, uv) / (uu + vv).clamp_min(1e-12)
+    return torch.where(uu + vv > 1e-6, share, torch.nan)
 
 
 class FilterDiagnostics(Metric):
@@ -130,6 +130,7 @@ class FilterDiagnostics(Metric):
 
     full_state_update = False
     shares: list[Tensor]
+    lines: list[Tensor]
     cosine: list[Tensor]
     offsets: list[Tensor]
     scored: list[Tensor]
@@ -137,19 +138,19 @@ class FilterDiagnostics(Metric):
     def __init__(self, most: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.most = most
-        for name in ("shares", "cosine", "offsets", "scored"):
+        for name in ("shares", "lines", "cosine", "offsets", "scored"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, trace: Trace, batch: Batch) -> None:
         """Accumulate the trace of a batch."""
         height, width = batch.rgb.shape[-2:]
-        steps = []
+        steps, lines = [], []
         for particles, output in zip(trace.particles, trace.outputs, strict=True):
             edge, corner = near_edge(particles.state, width, height)
             on = on_object(batch.mask, particles.state)
             off = off_frame(particles.state, width, height)
-            line = line_share(particles.state)
-            steps.append(torch.stack([on, off, edge, corner, distinct(particles.state), line]))
+            steps.append(torch.stack([on, off, edge, corner, distinct(particles.state)]))
+            lines.append(line_share(particles.state))
             self.cosine.append(pairwise_cosine(output.displacement))
             state = particles.state[:, : self.most]
             displacement = output.displacement[:, : self.most]
@@ -158,16 +159,18 @@ class FilterDiagnostics(Metric):
             positive = overlaps_mask(batch.mask, state).float()
             scored = torch.stack([output.log_likelihood[:, : self.most].float(), positive], dim=-1)
             self.scored.append(scored[~is_off_frame(state, width, height)])
-        self.shares.append(torch.stack(steps).permute(2, 0, 1))  # (B, T, 6)
+        self.shares.append(torch.stack(steps).permute(2, 0, 1))  # (B, T, 5)
+        self.lines.append(torch.stack(lines).T)  # (B, T)
 
     def compute(self) -> dict[str, Any]:
         """Return the diagnostics by name."""
-        shares = concat_state(self.shares).nanmean(0)  # only a line_share can be NaN
+        shares = concat_state(self.shares).mean(0)
         offsets, scored = concat_state(self.offsets), concat_state(self.scored)
-        names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct", "line_share")
+        names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct")
         lists = zip(names, shares.T.tolist(), strict=True)
         displacement, true = offsets[:, :2], offsets[:, 2:]
         return dict(lists) | {
+            "line_share": concat_state(self.lines).nanmean(0).tolist(),
             "pairwise_cosine": float(concat_state(self.cosine).nanmean()),
             "offset_r2": float(r2_score(displacement, true)),
             "heading": float(heading(displacement, true)),
