@@ -2,7 +2,7 @@
 
 import torch
 
-from posefilter.models.muon import Muon, orthogonal
+from posefilter.models.muon import Muon, orthogonalize
 
 
 def test_singular_values_come_to_about_one() -> None:
@@ -10,7 +10,7 @@ def test_singular_values_come_to_about_one() -> None:
     for shape in ((2, 40, 90), (2, 90, 40)):
         x = torch.randn(shape, generator=g)
         x[:, 0] *= 30  # one direction drowns the others
-        y = orthogonal(x)
+        y = orthogonalize(x)
         assert y.shape == x.shape
         values = torch.linalg.svdvals(y)
         assert values.min() > 0.4

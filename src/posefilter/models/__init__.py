@@ -1,3 +1,1 @@
-"""The methods: each a LightningModule, short, since base.py holds every hook and the pieces are
-injected.
-"""
+"""The methods: each a short LightningModule, since base.py has every hook."""

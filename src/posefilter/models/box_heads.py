@@ -1,6 +1,4 @@
-"""How a cloud of pixels bounds the object in the image: (left, top, right, bottom), the outer edges
-of pixels.
-"""
+"""Bounding boxes from particles: (left, top, right, bottom) [px], at the outer edges of pixels."""
 
 from typing import ClassVar, Protocol
 
@@ -13,29 +11,38 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 class BoxHead(Protocol):
-    """Bounds the object."""
+    """Compute the object's bounding box."""
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return (B, 4) [px]; reads neither mask nor pose of the batch."""
+        """Return (B, 4) [px]; mask and pose of the batch must not be used."""
         ...
 
 
 def weighted_quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
-    """Return the value below which `share` of the weight lies.
+    """Return the weighted quantile of each column.
 
-    (B, N, D), (B, N) summing to 1 -> (B, D).
+    Args:
+        values: (B, N, D).
+        weights: (B, N), summing to 1.
+        share: Fraction of the weight that lies below the quantile.
+
+    Returns:
+        (B, D), each one of the values.
     """
     order = values.argsort(dim=1)
     mass = weights[..., None].expand_as(values).gather(1, order).cumsum(1)
-    place = (mass < share - 1e-6).sum(1, keepdim=True).clamp(max=values.shape[1] - 1)
-    return values.gather(1, order).gather(1, place)[:, 0]
+    rank = (mass < share - 1e-6).sum(1, keepdim=True).clamp(max=values.shape[1] - 1)
+    return values.gather(1, order).gather(1, rank)[:, 0]
 
 
 class SpreadBox:
-    """Where the particles are: all but a share `beyond` of their weight on each side, and their
-    patches' reach.
+    """The box of the particles' positions, without their outermost weight.
 
-    All that the paper's detector can say: its particles should have moved onto the object.
+    All that the paper's detector predicts is that its particles have moved onto the object.
+
+    Args:
+        size: Side of the patch [px]; the box is enlarged by half of it.
+        beyond: Fraction of the weight that is left out at each side.
     """
 
     def __init__(self, size: int = 1, beyond: float = 0.05) -> None:
@@ -51,12 +58,10 @@ class SpreadBox:
 
 
 class VotedBox:
-    """What the particles say: the weighted median of where each puts the box's sides (its latent;
-    see losses.Sides).
-    """
+    """The weighted median of the sides that the particles predict, each in its latent."""
 
     requires: ClassVar[Capabilities] = ("free_latent",)
-    latent_width = 4  # numbers that it reads
+    latent_width = 4  # left, top, right, bottom
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
@@ -68,7 +73,7 @@ class VotedBox:
 
 
 class PoseBox:
-    """Where the estimated pose puts the object's hull."""
+    """The bounding box of the object's hull at the estimated pose."""
 
     requires: ClassVar[Capabilities] = ("pose",)
 

@@ -4,8 +4,6 @@ from posefilter.models.image_space import ImageSpace
 
 
 class CnnPatch(ImageSpace):
-    """Each particle sees its patch through three convolutions, and tells an offset and a
-    likelihood, but no pose.
-    """
+    """A particle's patch passes three convolutions; the output is an offset and a likelihood."""
 
     position_width = 0

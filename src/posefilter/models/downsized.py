@@ -4,6 +4,4 @@ from posefilter.models.cnn_patch import CnnPatch
 
 
 class Downsized(CnnPatch):
-    """The same on an image 160 pixels wide (`data.image_width`, set by its budgets): a patch covers
-    more of the object.
-    """
+    """The same on an image 160 pixels wide (`data.image_width`): a patch covers more of the object."""

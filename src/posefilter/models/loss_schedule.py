@@ -1,4 +1,4 @@
-"""Losses beside the chosen one, and how their weights change as training proceeds."""
+"""Auxiliary losses, and factors on all losses that change as training proceeds."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -16,29 +16,35 @@ class Auxiliary(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A part of training, and the factor on each loss by name (1 where it is not named) while it
-    lasts.
-    """
+    """A part of training with its own factors on the losses."""
 
-    until: float  # share of the training's steps at which it ends
-    factors: Mapping[str, float] = MappingProxyType({})
+    until: float  # fraction of the training's steps at which it ends
+    factors: Mapping[str, float] = MappingProxyType({})  # by name of the loss; others have 1
 
 
 def check_loss_schedule(loss_schedule: Sequence[Stage], names: Sequence[str]) -> None:
-    """Raise UserError unless the stages follow one another up to 1 and name existing losses."""
+    """Check a schedule.
+
+    Args:
+        loss_schedule: Its stages.
+        names: Names of the losses that there are.
+
+    Raises:
+        UserError: The ends of the stages do not rise to 1, or a loss does not exist.
+    """
     ends = [stage.until for stage in loss_schedule]
     if loss_schedule and (sorted(set(ends)) != ends or ends[-1] != 1):
-        raise UserError(f"model.stages end at {ends}: the ends must rise, and the last be 1")
+        raise UserError(f"model.loss_schedule ends at {ends}: the ends must rise, the last be 1")
     for stage in loss_schedule:
         for name in stage.factors:
             if name not in names:
                 raise UserError(
-                    f"model.stages names the loss {name!r}: there are {', '.join(names)}"
+                    f"model.loss_schedule names the loss {name!r}: there are {', '.join(names)}"
                 )
 
 
 def factors_at(loss_schedule: Sequence[Stage], progress: float) -> Mapping[str, float]:
-    """Return the factors in force at `progress` in [0, 1]; none without stages."""
+    """Return the factors at a fraction `progress` of the training, in [0, 1]; none without stages."""
     for stage in loss_schedule:
         if progress < stage.until:
             return stage.factors

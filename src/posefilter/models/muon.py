@@ -1,6 +1,4 @@
-"""Muon: momentum whose matrices are made orthogonal before each step (Jordan et al. 2024), AdamW
-for the rest.
-"""
+"""Muon: orthogonalized momentum for matrices (Jordan et al. 2024), AdamW for the rest."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -13,16 +11,25 @@ from posefilter.nets.layers import fast_bfloat16
 
 
 class Muon(Optimizer):
-    """Orthogonalized momentum for the matrices and kernels within networks; AdamW for vectors and
-    the layers at either end.
+    """Orthogonalized momentum for hidden matrices and convolution kernels, AdamW for the rest.
 
-    Every direction of a layer is then learned at the same pace, also those that few samples speak
-    for. Kernels count as matrices (outputs, rest). Steps have the size that AdamW's would (0.2 x
-    sqrt of the larger side; Liu et al. 2025).
+    All directions of a layer are learned at the same rate, also those of rare samples. A kernel is
+    a matrix (outputs, rest). Steps have the size of AdamW's: 0.2 x sqrt of the larger side (Liu et
+    al. 2025).
 
-    parameters: (name, parameter) pairs; lr, momentum: of the matrices; adam_lr, betas, eps: of the
-    rest; weight_decay: of both; spared: names of layers that AdamW trains, such as the first and
-    the last of each network.
+    `torch.optim.Muon` is not used, since it refuses parameters that are not 2-D, among them the 4-D
+    kernels of convolutions, and has no AdamW for the other parameters. This one also batches the
+    iterations of matrices of one shape.
+
+    Args:
+        parameters: (name, parameter) pairs.
+        lr: Learning rate of the matrices.
+        momentum: Momentum of the matrices.
+        adam_lr: Learning rate of the other parameters.
+        betas: Decay rates of AdamW.
+        eps: Of AdamW.
+        weight_decay: Of all parameters, decoupled.
+        spared: Names of layers that AdamW trains, such as the first and the last of each network.
     """
 
     def __init__(
@@ -55,7 +62,7 @@ class Muon(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
-        """Take one step."""
+        """Update all parameters; `closure`, if given, computes the loss anew and returns it."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -76,7 +83,7 @@ class Muon(Optimizer):
         for shape, pairs in alike.items():
             size = group["lr"] * 0.2 * max(shape) ** 0.5
             for (p, _), update in zip(
-                pairs, orthogonal(torch.stack([u for _, u in pairs])), strict=True
+                pairs, orthogonalize(torch.stack([u for _, u in pairs])), strict=True
             ):
                 p.mul_(1 - group["lr"] * group["weight_decay"]).sub_(
                     update.reshape(p.shape), alpha=size
@@ -100,12 +107,17 @@ class Muon(Optimizer):
             p.addcdiv_(state["mean"], spread, value=-group["lr"] / (1 - first**t))
 
 
-def orthogonal(matrices: Tensor, steps: int = 5) -> Tensor:
-    """Return matrices of the same singular vectors whose singular values are about 1 (0.7 to 1.2).
-    (M, a, b) -> (M, a, b).
+def orthogonalize(matrices: Tensor, steps: int = 5) -> Tensor:
+    """Orthogonalize matrices approximately: singular values become about 1 (0.7 to 1.2).
 
-    Newton-Schulz iterations of a quintic whose slope at zero is steep (Jordan et al. 2024): in
-    bfloat16 where that is fast.
+    Newton-Schulz iterations of a quintic (Jordan et al. 2024), in bfloat16 where that is fast.
+
+    Args:
+        matrices: (M, a, b).
+        steps: Iterations.
+
+    Returns:
+        (M, a, b), with the same singular vectors.
     """
     x = matrices / matrices.norm(dim=(1, 2), keepdim=True).clamp_min(1e-12)
     tall = x.shape[1] > x.shape[2]

@@ -7,9 +7,7 @@ from posefilter.models.image_space import ImageSpace
 
 
 class PatchPF(ImageSpace):
-    """Each particle sees the flattened patch about it and its own location, and remembers in its
-    latent.
-    """
+    """A particle sees the flattened patch around it and its own position, and keeps a latent."""
 
     requires: ClassVar[Capabilities] = ("pose",)
 

@@ -7,10 +7,9 @@ from posefilter.models.image_space import ImageSpace
 
 
 class PixelPF(ImageSpace):
-    """Each particle sees the one RGB-D pixel it stands on, and remembers what it saw before in its
-    latent.
+    """A particle sees the RGB-D pixel at its position, and keeps a latent.
 
-    It is not told where it stands: the paper concatenates pixel and latent, no more.
+    Its position is no input: the paper concatenates pixel and latent only.
     """
 
     requires: ClassVar[Capabilities] = ("pose",)

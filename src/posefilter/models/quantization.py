@@ -1,9 +1,7 @@
-"""Small weight files: convolution kernels as 8-bit integers with a scale a channel, the rest in
-half precision.
+"""Compact weight files: 8-bit kernels with one scale for each channel, the rest in half precision.
 
-Kernels of trained networks spread so evenly that 8 bits a weight leave an error of about 1 % of a
-weight's usual size, far below what training noise makes; the files are a quarter of their size in
-full precision.
+The error is about 1 % of a typical weight, far below the variation between trainings. A file is a
+quarter of its size in full precision.
 """
 
 from collections.abc import Mapping
@@ -16,8 +14,13 @@ _SUFFIX = "#scale"
 
 
 def pack(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the state with large kernels (3 or more dimensions) in 8 bits and other floats in half
-    precision.
+    """Quantize a state dict: large kernels (3 or more dimensions) in 8 bits, other floats in half.
+
+    Args:
+        state: Tensors by name.
+
+    Returns:
+        The packed tensors, and the scale of each kernel under its name with the suffix `#scale`.
     """
     out: dict[str, Tensor] = {}
     for name, value in state.items():
@@ -34,7 +37,7 @@ def pack(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return a state in full precision; a state that was never packed comes back as it is."""
+    """Return a state dict in full precision; one that was not packed is returned unchanged."""
     out: dict[str, Tensor] = {}
     for name, value in packed.items():
         if name.endswith(_SUFFIX):

@@ -9,8 +9,13 @@ from torch.optim.lr_scheduler import LambdaLR
 def warm_cosine(
     optimizer: Optimizer, steps: int, warm_up: int = 200, floor: float = 0.01
 ) -> LambdaLR:
-    """Rise linearly over `warm_up` steps (at most a tenth of all), then fall as a cosine to `floor`
-    of the peak.
+    """Linear warm-up, then cosine decay.
+
+    Args:
+        optimizer: Its learning rates are the peak.
+        steps: Length of the training.
+        warm_up: Steps of the warm-up, at most a tenth of all.
+        floor: Last learning rate, as a fraction of the peak.
     """
     rise = max(1, min(warm_up, steps // 10))
 

@@ -1,9 +1,8 @@
-"""Render colored depth images of meshes with OpenGL, off screen: optional, needs EGL and the extra
-`moderngl`.
+"""Render color and depth images of meshes with OpenGL, off screen.
 
-OpenGL's pixel (0, 0) has its center at (0.5, 0.5), ours at (0, 0): the principal point moves by
-half a pixel. Image row 0 is drawn at the bottom of the frame buffer, so that nothing need be
-flipped. Shadows are left to Embree's rays.
+Optional: needs EGL and the extra `moderngl`. OpenGL's pixel (0, 0) has its center at (0.5, 0.5),
+ours at (0, 0), so the principal point moves by half a pixel. Image row 0 is drawn at the bottom of
+the frame buffer, so that no image has to be flipped. Shadows are cast with Embree.
 """
 
 import importlib
@@ -15,17 +14,8 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh
-from posefilter.rendering.embree import EmbreeRenderer
-from posefilter.rendering.surfaces import (
-    NEAR,
-    Instance,
-    Lights,
-    Plane,
-    Rendered,
-    Surfaces,
-    pixel_rays,
-    shade,
-)
+from posefilter.rendering.renderer import Renderer
+from posefilter.rendering.surfaces import NEAR, Instance, Plane, Surfaces
 
 _FAR = 100.0  # [m]
 _KEPT = 128  # meshes and textures that stay on the device
@@ -62,18 +52,21 @@ class _Uploaded:
     array: Any
 
 
-class GLRenderer:
-    """Draw triangles with OpenGL.
+class GLRenderer(Renderer):
+    """Render with OpenGL; must not be shared between processes.
 
-    Raises UserError where moderngl or EGL is missing; not to be shared between processes.
+    Raises:
+        UserError: moderngl or EGL is missing.
     """
 
     def __init__(self) -> None:
+        super().__init__()
         try:
             moderngl: Any = importlib.import_module("moderngl")
         except ImportError as error:
             raise UserError(
-                "renderer=opengl: the package moderngl is missing; pip install 'posefilter[moderngl]'"
+                "renderer=opengl: the package moderngl is missing; "
+                "pip install 'posefilter[moderngl]'"
             ) from error
         try:
             self._gl: Any = moderngl.create_context(standalone=True, backend="egl")
@@ -88,22 +81,6 @@ class GLRenderer:
         self._arrays: dict[int, _Uploaded] = {}
         self._textures: dict[int, tuple[np.ndarray, Any]] = {}
         self._targets: dict[tuple[int, int], Any] = {}
-        self._embree = EmbreeRenderer()
-
-    def render(
-        self,
-        instances: Sequence[Instance],
-        K: np.ndarray,
-        height: int,
-        width: int,
-        lights: Lights,
-        planes: Sequence[Plane] = (),
-    ) -> Rendered:
-        """Return the picture of the instances before the planes."""
-        seen = self.surfaces(instances, K, height, width, planes)
-        rays = pixel_rays(K, height, width)
-        shadow = self._embree.shadow(seen, rays, instances, lights) if lights.shadows else None
-        return Rendered(shade(seen, rays, lights, shadow), seen.depth, seen.index, seen.unoccluded)
 
     def surfaces(
         self,
@@ -113,16 +90,16 @@ class GLRenderer:
         width: int,
         planes: Sequence[Plane] = (),
     ) -> Surfaces:
-        """Return what each pixel sees of the instances and planes."""
+        """Return what each pixel sees; see `Renderer.surfaces`."""
         target = self._target(height, width)
         self._program["clip_from_camera"].write(
             _clip_from_camera(K, height, width).T.astype("f4").tobytes()
         )
-        alone = np.zeros(len(instances), np.int64)
+        unoccluded = np.zeros(len(instances), np.int64)
         for i, one in enumerate(instances):
             self._begin(target)
             self._draw(one, i)
-            alone[i] = int((self._read(target, 0, height, width)[..., 3] >= 0).sum())
+            unoccluded[i] = int((self._read(target, 0, height, width)[..., 3] >= 0).sum())
         self._begin(target)
         for i, one in enumerate(instances):
             self._draw(one, i)
@@ -137,11 +114,11 @@ class GLRenderer:
             np.ascontiguousarray(shape[..., :3]),
             np.ascontiguousarray(shape[..., 3]),
             np.where(index < 0, -1, index).astype(np.int32),
-            alone,
+            unoccluded,
         )
 
     def _target(self, height: int, width: int) -> Any:
-        """Return the buffers for pictures of a size."""
+        """Return the frame buffer of an image size."""
         if (height, width) not in self._targets:
             colors = [self._gl.texture((width, height), 4, dtype="f4") for _ in range(2)]
             self._targets[height, width] = self._gl.framebuffer(
@@ -150,7 +127,7 @@ class GLRenderer:
         return self._targets[height, width]
 
     def _begin(self, target: Any) -> None:
-        """Empty the buffers: no surface is index -1 at depth 0."""
+        """Clear the buffers: no surface is index -1 at depth 0."""
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0)
         target.color_attachments[0].write(
@@ -192,7 +169,7 @@ class GLRenderer:
         texture: np.ndarray,
         index: int,
     ) -> None:
-        """Draw one shape, uploading what the device does not have yet."""
+        """Draw one shape; upload what is not on the device yet."""
         key = id(shape)
         if key not in self._arrays:
             while len(self._arrays) >= _KEPT:
@@ -207,7 +184,7 @@ class GLRenderer:
         self._arrays[key].array.render()
 
     def _texture(self, texture: np.ndarray) -> Any:
-        """Return a texture on the device, with its halvings."""
+        """Return a texture on the device, with its mipmap levels."""
         key = id(texture)
         if key not in self._textures:
             while len(self._textures) >= _KEPT:
@@ -224,9 +201,7 @@ class GLRenderer:
 
 
 def _clip_from_camera(K: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return OpenGL's projection for a pinhole camera with pixel centers at integers, image row 0
-    lowest.  -> (4, 4).
-    """
+    """Return OpenGL's projection (4, 4) of a pinhole camera, with image row 0 at the bottom."""
     out = np.zeros((4, 4))
     out[0, :3] = [2 * K[0, 0] / width, 2 * K[0, 1] / width, 2 * (K[0, 2] + 0.5) / width - 1]
     out[1, 1:3] = [2 * K[1, 1] / height, 2 * (K[1, 2] + 0.5) / height - 1]
@@ -236,7 +211,7 @@ def _clip_from_camera(K: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _mesh_vertices(mesh: Mesh) -> np.ndarray:
-    """Return position, normal, texture coordinate and tint of each corner.  -> (3 F, 11)."""
+    """Return position, normal, texture coordinate and color of each corner.  -> (3 F, 11)."""
     count = len(mesh.faces)
     uv = np.zeros((count, 3, 2)) if mesh.corner_uv is None else mesh.corner_uv
     colors = np.ones((count, 3, 3)) if mesh.corner_colors is None else mesh.corner_colors

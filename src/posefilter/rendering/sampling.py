@@ -1,16 +1,22 @@
-"""Read textures at points, at a resolution that does not alias."""
+"""Sample textures without aliasing."""
 
 import cv2
 import numpy as np
 
 _ROW = 4096  # cv2.remap takes no side above 32767, so samples are folded into rows of this length
-_KEPT = 256  # textures whose halvings are remembered
+_KEPT = 256  # textures whose levels stay in memory
 
 
 def sample_texture(texture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Look up colors bilinearly, (0, 0) the texture's bottom left, repeated beyond its edges.
+    """Sample a texture bilinearly; it repeats beyond its edges.
 
-    (h, w, 3) uint8, (P,), (P,) -> (P, 3) float32 in [0, 1].
+    Args:
+        texture: (h, w, 3) uint8.
+        u: (P,) from left to right, 1 for the width.
+        v: (P,) from bottom to top, 1 for the height.
+
+    Returns:
+        Colors (P, 3) float32 in [0, 1].
     """
     h, w = texture.shape[:2]
     n = len(u)
@@ -23,14 +29,14 @@ def sample_texture(texture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndar
 
 
 class MipmapCache:
-    """Halvings of textures, made when first asked for."""
+    """Mipmap levels of textures, computed on first use."""
 
     def __init__(self) -> None:
         # by id; the first level is the texture, so that its id stays its own
         self._levels: dict[int, list[np.ndarray]] = {}
 
     def level(self, texture: np.ndarray, texels_per_pixel: float) -> np.ndarray:
-        """Return the texture halved until one texel is about one pixel."""
+        """Return the level at which one texel is about one pixel."""
         key = id(texture)
         if key not in self._levels:
             while len(self._levels) >= _KEPT:

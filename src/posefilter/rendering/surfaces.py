@@ -1,13 +1,10 @@
-"""What a picture is made of: instances, planes and lights go in; surfaces, then a lit picture come
-out.
+"""The content of an image (instances, planes, lights), what each pixel sees of it, and shading.
 
-Camera axes as everywhere (OpenCV, pixel centers at integers). Rays are left as [x, y, 1], so that
-the distance along a ray *is* the z-depth.
+Camera axes are OpenCV's, with pixel centers at integers. Rays are not normalized but [x, y, 1], so
+that the distance along a ray is the z-depth.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -19,16 +16,16 @@ NEAR = 0.02  # [m]; nothing nearer is drawn
 
 @dataclass(frozen=True, eq=False)
 class Instance:
-    """One mesh in the picture."""
+    """One mesh in an image."""
 
     mesh: Mesh
-    camera_from_object: np.ndarray  # (4, 4) [m]; its linear part may stretch
+    camera_from_object: np.ndarray  # (4, 4) [m]; its linear part may scale
     texture: np.ndarray | None = None  # (h, w, 3) uint8, instead of the mesh's own
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A textured rectangle in its own z = 0."""
+    """A textured rectangle in the plane z = 0 of its own frame."""
 
     camera_from_plane: np.ndarray  # (4, 4) [m], rigid
     half_extent: tuple[float, float]  # [m] along its x and y
@@ -38,7 +35,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Lights:
-    """Ambient light, and lights infinitely far away."""
+    """Ambient light, and directional lights."""
 
     ambient: float = 0.6
     # towards the light, camera axes
@@ -53,7 +50,7 @@ class Lights:
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What each pixel sees, before light."""
+    """What each pixel sees, before shading."""
 
     albedo: np.ndarray  # (H, W, 3) float32 in [0, 1]
     normal: np.ndarray  # (H, W, 3) float32 unit, camera axes, towards the camera
@@ -64,7 +61,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A lit picture."""
+    """A shaded image."""
 
     rgb: np.ndarray  # (H, W, 3) float32, 1 = white, may exceed it
     depth: np.ndarray  # (H, W) float32 [m], 0 = nothing
@@ -72,24 +69,8 @@ class Rendered:
     unoccluded: np.ndarray  # (I,) pixels in the frame that each instance would have were it alone
 
 
-class Renderer(Protocol):
-    """Anything that turns instances into pictures."""
-
-    def render(
-        self,
-        instances: Sequence[Instance],
-        K: np.ndarray,
-        height: int,
-        width: int,
-        lights: Lights,
-        planes: Sequence[Plane] = (),
-    ) -> Rendered:
-        """Return the picture of the instances before the planes."""
-        ...
-
-
 def pixel_rays(K: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the ray [x, y, 1] of every pixel center.  -> (H, W, 3) float32."""
+    """Return the ray [x, y, 1] through each pixel's center.  -> (H, W, 3) float32."""
     rays = np.ones((height, width, 3), np.float32)
     rays[..., 0] = (np.arange(width) - K[0, 2]) / K[0, 0]
     rays[..., 1] = ((np.arange(height) - K[1, 2]) / K[1, 1])[:, None]
@@ -97,7 +78,16 @@ def pixel_rays(K: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the flat indices of the pixels that the convex hull of camera points may cover."""
+    """Find the pixels that the convex hull of points may cover.
+
+    Args:
+        points: (P, 3) in the camera [m].
+        K: (3, 3) camera matrix [px].
+        shape: Height and width of the image [px].
+
+    Returns:
+        Flat indices of the pixels, with a margin.
+    """
     height, width = shape
     if (points[:, 2] < NEAR).all():
         return np.zeros(0, np.int64)
@@ -118,29 +108,37 @@ def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) ->
 
 
 def shade(
-    seen: Surfaces, rays: np.ndarray, lights: Lights, shadow: np.ndarray | None = None
+    surfaces: Surfaces, rays: np.ndarray, lights: Lights, shadow: np.ndarray | None = None
 ) -> np.ndarray:
-    """Light the surfaces: ambient, Lambert, and a Blinn-Phong highlight of the first light.  -> (H,
-    W, 3) float32.
+    """Shade surfaces: ambient, Lambertian, and a Blinn-Phong highlight of the first light.
+
+    Args:
+        surfaces: What each pixel sees.
+        rays: (H, W, 3); see `pixel_rays`.
+        lights: The lights.
+        shadow: (H, W) how much of the first light arrives, in [0, 1]; None: all of it.
+
+    Returns:
+        (H, W, 3) float32, 1 = white; may exceed it.
     """
-    shade = np.full(seen.depth.shape, np.float32(lights.ambient))
+    shade = np.full(surfaces.depth.shape, np.float32(lights.ambient))
     highlight = np.zeros_like(shade)
     for k, (direction, strength) in enumerate(
         zip(lights.directions, lights.strengths, strict=True)
     ):
         L = unit(np.asarray(direction, np.float32))
         arriving = np.float32(strength) if k or shadow is None else np.float32(strength) * shadow
-        shade += arriving * np.maximum(seen.normal @ L, 0)
+        shade += arriving * np.maximum(surfaces.normal @ L, 0)
         if k == 0 and lights.specular > 0:
             half = L - rays / np.linalg.norm(rays, axis=-1, keepdims=True)
             half /= np.linalg.norm(half, axis=-1, keepdims=True) + 1e-6
-            glint = np.maximum((seen.normal * half).sum(-1), 0) ** np.float32(lights.shininess)
+            glint = np.maximum((surfaces.normal * half).sum(-1), 0) ** np.float32(lights.shininess)
             highlight = glint * np.float32(lights.specular) * (1 if shadow is None else shadow)
-    rgb = seen.albedo * shade[..., None] + highlight[..., None]
-    rgb[seen.depth == 0] = lights.background
+    rgb = surfaces.albedo * shade[..., None] + highlight[..., None]
+    rgb[surfaces.depth == 0] = lights.background
     return rgb
 
 
 def unit(v: np.ndarray) -> np.ndarray:
-    """Return a vector at length one."""
+    """Return a vector divided by its length."""
     return v / np.linalg.norm(v)

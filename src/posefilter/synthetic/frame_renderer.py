@@ -12,7 +12,8 @@ import numpy as np
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
-from posefilter.rendering.surfaces import Rendered, Renderer
+from posefilter.rendering.renderer import Renderer
+from posefilter.rendering.surfaces import Rendered
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.scenes import (
     Layout,
