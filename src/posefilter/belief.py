@@ -11,14 +11,11 @@ import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.modes import find_modes
+from posefilter.filters.modes import find_pose_modes
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.pose_statistics import covariance_about
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.limits import MOST_BYTES
-
-# of the diameter: poses nearer than this belong to one mode, as the 3-D view has it
-_APART = 0.1
 
 
 @dataclass(frozen=True)
@@ -106,8 +103,7 @@ class Belief:
         """
         samples, weights = self._tensors
         center = torch.from_numpy(self.center)
-        apart = _APART * self.diameter
-        found = find_modes(samples, weights.log(), self._space, bandwidth=apart / 3, reach=3.0)
+        found = find_pose_modes(samples, weights.log(), self._space, self.diameter)
         modes = []
         for number, (pose, mass) in enumerate(zip(found.states, found.weights, strict=True)):
             own = found.member == number

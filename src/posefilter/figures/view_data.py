@@ -13,7 +13,7 @@ from torch import Tensor
 
 from posefilter.figures.canvas import to_image
 from posefilter.figures.overlay import Shape, get_vertices
-from posefilter.filters.modes import find_modes
+from posefilter.filters.modes import APART, find_pose_modes
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
@@ -22,8 +22,7 @@ from posefilter.protocols import Space
 from posefilter.types import Batch, ObjectModel, Trace
 
 _GREY = 170
-# of the diameter: poses nearer to each other than this are one hypothesis, as ADD < 0.1 d has it
-_APART = 0.1
+
 _LEAST = 0.01  # of the weight: lighter modes are not shown
 _MOST = 8  # modes that are shown, the estimate's not counted
 
@@ -163,10 +162,9 @@ def find_hypotheses(
     (N, 4, 4), (N,), (4, 4).
     """
     space = PoseSpace((*model.center.tolist(),), model.radius)
-    apart = _APART * model.diameter
-    modes = find_modes(poses, log_weights, space, bandwidth=apart / 3, reach=3.0)
+    modes = find_pose_modes(poses, log_weights, space, model.diameter)
     distance, nearest = space.distance(poses, best).min(0)
-    own = int(modes.member[nearest]) if float(distance) <= apart else None
+    own = int(modes.member[nearest]) if float(distance) <= APART * model.diameter else None
     rest = [i for i in range(len(modes.weights)) if i != own]
     shown = [i for i in rest if float(modes.weights[i]) >= _LEAST][:_MOST]
     others = tuple(Hypothesis(modes.states[i].numpy(), float(modes.weights[i])) for i in shown)

@@ -8,6 +8,9 @@ from torch import Tensor
 from posefilter.filters.estimate import kernel_mass
 from posefilter.protocols import Space
 
+# of the diameter: nearer poses belong to one mode, as in the recall of ADD < 0.1 d
+APART = 0.1
+
 
 class Modes(NamedTuple):
     """The modes of one set of particles, by falling weight; every particle belongs to one."""
@@ -51,6 +54,21 @@ def find_modes(
     back = torch.empty_like(member)
     back[order] = torch.argsort(rank)[member]
     return Modes(state[order][root[rank]], mass[rank], back)
+
+
+def find_pose_modes(poses: Tensor, log_weights: Tensor, space: Space, diameter: float) -> Modes:
+    """Find the modes of a belief over poses.
+
+    Two particles belong to one mode where a chain of particles of ever higher density, each within
+    a tenth of the diameter of the next, leads from one to the other.
+
+    Args:
+        poses: (N, 4, 4) [m].
+        log_weights: (N,).
+        space: The space of poses about the object's center.
+        diameter: The object's diameter [m].
+    """
+    return find_modes(poses, log_weights, space, bandwidth=APART * diameter / 3, reach=3.0)
 
 
 def _find_leaders(state: Tensor, space: Space, reach: float, chunk: int = 1 << 20) -> Tensor:
