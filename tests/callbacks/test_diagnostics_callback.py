@@ -81,7 +81,6 @@ def test_methods_on_poses_are_left_alone(tmp_path: Path) -> None:
     )
     assert has_pixel_particles(run)
     assert not has_pixel_particles(poses)
-    assert not has_pixel_particles(None)
     callback = Diagnostics(tmp_path)
     trainer = SimpleNamespace(loggers=[], global_step=0, sanity_checking=False)
     callback.on_test_batch_end(trainer, None, poses, scenes(2), 0)  # type: ignore[arg-type]

@@ -7,11 +7,12 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.drawings import AnimatedScene, animate
 from posefilter.callbacks.gallery import name_frame, select_image
 from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.callbacks.trajectories import trace_lineage
 from posefilter.figures.canvas import AXES, Color, to_image
 from posefilter.figures.curves import draw_shares
@@ -31,7 +32,7 @@ LISTS: dict[str, Color] = {
 NUMBERS = ("pairwise_cosine", "offset_r2", "heading", "auroc")
 
 
-class Diagnostics(Callback):
+class Diagnostics(TraceCallback):
     """Log where the particles are, step by step, after each validation; draw it of a test, with
     trajectories of some images.
 
@@ -47,7 +48,7 @@ class Diagnostics(Callback):
     def __init__(
         self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005
     ) -> None:
-        self.folder = None if folder is None else Path(folder)
+        super().__init__(folder)
         self.images = images
         self.budget = Budget(share)
 
@@ -71,18 +72,12 @@ class Diagnostics(Callback):
                 title = f"Diagnostics\nstep {trainer.global_step}"
                 post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
 
-    def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def on_test_trace(
+        self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int
     ) -> None:
         """Draw and animate the first batch's trajectories."""
-        if batch_idx == 0 and has_pixel_particles(outputs):
-            self.draw(trainer, cast(PoseEstimator, pl_module), outputs, batch)
+        if number == 0 and has_pixel_particles(trace):
+            self.draw(trainer, method, trace, batch)
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw where the particles of the test were: of validations, the last one drawn may be an
@@ -114,9 +109,9 @@ class Diagnostics(Callback):
             post_image(trainer, f"animation_{i}", animation, self.folder, "test")
 
 
-def has_pixel_particles(outputs: Any) -> bool:
-    """Tell whether a step's outputs are a trace of particles that are pixels."""
-    return isinstance(outputs, Trace) and outputs.particles[-1].state.shape[2:] == (2,)
+def has_pixel_particles(trace: Trace) -> bool:
+    """Return whether particles are pixels."""
+    return trace.particles[-1].state.shape[2:] == (2,)
 
 
 def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:

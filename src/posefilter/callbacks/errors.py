@@ -4,12 +4,12 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.gallery import ImageSelection, draw_gallery, find_shape, keep_image
 from posefilter.callbacks.tensorboard import post_image
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.collect import PoseErrors
@@ -18,7 +18,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 
-class ErrorTable(Callback):
+class ErrorTable(TraceCallback):
     """Write `errors.csv`, a row an image of the test, and draw its worst and best images.
 
     Args:
@@ -28,7 +28,7 @@ class ErrorTable(Callback):
     """
 
     def __init__(self, folder: str | Path | None = None, best: int = 6, worst: int = 9) -> None:
-        self.folder = None if folder is None else Path(folder)
+        super().__init__(folder)
         self.counts = {"first": 0, "best": best, "worst": worst}
         self.rows: list[ImageError] = []
         self._selection = ImageSelection(**self.counts)
@@ -37,27 +37,18 @@ class ErrorTable(Callback):
         """Forget an earlier test."""
         self.rows, self._selection = [], ImageSelection(**self.counts)
 
-    def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def on_test_trace(
+        self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int
     ) -> None:
         """Take in one batch."""
-        assert isinstance(pl_module, PoseEstimator)
         records: Sequence[FrameRecord] = trainer.datamodule.records("test")  # type: ignore[attr-defined]
-        rows = measure_batch(
-            pl_module, outputs, batch, [records[i] for i in batch.frame_id.tolist()]
-        )
+        rows = measure_batch(method, trace, batch, [records[i] for i in batch.frame_id.tolist()])
         self.rows += rows
         for i, row in enumerate(rows):
             error = (
                 row.add_mm / 1000 if math.isfinite(row.diameter_mm) else 1 - row.particles_on_object
             )
-            keep = partial(keep_image, outputs, batch, pl_module, i, error, row.image)
+            keep = partial(keep_image, trace, batch, method, i, error, row.image)
             self._selection.offer(error, keep)
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
 from torch import Tensor
 
 from posefilter.callbacks.drawings import DRAWINGS, Occasion
@@ -23,13 +22,14 @@ from posefilter.callbacks.gallery import (
     select_image,
 )
 from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.errors import UserError
 from posefilter.geometry.pose_error import subsample
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 
-class Figures(Callback):
+class Figures(TraceCallback):
     """Draw what happened after each `every`-th validation, into TensorBoard and `folder`.
 
     folder: null for TensorBoard alone; first, best, worst: how many images of each kind; without:
@@ -55,7 +55,7 @@ class Figures(Callback):
                 f"callbacks.figures.without={unknown[0]}: there is no such figure; there are "
                 f"{', '.join(DRAWINGS)}"
             )
-        self.folder = None if folder is None else Path(folder)
+        super().__init__(folder)
         self.every, self.counts = every, {"first": first, "best": best, "worst": worst}
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in without}
         self.budget = Budget(share)
@@ -70,36 +70,23 @@ class Figures(Callback):
         self._selection, self._example, self._points = ImageSelection(**self.counts), None, None
         self.budget.start()
 
-    def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def on_validation_trace(
+        self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch
     ) -> None:
         """Keep the images that may be drawn."""
-        if (
-            trainer.sanity_checking
-            or not isinstance(outputs, Trace)
-            or self._validations % self.every
-        ):
+        if self._validations % self.every:
             return
-        method = _method(pl_module)
         if self._points is None:
             self._points = subsample(method.model.points, 256).to(batch.rgb.device)
-        errors = compute_errors(outputs, batch, method, self._points).tolist()
+        errors = compute_errors(trace, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))
-            self._selection.offer(
-                error, partial(keep_image, outputs, batch, method, i, error, name)
-            )
+            self._selection.offer(error, partial(keep_image, trace, batch, method, i, error, name))
             if self._example is None:
-                one = keep_image(outputs, batch, method, i, error, name)
+                one = keep_image(trace, batch, method, i, error, name)
                 self._example = (
                     one,
-                    select_image(outputs, 0),
+                    select_image(trace, 0),
                     Batch(*(x[:1].clone() for x in batch)),
                 )
 

@@ -3,20 +3,21 @@ log-likelihood.
 """
 
 from pathlib import Path
-from typing import Any
 
 import torch
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.tensorboard import Budget, post_image
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.figures.curves import draw_health
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
+from posefilter.models.base import PoseEstimator
 from posefilter.protocols import Space
-from posefilter.types import Trace
+from posefilter.types import Batch, Trace
 
 
-class FilterHealth(Callback):
+class FilterHealth(TraceCallback):
     """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one
     figure.
 
@@ -28,7 +29,7 @@ class FilterHealth(Callback):
     def __init__(
         self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.005
     ) -> None:
-        self.folder = None if folder is None else Path(folder)
+        super().__init__(folder)
         self.most = most
         self.budget = Budget(share)
         self._sums: dict[str, torch.Tensor] = {}
@@ -39,23 +40,14 @@ class FilterHealth(Callback):
         self._sums, self._images = {}, 0
         self.budget.start()
 
-    def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def on_validation_trace(
+        self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch
     ) -> None:
         """Take in one batch."""
-        if trainer.sanity_checking or not isinstance(outputs, Trace):
-            return
-        space: Any = pl_module.space
-        for name, values in measure_health(outputs, space).items():
+        for name, values in measure_health(trace, method.space).items():
             total = values.sum(0).cpu()
             self._sums[name] = self._sums[name] + total if name in self._sums else total
-        self._images += len(outputs.belief.best)
+        self._images += len(trace.belief.best)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the means."""

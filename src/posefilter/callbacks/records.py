@@ -7,13 +7,15 @@ import math
 from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from lightning import Callback, LightningModule, Trainer
+from lightning import LightningModule, Trainer
 
+from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -45,13 +47,14 @@ class PoseRow(NamedTuple):
     seconds: float  # -1 where unknown, as BOP has it
 
 
-class Records(Callback):
+class Records(TraceCallback):
     """Collect what a test says of each image; `outcomes` is read when the test is over.
 
     beliefs: whether particles are kept too.
     """
 
     def __init__(self, beliefs: bool = True) -> None:
+        super().__init__()
         self.beliefs = beliefs
         self.outcomes: list[Outcome] = []
 
@@ -59,19 +62,13 @@ class Records(Callback):
         """Forget an earlier test."""
         self.outcomes = []
 
-    def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+    def on_test_trace(
+        self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int
     ) -> None:
         """Take in one batch."""
-        times = getattr(pl_module, "seconds_per_image", [])
+        times = method.seconds_per_image
         self.outcomes += collect_outcomes(
-            outputs, batch, times[-1] if times else math.nan, self.beliefs
+            trace, batch, times[-1] if times else math.nan, self.beliefs
         )
 
 
