@@ -1,5 +1,5 @@
-"""Distractors easily taken for the target: its shape in another print, its print on another shape,
-boxes of its color.
+"""Distractors that look like the target: its shape with another texture, its texture on another
+shape, boxes of its color.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,13 @@ from posefilter.synthetic.textures import (
 def make_lookalike(
     target: Mesh, name: str, photos: Sequence[np.ndarray], rng: np.random.Generator
 ) -> Mesh:
-    """Draw a look-alike of the target: itself stretched, recolored or reprinted, or a box, of its
-    color or not.
+    """Draw a look-alike: the target scaled, recolored or with another texture, or a printed box.
+
+    Args:
+        target: The target's mesh.
+        name: Of the new mesh.
+        photos: Textures to crop from, (h, w, 3) uint8.
+        rng: Source of randomness.
     """
     kind = rng.random()
     printed = target.corner_uv is not None and min(target.texture.shape[:2]) >= 16
@@ -37,7 +42,7 @@ def make_lookalike(
 
 
 def stretch(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:
-    """Return a mesh drawn out along its axes, in another texture.  factors: (3,)."""
+    """Return a mesh scaled along its axes by factors (3,), with another texture."""
     normals = mesh.corner_normals / factors
     normals = normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-12)
     return replace(
@@ -84,9 +89,7 @@ def box(name: str, sides: np.ndarray, faces: Sequence[np.ndarray]) -> Mesh:
 
 
 def _clear_stretch(rng: np.random.Generator) -> np.ndarray:
-    """Draw factors that no one would take for the target's own proportions: 20 % off or more on
-    some axis.
-    """
+    """Draw factors (3,) of proportions that clearly differ from the target's on some axis."""
     factors = rng.uniform(0.6, 1.4, 3)
     axis = int(rng.integers(3))
     factors[axis] = rng.uniform(0.55, 0.78) if rng.random() < 0.6 else rng.uniform(1.25, 1.5)

@@ -1,6 +1,4 @@
-"""Find places for objects: the target before the camera, distractors round it, something in front
-of it when asked.
-"""
+"""Place objects: the target before the camera, distractors around it, occluders in front of it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.synthetic.solids import Solid, outline_mask, separated
 
-_STRIDE = 8  # [px] of the masks that foresee who hides whom
+_STRIDE = 8  # [px] of the masks by which occlusion is predicted
 _NEAREST = 0.2  # [m] no object comes nearer to the camera
 _GAP = 0.001  # [m] between objects
 _RIM = 0.03  # [m] how far inside the table's edge the centers of objects stay
@@ -18,37 +16,37 @@ _RIM = 0.03  # [m] how far inside the table's edge the centers of objects stay
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A solid somewhere."""
+    """A solid at a pose."""
 
     solid: Solid
     camera_from_object: np.ndarray  # (4, 4) [m]
 
     @cached_property
     def hull(self) -> np.ndarray:
-        """Return the hull's vertices in the camera.  -> (V, 3) [m]."""
+        """The hull's vertices in the camera, (V, 3) [m]."""
         return self.solid.hull @ self.camera_from_object[:3, :3].T + self.camera_from_object[:3, 3]
 
     @cached_property
     def center(self) -> np.ndarray:
-        """Return the box's center in the camera.  -> (3,) [m]."""
+        """The bounding box's center in the camera, (3,) [m]."""
         return self.camera_from_object[:3, :3] @ self.solid.center + self.camera_from_object[:3, 3]
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera, and what it would roughly see of hulls."""
+    """A camera, and the approximate masks of hulls in it."""
 
     K: np.ndarray
     height: int
     width: int
 
     def ray(self, u: float, v: float) -> np.ndarray:
-        """Return the ray through a point of the frame given in shares of its sides."""
+        """Return the ray (3,) through a point of the frame, in fractions of width and height."""
         x, y = u * self.width - self.K[0, 2], v * self.height - self.K[1, 2]
         return np.array([x / self.K[0, 0], y / self.K[1, 1], 1.0])
 
     def holds(self, one: Placed, largest_truncation: float) -> bool:
-        """Tell whether enough of an object's outline lies in the frame."""
+        """Return whether at most `largest_truncation` of an object's outline is out of the frame."""
         if one.hull[:, 2].min() < _NEAREST:
             return False
         pixels = one.hull[:, :2] / one.hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [
@@ -59,12 +57,15 @@ class View:
         return bool(inside.mean() >= 1 - largest_truncation)
 
     def mask(self, one: Placed) -> np.ndarray:
-        """Return an object's outline, coarsely."""
+        """Return the coarse mask of an object."""
         return outline_mask(one.hull, self.K, self.height, self.width, _STRIDE)
 
     def free(self, placed: list[Placed]) -> tuple[np.ndarray, int]:
-        """Return the coarse mask of the first object that no nearer one covers, and how large it
-        would be alone.
+        """Return the visible part of the first object.
+
+        Returns:
+            Its coarse mask without the pixels that nearer objects cover, and the number of pixels
+            that it would have alone.
         """
         whole = self.mask(placed[0])
         free = whole.copy()
@@ -74,21 +75,21 @@ class View:
         return free, max(int(whole.sum()), 1)
 
     def visible(self, placed: list[Placed]) -> float:
-        """Return the share of the first object's outline in the frame that no nearer one covers."""
+        """Return the visible fraction of the first object, of its part in the frame."""
         free, whole = self.free(placed)
         return float(free.sum() / whole)
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table top, and the spot of it that the target stands on."""
+    """A table top, and the point of it that the target stands on."""
 
     camera_from_spot: np.ndarray  # (4, 4) [m], z up, the origin under the target
     camera_from_top: np.ndarray  # (4, 4) [m], z up, the origin in the middle, axes along the sides
     half_extent: tuple[float, float]  # [m]
 
     def carries(self, one: Placed) -> bool:
-        """Tell whether an object's center is over the table."""
+        """Return whether an object's center is over the table."""
         x, y, _ = self.camera_from_top[:3, :3].T @ (one.center - self.camera_from_top[:3, 3])
         return bool(abs(x) < self.half_extent[0] - _RIM and abs(y) < self.half_extent[1] - _RIM)
 
@@ -96,7 +97,13 @@ class Table:
 def set_table(
     camera_from_spot: np.ndarray, half_extent: tuple[float, float], rng: np.random.Generator
 ) -> Table:
-    """Lay a table under a spot, turned by up to 45 degrees, the spot not too near to its edge."""
+    """Place a table under a point, rotated by up to 45 degrees.
+
+    Args:
+        camera_from_spot: (4, 4) [m], z up, the origin under the target and not near the edge.
+        half_extent: Half of the table's sides [m].
+        rng: Source of randomness.
+    """
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", rng.uniform(-45, 45), degrees=True).as_matrix()
     room = np.maximum(0.75 * np.array(half_extent) - 0.1, 0.05)
@@ -107,8 +114,17 @@ def set_table(
 def place_target_on_table(
     solid: Solid, view: View, distance: float, elevation_deg: float, rng: np.random.Generator
 ) -> tuple[Placed, np.ndarray]:
-    """Put the target on a table, the camera so far from it and so high.  -> it, and
-    camera_from_spot under it.
+    """Place the target on a table.
+
+    Args:
+        solid: The target.
+        view: The camera.
+        distance: From the camera to the target's center [m].
+        elevation_deg: Of the camera over the table [degrees].
+        rng: Source of randomness.
+
+    Returns:
+        The target, and camera_from_spot (4, 4) [m] of the point under it.
     """
     elevation = np.deg2rad(elevation_deg)
     roll = Rotation.from_euler("z", rng.normal(0, 6), degrees=True).as_matrix()
@@ -127,20 +143,20 @@ def place_target_on_table(
 def place_floating_target(
     solid: Solid, view: View, distance: float, rng: np.random.Generator
 ) -> Placed:
-    """Put the target anywhere in the view, turned anyhow."""
+    """Place the target in the air, at a random position in the view and a random rotation."""
     rotation = Rotation.random(rng=rng).as_matrix()
     center = view.ray(rng.uniform(0.12, 0.88), rng.uniform(0.12, 0.88)) * distance
     return _place_floating(solid, rotation, center)
 
 
 def are_separate(a: Placed, b: Placed) -> bool:
-    """Tell whether two objects stand apart, by their spheres or else by their hulls."""
+    """Return whether two objects do not touch, by their bounding spheres or else by their hulls."""
     far = np.linalg.norm(a.center - b.center) > a.solid.radius + b.solid.radius + _GAP
     return bool(far) or separated(a.hull, b.hull, _GAP)
 
 
 def compute_hiding_size(solid: Solid) -> float:
-    """Return the second largest side of a solid's box [m]: how much it hides at best."""
+    """Return the second largest side of a solid's box [m]: at best it hides that much."""
     low, high = solid.mesh.bounds
     return float(np.sort(high - low)[1])
 
@@ -154,11 +170,20 @@ def place_distractor(
     in_front: bool,
     rng: np.random.Generator,
 ) -> Placed | None:
-    """Find a free place for a distractor, afloat where there is no table; None where none was
-    found.
+    """Find a pose for a distractor, in the air where there is no table.
 
-    wanted: the share of the target (the first of `placed`) that should stay visible. In front of
-    the target if asked, so that about that much is left; else anywhere that leaves no less.
+    Args:
+        solid: The distractor.
+        placed: The objects so far, the target first.
+        view: The camera.
+        table: The table, if there is one.
+        wanted: Fraction of the target that should stay visible.
+        in_front: Place it in front of the target, so that about `wanted` stays visible; else
+            anywhere that leaves no less.
+        rng: Source of randomness.
+
+    Returns:
+        The distractor, or None where no pose was found.
     """
     best, best_error = None, np.inf
     free, whole = view.free(placed)
@@ -186,7 +211,7 @@ def place_distractor(
 def _draw_on_table(
     solid: Solid, target: Placed, frame: np.ndarray, in_front: bool, rng: np.random.Generator
 ) -> Placed:
-    """Stand a solid somewhere on the table."""
+    """Draw a pose on the table."""
     rest = _draw_stable_rotation(solid, rng, 0.6)
     reach = target.solid.radius + solid.radius
     if in_front:
@@ -202,7 +227,7 @@ def _draw_on_table(
 def _draw_floating(
     solid: Solid, target: Placed, in_front: bool, rng: np.random.Generator
 ) -> Placed:
-    """Hang a solid somewhere near the target, or before it."""
+    """Draw a pose in the air near the target, or in front of it."""
     rotation = Rotation.random(rng=rng).as_matrix()
     z = target.center[2] * rng.uniform(0.6, 0.95 if in_front else 1.3)
     spread = 0.5 * target.solid.radius + 0.5 * solid.radius if in_front else 0.16
@@ -211,8 +236,9 @@ def _draw_floating(
 
 
 def _draw_stable_rotation(solid: Solid, rng: np.random.Generator, upright: float) -> np.ndarray:
-    """Draw how a solid lies: as its mesh stands, or any rest (rare ones more often than chance), at
-    any heading.
+    """Draw a stable rotation: with probability `upright` the mesh's own, else any; then a yaw.
+
+    Improbable ones are drawn more often than by their probability.
     """
     if rng.random() < upright:
         down = -solid.stable_rotations[:, 2, :]  # the object's direction that each rest turns down
@@ -227,7 +253,7 @@ def _draw_stable_rotation(solid: Solid, rng: np.random.Generator, upright: float
 def _place_on_table(
     solid: Solid, rest: np.ndarray, spot: np.ndarray, camera_from_spot: np.ndarray
 ) -> Placed:
-    """Return a solid in a resting rotation with its center over a spot of the table."""
+    """Return a solid in a stable rotation with its center over a point of the table."""
     center = rest @ solid.center
     table_from_object = np.eye(4)
     table_from_object[:3, :3] = rest
@@ -240,7 +266,7 @@ def _place_on_table(
 
 
 def _place_floating(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:
-    """Return a solid with its center somewhere in the camera's frame."""
+    """Return a solid of this rotation with its center at a point in the camera."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, center - rotation @ solid.center
     return Placed(solid, pose)

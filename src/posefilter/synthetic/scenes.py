@@ -1,8 +1,7 @@
-"""Draw scenes: a target among distractors and look-alikes, on a table or afloat, with something in
-front of it when asked.
+"""Draw scenes: a target among distractors and look-alikes, on a table or in the air.
 
 A scene set (one folder of the dataset) fixes the surroundings, the distractors to choose from and
-the look-alikes; each of its frames has a camera, a layout and lights of its own.
+the look-alikes. Each of its frames has its own camera, layout and lights.
 """
 
 from dataclasses import dataclass, replace
@@ -36,7 +35,7 @@ _FLOOR = (0.15, 0.15, 0.1, 0.2, 0.3, 0.05, 0.05)
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What scenes are like."""
+    """The distributions that scenes are drawn from."""
 
     distractors: tuple[int, int] = (2, 8)  # least and most beside the target
     occlusion: float = 0.75  # largest share of the target that may be hidden
@@ -81,7 +80,7 @@ class Layout:
 
 
 class SolidStore:
-    """The solids of a mesh store, each measured once."""
+    """The solids of a mesh store, each computed on first use."""
 
     def __init__(self, store: MeshStore) -> None:
         self.store = store
@@ -97,7 +96,7 @@ class SolidStore:
 def choose_distractors(
     store: MeshStore, target: str, settings: SceneSettings, rng: np.random.Generator
 ) -> list[str]:
-    """Choose the meshes that a scene set takes its distractors from: the set's first draw."""
+    """Choose the names of a scene set's distractors; the first draw of its generator."""
     others = [name for name in store.names() if name != target]
     return [others[i] for i in rng.permutation(len(others))[: settings.classes]]
 
@@ -105,7 +104,14 @@ def choose_distractors(
 def draw_scene_set(
     library: SolidStore, target: str, settings: SceneSettings, rng: np.random.Generator
 ) -> SceneSet:
-    """Draw what the frames of one folder share."""
+    """Draw what the frames of one folder share.
+
+    Args:
+        library: The solids.
+        target: Name of the target's mesh.
+        settings: The distributions.
+        rng: Source of randomness.
+    """
     chosen = choose_distractors(library.store, target, settings, rng)
     goal = library.solid(target)
     distractors = tuple(library.solid(name) for name in chosen)
@@ -138,7 +144,19 @@ def draw_layout(
     width: int,
     rng: np.random.Generator,
 ) -> Layout | None:
-    """Draw one frame, or None where this draw does not work out (the caller draws again)."""
+    """Draw the layout of one frame.
+
+    Args:
+        scene: What the frames of its folder share.
+        settings: The distributions.
+        K: (3, 3) camera matrix [px].
+        height: Of the image [px].
+        width: Of the image [px].
+        rng: Source of randomness.
+
+    Returns:
+        The layout, or None where this draw is not possible and another has to be made.
+    """
     view = View(K, height, width)
     occluded = bool(rng.random() < settings.occluded_share)
     least = 1 - settings.occlusion
@@ -170,8 +188,10 @@ def _draw_objects(
     wanted: float,
     rng: np.random.Generator,
 ) -> tuple[list[Placed], Table | None]:
-    """Place the target and what stands round it, none where the target leaves the frame.  ->
-    objects, their table if any.
+    """Place the target and what is around it.
+
+    Returns:
+        The objects, none of them where the target leaves the frame, and their table if any.
     """
     distance = rng.uniform(*settings.distance)
     table = None
@@ -222,7 +242,7 @@ def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Genera
 def _surroundings(
     scene: SceneSet, target: Placed, table: Table | None, rng: np.random.Generator
 ) -> tuple[Plane, ...]:
-    """Return table, floor and wall, or the one surface behind floating clutter."""
+    """Return table, floor and wall, or the one plane behind objects in the air."""
     if table is None:
         back = np.eye(4)
         back[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.45, 3)).as_matrix()
@@ -263,7 +283,7 @@ def _draw_lights(up: np.ndarray, settings: SceneSettings, rng: np.random.Generat
 
 
 def shift_camera(layout: Layout, offset: float) -> Layout:
-    """Return the layout as a second camera sees it that stands `offset` [m] to the right."""
+    """Return the layout in the frame of a camera that stands `offset` [m] to the right."""
     move = np.eye(4)
     move[0, 3] = -offset
     placed = tuple(Placed(p.solid, move @ p.camera_from_object) for p in layout.placed)

@@ -1,9 +1,8 @@
-"""Model what a camera makes of a perfect picture: color as a cheap color camera gives it, depth as
-structured light does.
+"""Simulate an RGB-D camera: color of a cheap color camera, depth of structured light.
 
-The depth's defects follow a Kinect-like sensor: disparity in fixed steps (so errors grow with z
+The depth's defects follow a Kinect-like sensor: quantized disparity (so errors grow with z
 squared), correlated noise, a slowly varying offset, ragged edges, shadows on one side where the
-projector does not reach, holes on dark and shining surfaces, a largest range.
+projector does not reach, holes on dark and shiny surfaces, a maximum range.
 """
 
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from posefilter.synthetic.textures import blurred_noise, noise_field
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How far a camera departs from the perfect one."""
+    """Which images of a camera are degraded."""
 
     name: str
     color: bool
@@ -28,7 +27,11 @@ _MODELS = {"ideal": SensorModel("ideal", False, False), "kinect": SensorModel("k
 
 
 def sensor_model(name: str) -> SensorModel:
-    """Return a sensor by its name.  Raises UserError for an unknown one."""
+    """Return a sensor by its name.
+
+    Raises:
+        UserError: There is none of that name.
+    """
     if name not in _MODELS:
         raise UserError(f"sensor={name}: unknown; choose from {', '.join(_MODELS)}")
     return _MODELS[name]
@@ -37,10 +40,16 @@ def sensor_model(name: str) -> SensorModel:
 def simulate_sensor(
     rgb: np.ndarray, depth: np.ndarray, model: SensorModel, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the photograph (H, W, 3) uint8 RGB and the measured depth (H, W) float32 [m], 0 = no
-    reading.
+    """Simulate the images of a camera.
 
-    rgb: (H, W, 3) float32, 1 = white; depth: (H, W) float32 [m], 0 = nothing there.
+    Args:
+        rgb: (H, W, 3) float32, 1 = white.
+        depth: (H, W) float32 [m], 0 = nothing there.
+        model: The sensor.
+        rng: Source of randomness.
+
+    Returns:
+        The photograph (H, W, 3) uint8 RGB, and the depth (H, W) float32 [m], 0 = no measurement.
     """
     photo = simulate_color(rgb, rng) if model.color else np.clip(rgb, 0, 1)
     measured = simulate_depth(depth, photo, rng) if model.depth else depth
@@ -48,14 +57,11 @@ def simulate_sensor(
 
 
 def simulate_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the picture as a cheap color camera gives it.
-
-    (H, W, 3) float32 -> (H, W, 3) float32 in [0, 1].
-    """
+    """Simulate a cheap color camera.  (H, W, 3) float32 -> (H, W, 3) float32 in [0, 1]."""
     height, width = rgb.shape[:2]
     balance = np.exp(rng.normal(0, 0.07, 3) + rng.normal(0, 0.22)).astype(np.float32)
     out = rgb * balance
-    out = _falloff(out, rng)
+    out = _vary_brightness(out, rng)
     mean = out.mean((0, 1))
     out = mean + (out - mean) * np.float32(rng.uniform(0.8, 1.35))
     gray = out.mean(-1, keepdims=True)
@@ -72,12 +78,18 @@ def simulate_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def simulate_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the depth as a structured-light camera measures it.
+    """Simulate a structured-light camera.
 
-    (H, W) [m], 0 = nothing; photo (H, W, 3) in [0, 1] -> (H, W) float32 [m], 0 = no reading.
+    Args:
+        depth: (H, W) [m], 0 = nothing there.
+        photo: (H, W, 3) in [0, 1]; dark and overexposed surfaces have more holes.
+        rng: Source of randomness.
+
+    Returns:
+        (H, W) float32 [m], 0 = no measurement.
     """
     height, width = depth.shape
-    out = _ragged(depth, rng)
+    out = _jitter_edges(depth, rng)
     valid = out > 0
     fine = blurred_noise(rng, height, width, rng.uniform(0.8, 3) * width / 640)
     slow = cv2.resize(
@@ -93,8 +105,8 @@ def simulate_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generato
         step = np.float32(rng.uniform(0.3, 1) * 0.0029)
         out = 1 / (np.maximum(np.round(1 / np.maximum(out, 0.1) / step), 1) * step)
     out[~valid] = 0
-    out[_edge_loss(depth, rng)] = 0
-    out[_surface_loss(depth, photo, rng)] = 0
+    out[_lose_edges(depth, rng)] = 0
+    out[_lose_surfaces(depth, photo, rng)] = 0
     if rng.random() < 0.5:
         out[depth > rng.uniform(1.5, 3.5)] = 0
     out[out > 6.5] = 0
@@ -102,12 +114,12 @@ def simulate_depth(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generato
 
 
 def _blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    """Smooth a picture over sigma [px]."""
+    """Blur an image by a Gaussian of sigma [px]."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32)
 
 
-def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Darken or lighten the picture slowly across its face, as a near lamp or a lens does."""
+def _vary_brightness(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Vary the brightness slowly over the image, as a near lamp or a lens does."""
     coarse = 1 + rng.uniform(0, 0.25) * rng.uniform(-1, 1, (3, 4)).astype(np.float32)
     return (
         rgb
@@ -118,7 +130,7 @@ def _falloff(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
-    """Return the trace of a moving camera: a line of `length` pixels in a random direction."""
+    """Return the kernel of motion blur: a line of `length` pixels in a random direction."""
     line = np.zeros((length, length), np.float32)
     line[length // 2] = 1
     turn = cv2.getRotationMatrix2D((length / 2 - 0.5, length / 2 - 0.5), rng.uniform(0, 180), 1)
@@ -127,9 +139,7 @@ def motion_kernel(rng: np.random.Generator, length: int) -> np.ndarray:
 
 
 def _color_noise(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """Return sensor noise: partly of brightness, partly of color, and that one coarser, as
-    demosaicing leaves it.
-    """
+    """Return sensor noise of brightness, and coarser noise of color, as demosaicing leaves it."""
     bright = rng.standard_normal((height, width, 1), dtype=np.float32) * np.float32(
         rng.uniform(0.004, 0.04)
     )
@@ -139,10 +149,8 @@ def _color_noise(rng: np.random.Generator, height: int, width: int) -> np.ndarra
     return bright + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
-def _ragged(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the depth read through a jittering grid, and shifted by about a pixel against the
-    color.
-    """
+def _jitter_edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the depth sampled on a jittered grid, shifted by about a pixel against the color."""
     height, width = depth.shape
     scale = width / 640
     grid = np.empty((2, height, width), np.float32)
@@ -156,10 +164,8 @@ def _ragged(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return cv2.remap(depth, grid[0], grid[1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _edge_loss(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return where depth is lost along jumps: on one side as the projector's shadow, or on both.
-    -> (H, W) bool.
-    """
+def _lose_edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return where depth is lost at discontinuities, on one side or both.  -> (H, W) bool."""
     height, width = depth.shape
     scale = width / 640
     box = np.ones((3, 3), np.uint8)
@@ -173,8 +179,8 @@ def _edge_loss(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return band & (rag > rng.uniform(-2, 0.8))
 
 
-def _surface_loss(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return holes in surfaces, likelier where it is very dark or shining.  -> (H, W) bool."""
+def _lose_surfaces(depth: np.ndarray, photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return holes in surfaces, more of them where it is dark or overexposed.  -> (H, W) bool."""
     height, width = depth.shape
     if rng.random() < 0.3:
         return np.zeros((height, width), bool)

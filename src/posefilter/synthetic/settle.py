@@ -1,5 +1,6 @@
-"""Let objects fall on a table and come to rest, with mujoco (extra `sim`): leaning, tipped,
-touching, as real ones are.
+"""Simulate objects that fall on a table and come to rest, with mujoco (extra `sim`).
+
+They then lean, tip over and touch, as real objects do.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,11 @@ _DENSITY = 300.0  # [kg/m^3] of a box that holds something light
 
 
 def load_mujoco() -> Any:
-    """Import mujoco.  Raises UserError where it is missing."""
+    """Import mujoco.
+
+    Raises:
+        UserError: It is missing.
+    """
     try:
         import mujoco
     except ImportError as error:
@@ -31,10 +36,19 @@ def load_mujoco() -> Any:
 def settle(
     placed: Sequence[Placed], table: Table, rng: np.random.Generator, dropped: float = 0.5
 ) -> list[Placed]:
-    """Return the objects as they come to rest; those that end beyond the table's edge are left out,
-    never the first.
+    """Simulate objects until they rest.
 
-    Of the others, a share `dropped` is first turned anyhow and let fall from a hand's height.
+    Args:
+        placed: The objects, the target first.
+        table: The table.
+        rng: Source of randomness.
+        dropped: Fraction of the others that fall from up to 12 cm in a random rotation.
+
+    Returns:
+        The objects at rest, without those that left the table; the target always stays.
+
+    Raises:
+        UserError: mujoco is missing.
     """
     mujoco = load_mujoco()
     start = [
@@ -66,9 +80,7 @@ def settle(
 
 
 def _drop(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Generator) -> Placed:
-    """Return an object turned anyhow and held up to 12 cm over its place; as it was where that
-    would touch another.
-    """
+    """Return an object in a random rotation, raised by up to 12 cm; unchanged if that touches."""
     pose = one.camera_from_object.copy()
     pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
     pose[:3, 3] = one.center - pose[:3, :3] @ one.solid.center
@@ -82,9 +94,7 @@ def _drop(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Ge
 
 
 def _world(solids: Sequence[Solid]) -> str:
-    """Return mujoco's description of a table plane and free convex bodies in each object's own
-    frame.
-    """
+    """Return mujoco's XML of a table plane and free convex bodies, each in its own frame."""
     contact = 'condim="6" friction="0.7 0.01 0.002"'
     meshes = "".join(
         f'<mesh name="m{k}" maxhullvert="64" vertex="{_vertices(solid)}"/>'
@@ -101,5 +111,5 @@ def _world(solids: Sequence[Solid]) -> str:
 
 @lru_cache(maxsize=256)
 def _vertices(solid: Solid) -> str:
-    """Return a hull as mujoco reads it.  Solids are remembered by identity."""
+    """Return the vertices of a hull as mujoco's XML has them; cached by identity."""
     return " ".join(f"{x:.6f}" for x in solid.hull.reshape(-1))

@@ -1,4 +1,4 @@
-"""Objects as things that rest, touch and hide: what a scene's layout needs to know of a mesh."""
+"""The geometry of a mesh that placing needs: convex hull, bounding sphere, stable rotations."""
 
 from dataclasses import dataclass
 
@@ -10,18 +10,18 @@ from posefilter.meshes.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A mesh, its convex hull, and how it can lie on a table."""
+    """A mesh, its convex hull, and the rotations in which it lies stably on a table."""
 
     mesh: Mesh
     hull: np.ndarray  # (V, 3) the vertices that reach farthest in 300 directions [m]
     center: np.ndarray  # (3,) of the bounding box [m]
-    radius: float  # of the hull round the center [m]
+    radius: float  # of the hull around the center [m]
     stable_rotations: np.ndarray  # (R, 3, 3) table_from_object rotations in which it rests, z up
     stable_weights: np.ndarray  # (R,) how likely each is when dropped, sums to 1
 
 
 def make_solid(mesh: Mesh) -> Solid:
-    """Measure a mesh."""
+    """Compute the hull, the bounding sphere and the stable rotations of a mesh."""
     hull = mesh.vertices[np.unique((fibonacci_sphere(300) @ mesh.vertices.T).argmax(1))]
     center = mesh.bounds.mean(0)
     rests, weights = find_stable_rotations(hull)
@@ -31,12 +31,18 @@ def make_solid(mesh: Mesh) -> Solid:
 
 
 def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Find how a convex body lies still.  (V, 3) -> rotations (R, 3, 3) that turn a resting
-    direction down, weights (R,).
+    """Find the rotations in which a convex body lies stably.
 
-    Its center of mass (taken as the middle of its box) is lowest there: a local minimum of the
-    height over the directions that could point down. From all over the sphere directions roll
-    downhill; the share that ends in a minimum is its weight.
+    They are local minima of the height of the center of mass (taken as the center of the box) over
+    all directions that could point down. Directions from all over the sphere descend to them.
+
+    Args:
+        hull: (V, 3) vertices [m].
+        directions: How many directions descend.
+
+    Returns:
+        Rotations (R, 3, 3) that turn the direction of each minimum down, and the fraction of the
+        directions that ended there (R,).
     """
     down = fibonacci_sphere(directions)
     body = hull - (hull.min(0) + hull.max(0)) / 2
@@ -63,7 +69,7 @@ def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.n
 
 
 def rotation_down(direction: np.ndarray) -> np.ndarray:
-    """Return the least rotation that takes a unit direction to -z.  (3,) -> (3, 3)."""
+    """Return the smallest rotation that takes a unit direction to -z.  (3,) -> (3, 3)."""
     target = np.array([0.0, 0.0, -1.0])
     axis, cosine = np.cross(direction, target), float(direction @ target)
     if cosine < -0.999999:
@@ -73,7 +79,7 @@ def rotation_down(direction: np.ndarray) -> np.ndarray:
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:
-    """Return directions spread evenly.  -> (count, 3) unit."""
+    """Return evenly spread unit directions.  -> (count, 3)."""
     k = np.arange(count) + 0.5
     z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - z * z)
@@ -84,10 +90,10 @@ _DIRECTIONS = fibonacci_sphere(160)
 
 
 def separated(a: np.ndarray, b: np.ndarray, gap: float = 0.0) -> bool:
-    """Tell whether some plane keeps two point sets apart by `gap` [m].  (P, 3), (Q, 3).
+    """Return whether some plane separates two point sets by `gap` [m].  (P, 3), (Q, 3).
 
-    Directions tried: 160 spread ones and the line of centers. A no may be wrong for bodies that
-    nearly touch, a yes is not.
+    160 spread directions and the line of centers are tried. False may be wrong for bodies that
+    nearly touch; True is exact.
     """
     between = b.mean(0) - a.mean(0)
     d = np.concatenate([_DIRECTIONS, [between / (np.linalg.norm(between) + 1e-12)]])
@@ -98,9 +104,17 @@ def separated(a: np.ndarray, b: np.ndarray, gap: float = 0.0) -> bool:
 def outline_mask(
     points: np.ndarray, K: np.ndarray, height: int, width: int, stride: int
 ) -> np.ndarray:
-    """Return the mask of a convex body on a grid of every stride-th pixel.
+    """Return the mask of a convex body.
 
-    (P, 3) camera [m], all before it -> bool.
+    Args:
+        points: (P, 3) in the camera [m], all in front of it.
+        K: (3, 3) camera matrix [px].
+        height: Of the image [px].
+        width: Of the image [px].
+        stride: Every stride-th pixel is computed.
+
+    Returns:
+        (height // stride, width // stride) bool.
     """
     pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
     pixels = np.clip(pixels / stride, -2000, 2000)
