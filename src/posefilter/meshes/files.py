@@ -15,9 +15,15 @@ SUFFIXES = (".obj", ".ply", ".glb")
 
 
 def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
-    """Read one mesh file; `scale` turns its unit into meters.
+    """Read a mesh file.
 
-    Raises UserError, naming the file, where it is missing, corrupt, empty, or lacks its texture.
+    Args:
+        path: An OBJ, PLY or GLB file.
+        name: Of the mesh.
+        scale: Meters in the file's unit.
+
+    Raises:
+        UserError: It is missing, corrupt or empty, or its texture is missing; names the file.
     """
     readers: dict[str, Callable[[Path], RawMesh]] = {
         ".obj": read_obj,
@@ -32,7 +38,7 @@ def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
         raw = readers[path.suffix.lower()](path)
     except UserError:
         raise
-    # the file decides what breaks: parsers raise anything from KeyError to struct.error
+    # depending on the damage, parsers raise anything from KeyError to struct.error
     except Exception as error:
         reason = next(iter(str(error).splitlines()), "")
         raise UserError(
@@ -63,7 +69,7 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
 
 
 def _one_texture(raw: RawMesh) -> tuple[np.ndarray | None, np.ndarray]:
-    """Put all materials into one picture, stacked; a mesh of one plain color gets one pixel."""
+    """Stack all materials into one texture; a mesh of one plain color gets one pixel."""
     used = np.unique(raw.face_material)
     pictures = [_picture(raw.materials[i]) for i in used]
     if len(used) == 1 and (raw.corner_uv is None or pictures[0].shape[:2] == (1, 1)):
@@ -125,9 +131,7 @@ def _read_other(path: Path) -> RawMesh:
 
 
 def _check_ply_texture(path: Path) -> None:
-    """Raise UserError where the texture that a PLY's header names cannot be read: trimesh would go
-    on without it.
-    """
+    """Raise UserError unless the texture that a PLY's header names can be read: trimesh ignores it."""
     header = path.read_bytes()[:4096].partition(b"end_header")[0].decode(errors="replace")
     for line in header.splitlines():
         if line.lower().startswith("comment texturefile "):

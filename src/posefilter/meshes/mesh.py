@@ -1,7 +1,4 @@
-"""What a mesh is here, and the small pure functions on it.
-
-Numpy throughout: rendering and labels live on the CPU.
-"""
+"""Triangle meshes and pure functions on them, in numpy."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -45,7 +42,7 @@ class Mesh:
 
     @cached_property
     def bounds(self) -> np.ndarray:
-        """Return the corners of the axis-aligned box, least and greatest.  (2, 3) [m]."""
+        """Lowest and highest corner of the axis-aligned bounding box, (2, 3) [m]."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
 
@@ -56,11 +53,17 @@ def face_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return area-weighted normals that stay crisp over sharp edges.  (V, 3), (F, 3) -> (F, 3, 3)
-    float32, unit.
+    """Compute area-weighted normals that keep sharp edges.
 
-    A corner averages the faces round its position that lie within 40 degrees of its own face, so
-    that seams in the texture do not show and boxes keep their edges.
+    The normal of a corner averages the faces at its position that lie within 40 degrees of its own,
+    so that seams in the texture do not show and boxes keep their edges.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3) indices.
+
+    Returns:
+        Unit normals of the corners (F, 3, 3) float32.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     weighted = np.cross(b - a, c - a)  # length: twice the area
@@ -89,10 +92,18 @@ def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Draw surface points evenly by area.  -> face (count,) int64, barycentric weights (count, 3).
+    """Draw surface points uniformly by area.
 
-    Faces are drawn systematically along their cumulated area, which spreads points better than
-    independent draws.
+    Faces are drawn by systematic sampling along their cumulative area, which spreads points better
+    than independent draws.
+
+    Args:
+        mesh: The mesh.
+        count: Number of points.
+        seed: Of the random generator.
+
+    Returns:
+        Faces (count,) int64, and barycentric weights (count, 3).
     """
     rng = np.random.default_rng(seed)
     cumulated = np.cumsum(face_areas(mesh.vertices, mesh.faces))
@@ -108,8 +119,17 @@ def surface_points(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def surface_colors(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the colors there, the texture read bilinearly and repeated beyond its edges.  -> (P,
-    3) float32 in [0, 1].
+    """Return the colors at barycentric weights on faces.
+
+    The texture is sampled bilinearly and repeats beyond its edges.
+
+    Args:
+        mesh: The mesh.
+        face: (P,) indices.
+        weights: (P, 3).
+
+    Returns:
+        (P, 3) float32 in [0, 1].
     """
     height, width = mesh.texture.shape[:2]
     if mesh.corner_uv is None:
@@ -144,12 +164,20 @@ def hull_vertices(vertices: np.ndarray) -> np.ndarray:
 def outline_hull(
     vertices: np.ndarray, most: int = _HULL_VERTICES, error: float = _HULL_ERROR
 ) -> np.ndarray:
-    """Return few hull vertices that draw nearly the same outline.  (V, 3) -> (<= most, 3) [m].
+    """Select few hull vertices that have nearly the same outline.
 
-    A silhouette is bounded by support functions h(d) = max x . d. Greedy: find the direction in
-    which the vertices chosen so far fall shortest of the full hull's h, add the vertex that reaches
-    farthest there, until none falls short by more than `error`. The outline never reaches beyond
-    the true one, and at 128 vertices stays within some 1.2 mm of it for objects of 0.25 m.
+    A silhouette is bounded by support functions h(d) = max x . d. Greedily, the direction is found
+    in which h of the selected vertices is furthest below that of the full hull, and the vertex that
+    is farthest there is added. The outline is never outside of the true one, and with 128 vertices
+    within 1.2 mm of it for objects of 0.25 m.
+
+    Args:
+        vertices: (V, 3) [m].
+        most: Largest number of vertices.
+        error: Stop where no direction is further below than this [m].
+
+    Returns:
+        (<= most, 3) [m].
     """
     full = hull_vertices(vertices)
     directions = sphere_directions(_HULL_DIRECTIONS)
@@ -169,7 +197,7 @@ def outline_hull(
 
 
 def sphere_directions(count: int) -> np.ndarray:
-    """Return directions spread evenly over the sphere (Fibonacci lattice).  -> (count, 3), unit."""
+    """Return evenly spread unit directions (Fibonacci lattice).  -> (count, 3)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
     flat = np.sqrt(1 - z * z)
@@ -187,10 +215,14 @@ def diameter(vertices: np.ndarray) -> float:
 def object_model(
     mesh: Mesh, points: np.ndarray | None = None, count: int = 2000, seed: int = 0
 ) -> ObjectModel:
-    """Return the tensors that methods and metrics know an object by.
+    """Return the object as methods and metrics use it.
 
-    `points` (P, 3) [m] in the mesh's frame are what ADD is defined on; by default `count` points
-    drawn evenly from the surface. The same seed gives the same points.
+    Args:
+        mesh: The mesh.
+        points: (P, 3) [m] in the mesh's frame, on which ADD is defined; None: drawn uniformly from
+            the surface.
+        count: How many points are drawn.
+        seed: Of the random generator; the same seed gives the same points.
     """
     if points is None:
         points = surface_points(mesh, *sample_surface(mesh, count, seed))
@@ -207,8 +239,14 @@ def object_model(
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Return the triangles of a grid of vertices, numbered row by row.  -> (2 (rows - 1) (columns -
-    1), 3).
+    """Return the triangles of a grid of vertices.
+
+    Args:
+        rows: Rows of vertices, which are numbered row by row.
+        columns: Columns of vertices.
+
+    Returns:
+        (2 * (rows - 1) * (columns - 1), 3) indices.
     """
     index = np.arange(rows * columns).reshape(rows, columns)
     quads = [(a, b) for a, b in pairwise(range(rows))]

@@ -1,6 +1,4 @@
-"""Read Wavefront OBJ and its materials as written: seams in the texture and normals a corner
-survive.
-"""
+"""Read Wavefront OBJ and its materials, with seams in the texture and normals of each corner."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +12,7 @@ from posefilter.paths import check_inside
 
 
 class Material(NamedTuple):
-    """A picture and the color that it is multiplied by."""
+    """A texture image and the color that it is multiplied by."""
 
     color: np.ndarray  # (3,) in [0, 1]
     image: np.ndarray | None  # (h, w, 3) uint8 RGB
@@ -24,7 +22,7 @@ PLAIN = Material(np.full(3, 0.7), None)
 
 
 class RawMesh(NamedTuple):
-    """What a file says, before its materials are put into one picture."""
+    """The content of a file, before its materials are merged into one texture."""
 
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3)
@@ -36,7 +34,18 @@ class RawMesh(NamedTuple):
 
 
 def read_image(path: Path, source: Path) -> np.ndarray:
-    """Read a texture as (h, w, 3) uint8 RGB; it must lie in the folder of what names it."""
+    """Read a texture image.
+
+    Args:
+        path: The image.
+        source: The file that names it; the image must be in the folder of that file.
+
+    Returns:
+        (h, w, 3) uint8 RGB.
+
+    Raises:
+        UserError: It is missing, not readable, too large, or elsewhere.
+    """
     check_inside(path, source.parent)
     if not path.is_file():
         raise UserError(f"{path}: missing texture, named by {source.name}")

@@ -1,6 +1,4 @@
-"""Where meshes come from: folders of one's own, YCB's layout, BOP's models, or the meshes that the
-project draws itself.
-"""
+"""Meshes by name: of a folder (YCB's layout, BOP's models, or any files), or the built-in ones."""
 
 import difflib
 import math
@@ -19,19 +17,25 @@ from posefilter.meshes.symmetries import identity_first, read_symmetries, symmet
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
 
-# [m] no object of ours is larger or smaller across: the unit must be wrong
+# [m] the unit of an object that is larger or smaller must be wrong
 _LARGEST, _SMALLEST = 10.0, 1e-3
 BUILTIN = "builtin"
 
 
 class MeshStore:
-    """Meshes by name, read once.
+    """Meshes by name, each read once.
 
-    `root` is "builtin" or a folder: `<class>/google_16k/textured.obj` (YCB),
-    `<class>/*.{obj,ply,glb}`, or flat `<name>.{obj,ply,glb}`. `scale` turns the files' unit into
-    meters (0.001 for BOP). `symmetries` maps names to (S, 4, 4) object_from_object [m]; it beats
-    `symmetries.json` or BOP's `models_info.json` in the folder, which beat the tables of YCB and
-    the builtin meshes.
+    Args:
+        root: "builtin", or a folder with `<class>/google_16k/textured.obj` (YCB),
+            `<class>/*.{obj,ply,glb}`, or `<name>.{obj,ply,glb}`.
+        scale: Meters in the files' unit (0.001 for BOP).
+        symmetries: (S, 4, 4) object_from_object [m] by name. They take precedence over
+            `symmetries.json` or BOP's `models_info.json` in the folder, and these over the tables
+            of YCB and of the built-in meshes.
+        symmetry_steps: Steps in which a turn about an axis of any angle is sampled.
+
+    Raises:
+        UserError: The folder is missing or has no meshes, or the scale is impossible.
     """
 
     def __init__(
@@ -46,19 +50,20 @@ class MeshStore:
         if not (isinstance(scale, int | float) and 0 < scale < math.inf):
             raise UserError(f"mesh_scale={scale}: meters a unit of the mesh files, such as 0.001")
         self._files: dict[str, Path] = {}
-        self._ambiguous: dict[str, str] = {}  # folders that do not tell which mesh is meant
+        self._ambiguous: dict[str, str] = {}  # messages of folders with several candidates
         if str(root) != BUILTIN:
             self._files, self._ambiguous = _find_meshes(Path(root))
         self._loaded: dict[str, Mesh] = {}
 
     def names(self) -> list[str]:
-        """Return every mesh's name, sorted."""
+        """Return the names of all meshes, sorted."""
         return builtin.names() if str(self.root) == BUILTIN else sorted(self._files)
 
     def load(self, name: str) -> Mesh:
-        """Return a mesh, read or drawn on first use.
+        """Return a mesh, read on first use.
 
-        Raises UserError for unknown names, bad files and wrong units.
+        Raises:
+            UserError: There is none of that name, its file is damaged, or its unit is wrong.
         """
         if name not in self._loaded:
             self._loaded[name] = self._load(name)
@@ -83,7 +88,7 @@ class MeshStore:
         return mesh if symmetries is None else replace(mesh, symmetries=symmetries)
 
     def _symmetries(self, name: str) -> np.ndarray | None:
-        """Return the declared symmetries, None where nothing but the mesh itself says."""
+        """Return the declared symmetries, None where there are none but the mesh's own."""
         if name in self._given:
             return identity_first(
                 np.asarray(self._given[name], dtype=np.float64), f"symmetries of '{name}'"
@@ -99,7 +104,7 @@ class MeshStore:
 
 
 def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
-    """Return the mesh of each class, and for classes whose mesh is not clear, why."""
+    """Return the mesh file of each class, and a message for each class with several candidates."""
     if not root.is_dir():
         raise UserError(
             f"{root}: no such folder of meshes (use 'builtin' for those that the "
@@ -130,7 +135,7 @@ def _find_meshes(root: Path) -> tuple[dict[str, Path], dict[str, str]]:
 
 
 def _mesh_in(folder: Path) -> Path | str | None:
-    """Return the mesh that stands for a class's folder, None for none, or why it is not clear."""
+    """Return the mesh file of a class's folder, None, or a message where there are several."""
     preferred = [
         folder / "google_16k" / "textured.obj",
         *(folder / f"textured{suffix}" for suffix in SUFFIXES),
@@ -149,7 +154,7 @@ def _mesh_in(folder: Path) -> Path | str | None:
 
 
 def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
-    """Raise UserError, naming the setting that mends it, where an object cannot be so large."""
+    """Raise UserError, naming the setting to change, where an object has an impossible size."""
     across = diameter(mesh.vertices)
     if across > _LARGEST:
         factor, unit = 0.001, "millimeters"

@@ -1,6 +1,6 @@
-"""Facts about the YCB objects of YCB-Video and FAT: names, order, ids, frames, sizes, symmetries.
+"""The YCB objects of YCB-Video and FAT: names, order, ids, frames, sizes, symmetries.
 
-Numbers are measured on the public files (YCB's google_16k meshes, YCB-Video's model points, FAT's
+Numbers were measured on the public files (YCB's google_16k meshes, YCB-Video's model points, FAT's
 object settings).
 """
 
@@ -38,10 +38,9 @@ CLASSES = (
 # relation fits it.
 WITHOUT_GEOMETRY = frozenset({"036_wood_block"})
 
-# ycbvideo_from_original is this translation alone [m]: rotations fitted freely stay under 0.22
-# degrees, and the
-# nearest-neighbor residual under 0.5 mm, for all classes but 036_wood_block (12 degrees, 3 mm),
-# hence not listed.
+# ycbvideo_from_original is this translation alone [m]: rotations fitted freely are below 0.22
+# degrees and nearest-neighbor residuals below 0.5 mm, for all classes but 036_wood_block (12
+# degrees, 3 mm), which is therefore not listed.
 _YCBVIDEO_FROM_ORIGINAL = {
     "002_master_chef_can": (0.01567, 0.010218, -0.073504),
     "003_cracker_box": (0.012323, 0.012463, -0.108328),
@@ -90,17 +89,13 @@ SIZES_ALIGNED = {
     "061_foam_brick": (0.07787, 0.05119, 0.05256),
 }
 
-# Symmetries that we declare, for training and labels only: ADD and ADD-S as published ignore them.
-# Few on purpose.
-# YCB-Video (Xiang et al. 2018) and BOP name bowl, wood block, both clamps and foam brick. Which
-# turns hold was measured
-# here, by registering each google_16k mesh with itself (mean nearest-neighbor distance, against
-# that of two samplings
-# of the mesh): bowl 0.82 mm (0.79), wood block 1.06 (0.94), large clamp 0.95 (0.64), extra large
-# clamp 1.01 (0.75),
-# foam brick 0.70 (0.47). The brick has holes on one face only, so its other two half turns (1.1 and
-# 1.2 mm mean, 12 mm
-# at the holes) are left out; so is the block's quarter turn, whose grain differs.
+# Declared symmetries, for training and labels only: ADD and ADD-S as published ignore them.
+# YCB-Video (Xiang et al. 2018) and BOP list bowl, wood block, both clamps and foam brick. Which
+# rotations hold was measured by registering each google_16k mesh with itself: mean nearest-neighbor
+# distance, and in brackets that of two samplings of the mesh. Bowl 0.82 mm (0.79), wood block 1.06
+# (0.94), large clamp 0.95 (0.64), extra large clamp 1.01 (0.75), foam brick 0.70 (0.47). The brick
+# has holes on one face only, so its other two half turns (1.1 and 1.2 mm mean, 12 mm at the holes)
+# are left out; so is the block's quarter turn, whose grain differs.
 # name -> half turns about (axis, point [m]), turns by any angle about (axis, point [m]); in the
 # original frame.
 _HALF_TURNS = {
@@ -123,8 +118,10 @@ def fat_segmentation_id(name: str) -> int:
 
 
 def ycbvideo_from_original(name: str) -> np.ndarray:
-    """Return the transform from the google_16k mesh's frame to YCB-Video's.  -> (4, 4) [m];
-    KeyError where none fits.
+    """Return the transform (4, 4) [m] from the frame of the google_16k mesh to YCB-Video's.
+
+    Raises:
+        KeyError: No rigid transform fits that class.
     """
     out = np.eye(4)
     out[:3, 3] = _YCBVIDEO_FROM_ORIGINAL[name]
@@ -132,8 +129,14 @@ def ycbvideo_from_original(name: str) -> np.ndarray:
 
 
 def symmetries(name: str, steps: int = 36) -> np.ndarray | None:
-    """Return a class's declared symmetries in the original frame, None where none is.  -> (S, 4,
-    4), the identity first.
+    """Return a class's declared symmetries.
+
+    Args:
+        name: The class.
+        steps: Steps in which a turn of any angle is sampled.
+
+    Returns:
+        (S, 4, 4) in the frame of the google_16k mesh, the identity first; None without symmetries.
     """
     if name in _HALF_TURNS:
         axis, point = (np.array(v) for v in _HALF_TURNS[name])

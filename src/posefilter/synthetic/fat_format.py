@@ -1,10 +1,10 @@
-"""The Falling Things format on disk: its constants, and how to write it.
+"""The Falling Things (FAT) format: its constants, and writing it.
 
 A folder holds `_object_settings.json`, `_camera_settings.json` and for each frame and camera
 `NNNNNN.left.jpg`, `.json`, `.depth.png` and `.seg.png`. Lengths in the JSON files are centimeters,
 depth images are 0.1 mm a unit. Poses are of an *aligned* object frame: y down, centered on the
-bounding box. How the mesh gets there, each folder's `fixed_model_transform` F says, for row
-vectors: p_aligned_cm = [x y z 1] @ F.
+bounding box. Each folder's `fixed_model_transform` F maps the mesh there, for row vectors:
+p_aligned_cm = [x y z 1] @ F.
 """
 
 import json
@@ -46,7 +46,7 @@ _ALIGNED_FROM_UPRIGHT = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0,
 
 @dataclass(frozen=True, eq=False)
 class ExportedObject:
-    """An object class as a folder's settings describe it."""
+    """An object class, as in a folder's settings."""
 
     name: str  # without FAT's suffix
     seg_id: int
@@ -55,7 +55,7 @@ class ExportedObject:
 
     @property
     def fat_class(self) -> str:
-        """Return the class as FAT spells it."""
+        """The class's name in FAT."""
         return self.name + CLASS_SUFFIX
 
 
@@ -65,12 +65,12 @@ class ObjectInFrame:
 
     exported: ExportedObject
     camera_from_object: np.ndarray  # (4, 4) [m], mesh frame
-    visibility: float  # visible share of the pixels that it would have in the frame were it alone
-    truncated: float  # share of its outline that leaves the frame
+    visibility: float  # visible fraction of the pixels that it would have alone
+    truncated: float  # fraction of its outline that is out of the frame
 
 
 def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
-    """Describe a mesh by its own bounding box: upright turned y down, centered."""
+    """Return a mesh's class; its aligned frame is centered on the bounding box, y down."""
     center = mesh.bounds.mean(0)
     aligned = np.eye(4)
     aligned[:3, :3] = _ALIGNED_FROM_UPRIGHT
@@ -80,7 +80,7 @@ def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
 
 
 def object_settings(objects: Sequence[ExportedObject]) -> dict[str, Any]:
-    """Return what `_object_settings.json` says of a folder's classes."""
+    """Return the content of `_object_settings.json`."""
     exported = []
     for one in objects:
         F = one.aligned_from_mesh.T.copy()
@@ -101,7 +101,7 @@ def object_settings(objects: Sequence[ExportedObject]) -> dict[str, Any]:
 def camera_settings(
     K: np.ndarray, height: int, width: int, cameras: Sequence[str]
 ) -> dict[str, Any]:
-    """Return what `_camera_settings.json` says of a folder's cameras."""
+    """Return the content of `_camera_settings.json`; K (3, 3) and sizes in pixels."""
     one = {
         "horizontal_fov": float(np.rad2deg(2 * np.arctan(width / 2 / K[0, 0]))),
         "intrinsic_settings": {
@@ -119,10 +119,14 @@ def camera_settings(
 def frame_record(
     objects: Sequence[ObjectInFrame], K: np.ndarray, right: float = 0.0
 ) -> dict[str, Any]:
-    """Return a frame's JSON.  right: how far right of the left camera this one stands [m].
+    """Return the content of a frame's JSON file.
 
-    There is no world here: the world frame (left-handed, x forward, y right, z up, centimeters) is
-    the left camera's place.
+    The world frame (left-handed, x forward, y right, z up, centimeters) is that of the left camera.
+
+    Args:
+        objects: The objects of the frame.
+        K: (3, 3) camera matrix [px].
+        right: How far right of the left camera this one stands [m].
     """
     camera = {
         "location_worldframe": [0.0, right * CM, 0.0],
@@ -157,9 +161,10 @@ def _object_record(one: ObjectInFrame, K: np.ndarray) -> dict[str, Any]:
 
 
 def write_image(path: Path, image: np.ndarray) -> None:
-    """Write a JPEG (RGB) or PNG; PNGs at a fast level.
+    """Write a JPEG (from RGB) or a PNG, by the path's suffix; all of the file or nothing.
 
-    Raises OSError where it cannot be written.
+    Raises:
+        OSError: It cannot be written.
     """
     if path.suffix == ".jpg":
         ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
@@ -171,21 +176,25 @@ def write_image(path: Path, image: np.ndarray) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON; all of the file or nothing."""
     write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file, whole or not at all: beside it first, then renamed."""
+    """Write a file, all of it or nothing: to a temporary file that is then renamed."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     partial.write_bytes(data)
     partial.replace(path)
 
 
 def depth_units(depth: np.ndarray) -> np.ndarray:
-    """Return depth as it is stored.
+    """Encode depth.
 
-    (H, W) [m] -> (H, W) uint16, 0.1 mm a unit; 0 where nothing or beyond 6.5535 m.
+    Args:
+        depth: (H, W) [m].
+
+    Returns:
+        (H, W) uint16 in 0.1 mm; 0 where there is nothing, and beyond 6.5535 m.
     """
     units = np.round(depth * DEPTH_UNITS)
     return np.where(units > 65535, 0, units).astype(np.uint16)

@@ -1,6 +1,4 @@
-"""Draw the frames of a generated dataset, one at a time, each from the job's settings, the seed and
-its number alone.
-"""
+"""Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +30,7 @@ RENDERERS = ("embree", "opengl")
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that decides what is rendered; written beside the frames."""
+    """All settings that decide what is rendered; saved with the frames."""
 
     object: str
     meshes: str
@@ -52,15 +50,15 @@ class Job:
         return f"mixed/scene{frame // self.frames_per_scene:04d}_0"
 
     def cameras(self) -> tuple[tuple[str, float], ...]:
-        """Return the cameras, and how far right of the left one they stand [m]."""
+        """Return the cameras' names, and how far right of the left one each stands [m]."""
         return (("left", 0.0), ("right", fat.BASELINE)) if self.stereo else (("left", 0.0),)
 
     def scene_generator(self, number: int) -> np.random.Generator:
-        """Return the generator that a folder's scene set is drawn from."""
+        """Return the random generator of a folder's scene set."""
         return np.random.default_rng([self.seed, 1, number])
 
     def files(self, out: Path, frame: int) -> list[Path]:
-        """Return the files of a frame, the one that is written last at the end."""
+        """Return the files of a frame in the order of writing."""
         stem = out / self.folder(frame) / f"{frame % self.frames_per_scene:06d}"
         endings = ("jpg", "depth.png", "seg.png", "json")
         return [
@@ -73,7 +71,8 @@ class Job:
 def make_renderer(name: str) -> Renderer:
     """Return a renderer by its name.
 
-    Raises UserError for an unknown one, and where one cannot run here.
+    Raises:
+        UserError: There is none of that name, or it cannot run on this machine.
     """
     if name == "embree":
         return EmbreeRenderer()
@@ -87,7 +86,7 @@ def make_renderer(name: str) -> Renderer:
 
 
 class FrameRenderer:
-    """Draw frames of one job.  One a process: it keeps the renderer and the meshes."""
+    """Renders frames of one job; each process has its own, with renderer and meshes."""
 
     def __init__(self, job: Job, out: Path, store: MeshStore | None = None) -> None:
         """Set up the renderer, the meshes and the sensor.
@@ -105,7 +104,7 @@ class FrameRenderer:
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
 
     def scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
-        """Return a folder's set, and its classes by name; write the folder's settings."""
+        """Return a folder's scene set and its classes by name; write the folder's settings."""
         if self._scene is None or self._scene[0] != number:
             rng = self.job.scene_generator(number)
             scene = draw_scene_set(self.library, self.job.object, self.job.scenes, rng)
@@ -122,7 +121,14 @@ class FrameRenderer:
         return self._scene[1], self._scene[2]
 
     def draw(self, frame: int) -> tuple[Layout, Rendered, np.random.Generator]:
-        """Return a frame's layout and picture, and its generator as the drawing left it."""
+        """Draw and render a frame.
+
+        Returns:
+            Its layout, the image, and its random generator, for what is drawn afterwards.
+
+        Raises:
+            UserError: No layout shows enough of the target.
+        """
         scene, _ = self.scene(frame // self.job.frames_per_scene)
         rng = np.random.default_rng([self.job.seed, 2, frame])
         height, width = self.job.height, self.job.width
@@ -167,7 +173,7 @@ class FrameRenderer:
             fat.write_json(next(files), record)
 
     def _shows_target(self, picture: Rendered) -> bool:
-        """Tell whether enough of the target is seen."""
+        """Return whether enough of the target is visible."""
         seen, alone = int((picture.index == 0).sum()), int(picture.unoccluded[0])
         least = 0.002 * self.job.width * self.job.height
         return alone >= least and seen >= (1 - self.job.scenes.occlusion) * alone
@@ -180,7 +186,7 @@ class FrameRenderer:
         right: float,
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
-        """Return a camera's color, depth and segment images, and its record."""
+        """Return a camera's color, depth and segmentation images, and its JSON record."""
         photo, depth = simulate_sensor(picture.rgb, picture.depth, self.sensor, rng)
         ids = np.array([*(exported[p.solid.mesh.name].seg_id for p in layout.placed), 0], np.uint8)
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
@@ -199,7 +205,7 @@ class FrameRenderer:
         )
 
     def _truncated(self, hull: np.ndarray) -> float:
-        """Return the share of a hull's outline, by area, that leaves the frame."""
+        """Return the fraction of a hull's outline, by area, that is out of the frame."""
         pixels = (
             hull[:, :2] / hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [self.K[0, 2], self.K[1, 2]]
         ).astype(np.float32)

@@ -1,47 +1,40 @@
-"""Render cluttered scenes in the FAT format: the same for any number of processes, resumable after
-a kill.
+"""Generate cluttered scenes in the FAT format.
+
+The result does not depend on the number of processes, and an interrupted run can be resumed.
 """
 
 import importlib.metadata
 import json
 import logging
-import multiprocessing
-import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import torch
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore
-from posefilter.progress import bars
 from posefilter.synthetic import fat_format as fat
-from posefilter.synthetic.frame_renderer import FrameRenderer, Job, make_renderer
+from posefilter.synthetic.frame_renderer import Job, make_renderer
 from posefilter.synthetic.scenes import SceneSettings, choose_distractors
 from posefilter.synthetic.sensor import sensor_model
 from posefilter.synthetic.settle import load_mujoco
+from posefilter.synthetic.workers import render_frames
 
 log = logging.getLogger(__name__)
 
 GENERATOR = "_generator.json"
 VERSION = 4  # of the scenes that a seed gives: raise it when they change
-FRAMES_PER_TASK = 5
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run did."""
+    """What a call of `generate` did."""
 
     out: Path
     frames: int  # that the dataset holds now
@@ -51,7 +44,7 @@ class Summary:
 
     @property
     def frames_per_second(self) -> float:
-        """Return this run's speed."""
+        """Frames that were rendered for each second."""
         return self.rendered / max(self.seconds, 1e-9)
 
 
@@ -141,16 +134,24 @@ def generate(
     if todo:
         log.info("rendering %d frames of %s into %s", len(todo), object, out)
     began = time.perf_counter()
-    for _ in _run(job, out, todo, workers, progress, store):
-        pass
+    render_frames(job, out, todo, workers, progress, store)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
 
 
 def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
-    """Return K (3, 3) [px] of a named camera, scaled to the size, or of (fx, fy, cx, cy) as given.
+    """Return a camera matrix.
 
-    Raises UserError.
+    Args:
+        camera: "ycb_video" or "fat", scaled to the size, or (fx, fy, cx, cy) [px] as given.
+        width: Of the image [px].
+        height: Of the image [px].
+
+    Returns:
+        K (3, 3) [px].
+
+    Raises:
+        UserError: The name is unknown, or the numbers are impossible.
     """
     named = {"ycb_video": _YCB_VIDEO, "fat": _FAT}
     if isinstance(camera, str):
@@ -160,7 +161,7 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
             )
         fx, fy, cx, cy, w, h = named[camera]
         scale = width / w
-        # another shape of picture: same field of view across, centered
+        # another aspect ratio: the same horizontal field of view, centered
         if abs(height / h - scale) > 0.01 * scale:
             cy = (h - 1) / 2 + ((height / scale) - h) / 2
         fx, fy, cx, cy = fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5
@@ -174,7 +175,7 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
 
 
 def _check(job: Job, frames: int, workers: int) -> None:
-    """Raise UserError for values that cannot be meant."""
+    """Raise UserError for impossible values."""
     low, high = job.scenes.distractors
     rules = [
         (frames < 1, f"frames={frames}: must be at least 1"),
@@ -205,10 +206,15 @@ def _check(job: Job, frames: int, workers: int) -> None:
 
 
 def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
-    """Read the meshes that frames take: the object and their scenes' distractors, no others.
+    """Read the meshes of frames: the object and the distractors of their scenes, no others.
+
+    Args:
+        job: What to render.
+        store: The meshes.
+        frames: Numbers of the frames.
 
     Raises:
-        UserError: One is not there, cannot be read, or is in another unit.
+        UserError: One is missing, cannot be read, or is in another unit.
     """
     if job.object not in store.names() or frames:
         store.load(job.object)
@@ -221,7 +227,7 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
 
 
 def _open_dataset(out: Path, job: Job, frames: int) -> None:
-    """Write the settings into a new dataset, or make sure that the one there has the same."""
+    """Write the settings into a new dataset, or check that an existing one has the same."""
     settings = json.loads(json.dumps({"version": VERSION, **asdict(job)}))
     path = out / GENERATOR
     if path.is_file():
@@ -258,92 +264,6 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return a record's settings with those that came later, and today's name of the renderer."""
+    """Return recorded settings with defaults of later ones, and the renderer's current name."""
     out = {"mesh_scale": 1.0, **settings}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out
-
-
-def _run(
-    job: Job, out: Path, todo: list[int], workers: int, progress: bool, store: MeshStore
-) -> Iterator[int]:
-    """Render frames, here or in processes; yield the number done after each chunk."""
-    chunks: dict[tuple[int, int], list[int]] = {}
-    for i in todo:
-        chunks.setdefault((i // job.frames_per_scene, i // FRAMES_PER_TASK), []).append(i)
-    speed = TextColumn("{task.fields[rate]}")
-    columns = (
-        TextColumn("rendering"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        speed,
-    )
-    with bars(*columns, shown=progress) as bar:
-        task = bar.add_task("frames", total=len(todo), rate="")
-        began, done = time.perf_counter(), 0
-        for count in _results(job, out, list(chunks.values()), workers, store):
-            done += count
-            bar.update(
-                task, completed=done, rate=f"{done / (time.perf_counter() - began):.1f} frames/s"
-            )
-            yield done
-
-
-def _results(
-    job: Job, out: Path, chunks: list[list[int]], workers: int, store: MeshStore
-) -> Iterator[int]:
-    """Yield how many frames each chunk had, as they finish."""
-    if workers == 1 or len(chunks) <= 1:
-        renderer = FrameRenderer(job, out, store)
-        for chunk in chunks:
-            for frame in chunk:
-                renderer.write(frame)
-            yield len(chunk)
-        return
-    context = multiprocessing.get_context("spawn")
-    with _single_threaded_children():
-        pool = ProcessPoolExecutor(min(workers, len(chunks)), context, _start_worker, (job, out))
-        with pool:
-            futures = [pool.submit(_render_chunk, chunk) for chunk in chunks]
-            try:
-                for future in as_completed(futures):
-                    yield future.result()
-            finally:
-                pool.shutdown(cancel_futures=True)
-
-
-_frame_renderer: FrameRenderer | None = None  # one a worker process
-
-
-def _start_worker(job: Job, out: Path) -> None:
-    """Set up a worker process."""
-    global _frame_renderer
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    _frame_renderer = FrameRenderer(job, out)
-
-
-def _render_chunk(chunk: list[int]) -> int:
-    """Render some frames in a worker."""
-    assert _frame_renderer is not None
-    for frame in chunk:
-        _frame_renderer.write(frame)
-    return len(chunk)
-
-
-@contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    """Have processes started meanwhile compute with one thread each: as many threads as cores in
-    each would fight.
-    """
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ.update(dict.fromkeys(names, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value

@@ -289,16 +289,3 @@ def shift_camera(layout: Layout, offset: float) -> Layout:
     placed = tuple(Placed(p.solid, move @ p.camera_from_object) for p in layout.placed)
     planes = tuple(replace(p, camera_from_plane=move @ p.camera_from_plane) for p in layout.planes)
     return replace(layout, placed=placed, planes=planes)
-
-
-__all__ = [
-    "Layout",
-    "Placed",
-    "SceneSet",
-    "SceneSettings",
-    "SolidStore",
-    "choose_distractors",
-    "draw_layout",
-    "draw_scene_set",
-    "shift_camera",
-]

@@ -1,7 +1,4 @@
-"""Draw textures: what tables, floors, walls and unknown boxes are covered with.
-
-All drawn from a numpy Generator.
-"""
+"""Draw random textures of tables, floors, walls and boxes."""
 
 from collections.abc import Sequence
 
@@ -14,9 +11,7 @@ Color = np.ndarray  # (3,) float in [0, 1]
 def noise_field(
     rng: np.random.Generator, size: int, octaves: Sequence[int] = (4, 8, 16, 32, 64)
 ) -> np.ndarray:
-    """Return smooth noise with random weights an octave, spread over [0, 1].  -> (size, size)
-    float32.
-    """
+    """Return smooth noise in [0, 1], a sum of octaves with random weights.  -> (size, size) float32."""
     field = np.zeros((size, size), np.float32)
     for cells in octaves:
         coarse = rng.standard_normal((cells, cells), dtype=np.float32)
@@ -35,7 +30,7 @@ def blurred_noise(rng: np.random.Generator, height: int, width: int, sigma: floa
 
 
 def random_color(rng: np.random.Generator) -> Color:
-    """Draw a color such as rooms have: grays, woods, and any."""
+    """Draw a color of indoor scenes: often gray or brown.  -> (3,) in [0, 1]."""
     kind = rng.random()
     if kind < 0.4:
         color = np.full(3, rng.uniform(0.03, 1)) + rng.normal(0, 0.03, 3)
@@ -121,7 +116,7 @@ def label(rng: np.random.Generator, size: int, base: Color | None = None) -> np.
 
 
 def _write(rng: np.random.Generator, out: np.ndarray, size: int) -> None:
-    """Draw lines of something that looks like writing from afar."""
+    """Draw rows of strokes that look like text."""
     ink = random_color(rng).tolist()
     height = int(rng.integers(3, max(5, size // 10)))
     top, left = (int(x) for x in rng.integers(0, size - 2 * height, 2))
@@ -143,9 +138,16 @@ def random_texture(
     photos: Sequence[np.ndarray] = (),
     weights: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """Draw a texture of a random kind, or cut it out of a photo.  -> (size, size, 3) uint8 RGB.
+    """Draw a texture of a random kind, or crop it from a photo.
 
-    weights: of plain, checker, marble, wood, carpet, stripes, label; equal if not given.
+    Args:
+        rng: Source of randomness.
+        size: Width and height [px].
+        photos: Images (h, w, 3) uint8 to crop from.
+        weights: Of plain, checker, marble, wood, carpet, stripes, label; None: equal.
+
+    Returns:
+        (size, size, 3) uint8 RGB.
     """
     if len(photos) and rng.random() < 0.15:
         out = crop_texture(rng, photos[int(rng.integers(len(photos)))], size)
@@ -158,8 +160,10 @@ def random_texture(
 
 
 def crop_texture(rng: np.random.Generator, photo: np.ndarray, size: int) -> np.ndarray:
-    """Cut a square out of a mesh's texture, colors permuted half of the time.  -> (size, size, 3)
-    float in [0, 1].
+    """Crop a square from an image, with permuted colors half of the time.
+
+    Returns:
+        (size, size, 3) float in [0, 1].
     """
     side = int(rng.integers(min(photo.shape[:2]) // 8 + 1, min(photo.shape[:2]) // 2 + 2))
     row, column = (int(rng.integers(0, n - side + 1)) for n in photo.shape[:2])
@@ -179,9 +183,7 @@ def recolor(rng: np.random.Generator, texture: np.ndarray) -> np.ndarray:
 
 
 def find_dominant_color(texture: np.ndarray) -> Color:
-    """Return the color that most of a texture has: the fullest cell of a coarse histogram that is
-    not black.  -> (3,).
-    """
+    """Return the mean color (3,) of the largest bin of a coarse histogram, black left out."""
     small = cv2.resize(texture, (64, 64), interpolation=cv2.INTER_AREA).reshape(-1, 3)
     small = small[small.max(1) > 40] if (small.max(1) > 40).any() else small
     cell = (small // 43).astype(int) @ [36, 6, 1]
@@ -189,5 +191,5 @@ def find_dominant_color(texture: np.ndarray) -> Color:
 
 
 def to_uint8(colors: np.ndarray) -> np.ndarray:
-    """Round colors in [0, 1] to bytes."""
+    """Convert colors in [0, 1] to uint8."""
     return np.ascontiguousarray(np.clip(colors * 255 + 0.5, 0, 255).astype(np.uint8))

@@ -1,1 +1,1 @@
-"""The objects that the project draws itself."""
+"""The built-in objects, drawn by code."""

@@ -1,7 +1,4 @@
-"""Meshes that the project draws itself: the same every time, no files.
-
-Sizes follow YCB's objects of the same kind.
-"""
+"""The built-in meshes by name: drawn by code, always the same, in the sizes of YCB's objects."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,14 +23,24 @@ def names() -> list[str]:
 
 
 def build(name: str) -> Mesh:
-    """Draw a builtin mesh.  Raises KeyError for unknown names."""
+    """Draw a built-in mesh.
+
+    Raises:
+        KeyError: There is none of that name.
+    """
     return _BUILDERS[name]()
 
 
 def make_printed_box(
     name: str, size: tuple[float, float, float], prints: dict[str, np.ndarray]
 ) -> Mesh:
-    """Make a printed box from its six faces' pictures."""
+    """Make a printed box.
+
+    Args:
+        name: Of the mesh.
+        size: Width, depth, height [m].
+        prints: The image (h, w, 3) uint8 of each of the six faces.
+    """
     w, d, h = size
     # Front and back side by side, the two narrow sides stacked beside them, lid and base below.
     across = round(TEXTURE * w / (2 * w + d))
@@ -63,7 +70,7 @@ def make_printed_box(
 
 
 def _brick() -> Mesh:
-    """Make the foam brick, which half turns about its three axes leave as it is."""
+    """Make the foam brick, which is symmetric under half turns about its three axes."""
     mesh = make_printed_box("brick", builtin_boxes.BRICK_SIZE, builtin_boxes.brick_faces())
     center = mesh.bounds.mean(0)
     return replace(
@@ -75,7 +82,7 @@ def _brick() -> Mesh:
 
 
 def _bowl() -> Mesh:
-    """Make the bowl, which every turn about z leaves as it is."""
+    """Make the bowl, which is symmetric under every rotation about z."""
     return replace(
         builtin_vessels.bowl(),
         symmetries=symmetry_group(continuous=[(np.array([0, 0, 1.0]), np.zeros(3))]),

@@ -1,6 +1,4 @@
-"""A printer for labels: text, barcodes, tables and pictures made of shapes, on a canvas measured in
-millimeters.
-"""
+"""Draw labels: text, barcodes, tables and shapes on a canvas measured in millimeters."""
 
 import cv2
 import numpy as np
@@ -27,7 +25,7 @@ _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 class Canvas:
-    """A picture that is drawn in millimeters."""
+    """An image with coordinates in millimeters."""
 
     def __init__(
         self, width_mm: float, height_mm: float, color: Color, px_per_mm: float = 3.0
@@ -92,8 +90,14 @@ class Canvas:
     def text(
         self, words: str, box: Box, color: Color, weight: float = 0.1, turned: bool = False
     ) -> "Canvas":
-        """Print words as large as the box allows, centered; `weight` is stroke over letter height;
-        `turned` reads upwards.
+        """Print words, centered and as large as the box allows.
+
+        Args:
+            words: The text.
+            box: Where [mm].
+            color: RGB.
+            weight: Width of the stroke over the height of the letters.
+            turned: Print from bottom to top.
         """
         (x0, y0), (x1, y1) = self._at(*box[:2]), self._at(*box[2:])
         room = (y1 - y0, x1 - x0) if turned else (x1 - x0, y1 - y0)
@@ -112,7 +116,7 @@ class Canvas:
         return self
 
     def lines(self, box: Box, color: Color, pitch_mm: float = 3.2, seed: int = 0) -> "Canvas":
-        """Print small text that no camera could read: rows of word-long strokes."""
+        """Print rows of strokes that look like small text."""
         rng = np.random.default_rng(seed)
         y = box[1] + pitch_mm / 2
         while y < box[3]:

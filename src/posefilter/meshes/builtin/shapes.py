@@ -13,19 +13,19 @@ Rect = tuple[float, float, float, float]  # u0, v0, u1, v1: part of the texture,
 
 
 class Soup(NamedTuple):
-    """Loose triangles: corner positions and texture coordinates."""
+    """A triangle soup: corner positions and texture coordinates."""
 
     corners: np.ndarray  # (F, 3, 3) [m]
     uv: np.ndarray  # (F, 3, 2)
 
 
 def join(*soups: Soup) -> Soup:
-    """Put triangles together."""
+    """Concatenate triangle soups."""
     return Soup(np.concatenate([s.corners for s in soups]), np.concatenate([s.uv for s in soups]))
 
 
 def weld(name: str, soup: Soup, texture: np.ndarray, symmetries: np.ndarray | None = None) -> Mesh:
-    """Make a mesh: corners at one place share a vertex, triangles without area go."""
+    """Make a mesh: merge corners at one position, drop triangles without area."""
     rounded = np.round(soup.corners.reshape(-1, 3), 8)
     vertices, inverse = np.unique(rounded, axis=0, return_inverse=True)
     faces = inverse.reshape(-1, 3).astype(np.int64)
