@@ -59,7 +59,7 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
 
 
 class Method(torch.nn.Module):
-    """What the callback asks of a method."""
+    """What the callback uses of a method."""
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
         trace = SimpleNamespace(
             particles=[last], belief=SimpleNamespace(score=torch.arange(3.0), best=guess)
         )
-        table.on_test_batch_end(trainer, method, trace, batch, 0)
+        table.on_test_trace(trainer, method, trace, batch, 0)
     table.on_test_epoch_end(trainer, method)
     return tmp_path, errors
 
