@@ -20,7 +20,8 @@ from dataset_trees import (
 )
 from torch.utils.data import default_collate
 
-from posefilter.data.module import PoseDataModule, spare_cores
+from posefilter.data.loaders import spare_cores
+from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 from posefilter.meshes.store import MeshStore
@@ -368,16 +369,16 @@ def test_an_open_mesh_store_may_be_given(root):
 )
 def test_loader_processes_take_the_cores_that_are_spare(monkeypatch, cores, threads, workers):
     monkeypatch.setattr(
-        "posefilter.data.module.os.sched_getaffinity", lambda _: set(range(cores)), raising=False
+        "posefilter.data.loaders.os.sched_getaffinity", lambda _: set(range(cores)), raising=False
     )
-    monkeypatch.setattr("posefilter.data.module.torch.get_num_threads", lambda: threads)
-    monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("posefilter.data.loaders.torch.get_num_threads", lambda: threads)
+    monkeypatch.setattr("posefilter.data.loaders.torch.cuda.is_available", lambda: False)
     assert spare_cores() == workers
 
 
 def test_a_gpu_leaves_the_cores_to_the_loader(monkeypatch):
     monkeypatch.setattr(
-        "posefilter.data.module.os.sched_getaffinity", lambda _: set(range(4)), raising=False
+        "posefilter.data.loaders.os.sched_getaffinity", lambda _: set(range(4)), raising=False
     )
-    monkeypatch.setattr("posefilter.data.module.torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("posefilter.data.loaders.torch.cuda.is_available", lambda: True)
     assert spare_cores() == 3

@@ -1,16 +1,11 @@
 """The ablations between the paper's methods and the working ones, as one ordered table.
 
-Each row is a name, what it changes, the row that it builds on, and overrides. Rows are registered
-with Hydra, so that they are chosen like files of `conf/ablation/`: `ablation=c2_glimpse`, or all of
-a table in one sweep by `sweep=ablation`. Names begin with `s` for one modification of the paper's
-method alone, `c` for one more modification each, `m` for the working method without one of them;
-`pose_` and `box_` are for methods with a pose and for detectors.
+Each row is a name, what it changes, the row that it builds on, and overrides. Names begin with `s`
+for one modification of the paper's method alone, `c` for one more modification each, `m` for the
+working method without one of them; `pose_` and `box_` are for methods with a pose and detectors.
 """
 
-from typing import Any, NamedTuple
-
-from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
+from typing import NamedTuple
 
 SIZE = "preset/size"  # the group of a working preset's numbers
 
@@ -247,7 +242,7 @@ ABLATIONS = (
     ),
     Ablation(
         "pose_m14_own_point",
-        "Working, with a pose head that does not use the own point (so that nothing can agree on it).",
+        "Working, with a pose head without a surface point (so that no agreement is possible).",
         "working",
         ("model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax"),
     ),
@@ -293,6 +288,15 @@ def find_ablation(name: str) -> Ablation | None:
     return _BY_NAME.get(name)
 
 
+def find_parent(ablation: Ablation) -> Ablation:
+    """Return the row that a row builds on.
+
+    Raises:
+        KeyError: It changes a variant, not a row.
+    """
+    return _BY_NAME[ablation.parent]
+
+
 def list_pose_ablations() -> list[str]:
     """Return the names of the rows for methods with a pose, in order of the table's sweep."""
     return _in_order([a.name for a in ABLATIONS if not a.name.startswith("box_")])
@@ -312,56 +316,3 @@ def _in_order(names: list[str]) -> list[str]:
         "working",
         *names[first:],
     ]
-
-
-def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
-    """Return the variant that a row changes, and its overrides with those of all its parents.
-
-    A later override of the same group or key replaces an earlier one.
-    """
-    chain = [ablation]
-    while not chain[0].parent.startswith("variant="):
-        chain.insert(0, _BY_NAME[chain[0].parent])
-    pairs = [override.partition("=") for step in chain for override in step.overrides]
-    return chain[0].parent.partition("=")[2], {key: value for key, _, value in pairs}
-
-
-def make_node(ablation: Ablation) -> dict[str, Any]:
-    """Return a row as Hydra composes it: a list of defaults, and settings."""
-    variant, overrides = resolve_overrides(ablation)
-    groups = {"variant": variant} | {k: v for k, v in overrides.items() if "." not in k}
-    settings = OmegaConf.from_dotlist([f"{k}={v}" for k, v in overrides.items() if "." in k])
-    plain = OmegaConf.to_container(settings)
-    assert isinstance(plain, dict)
-    return {
-        "defaults": [{f"override /{group}": choice} for group, choice in groups.items()],
-        **{str(key): value for key, value in plain.items()},
-    }
-
-
-def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[str, Any]:
-    return {
-        "defaults": [{f"override /{group}": choice} for group, choice in groups.items()],
-        **settings,
-        "hydra": {"mode": "MULTIRUN", "sweeper": {"params": {"ablation": ",".join(names)}}},
-    }
-
-
-def register_ablations() -> None:
-    """Register the table with Hydra: `ablation=NAME`, `sweep=ablation` and `sweep=ablation_detect`.
-
-    All runs of `sweep=ablation` have the size of the working preset, so that a row differs from the
-    next in its modification alone. All runs of `sweep=ablation_detect` have 32 particles, for time;
-    those that start from the paper keep its 30 steps, since shorter roll-outs are a modification.
-    """
-    store = ConfigStore.instance()
-    for ablation in ABLATIONS:
-        store.store(
-            group="ablation", name=ablation.name, node=make_node(ablation), package="_global_"
-        )
-    sweeps = {
-        "ablation": _sweep(list_pose_ablations(), {SIZE: "${model}"}),
-        "ablation_detect": _sweep(list_detector_ablations(), {}, filter={"particles": 32}),
-    }
-    for name, node in sweeps.items():
-        store.store(group="sweep", name=name, node=node, package="_global_")

@@ -1,33 +1,28 @@
-"""The data of an experiment: one reader, its splits by scene, and loaders that never keep the
-training waiting.
-"""
+"""The data of an experiment: one reader, its splits by scene, and loaders."""
 
-import dataclasses
 import logging
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
-import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from posefilter.data.cache import CACHES, FrameCache, Prepared, open_cache
-from posefilter.data.dataset import EpochShuffle, FrameDataset, ResumableLoader
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.cache import CACHES, open_cache
+from posefilter.data.dataset import EpochShuffle, FrameDataset
+from posefilter.data.decoding import FrameDecoder
+from posefilter.data.frames import FrameRecord, Reader
 from posefilter.data.generated_scenes import ensure_scenes
+from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
 from posefilter.data.ranges import check_ranges
 from posefilter.data.readers.registry import open_meshes, open_reader
-from posefilter.data.resize import network_size, resize
 from posefilter.data.splits import NAMES, Share, split_records
-from posefilter.errors import BadData, UserError
+from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore, object_model
 from posefilter.types import Batch, ObjectModel
 
@@ -45,24 +40,8 @@ _STAGES = {
 }
 
 
-def spare_cores(most: int = 4) -> int:
-    """Return how many loader processes fit beside a training: what cores torch's threads leave, or
-    with a GPU all but one.
-
-    The threads of one operation wait for each other, so a process that takes one's core away holds
-    up all of them.
-    """
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    busy = 1 if torch.cuda.is_available() else torch.get_num_threads()
-    return max(0, min(most, cores - busy))
-
-
 class PoseDataModule(LightningDataModule):
-    """Frames of one dataset with the objects asked for, split by scene, resized, cached and
-    augmented.
-    """
+    """Frames of one dataset with the chosen objects: split by scene, resized, cached, augmented."""
 
     def __init__(
         self,
@@ -94,7 +73,7 @@ class PoseDataModule(LightningDataModule):
         options: Mapping[str, Any] | None = None,
         progress: bool = True,
     ) -> None:
-        """Say what to read; nothing is opened before `setup`.
+        """Set up; no file is opened before `setup`.
 
         Args:
             source: "scenes", "fat", "ycb_video" or "bop".
@@ -126,7 +105,7 @@ class PoseDataModule(LightningDataModule):
             progress: Draw bars.
 
         Raises:
-            UserError: A value makes no sense.
+            UserError: A value is impossible.
         """
         super().__init__()
         check_ranges(locals())
@@ -158,26 +137,26 @@ class PoseDataModule(LightningDataModule):
 
     @cached_property
     def meshes(self) -> MeshStore:
-        """Return the mesh store."""
+        """The mesh store."""
         if isinstance(self._meshes, MeshStore):
             return self._meshes
         return open_meshes(self._meshes, self._mesh_scale, self.source, self._object)
 
     @cached_property
     def reader(self) -> Reader:
-        """Return the dataset's reader."""
+        """The dataset's reader."""
         return open_reader(
             self.source, self.root, self._object, self.meshes, self._on_error, **self._options
         )
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """Return the classes; a batch's `object_id` is an index into them."""
+        """The classes; a batch's `object_id` is an index into them."""
         return self.reader.objects
 
     @cached_property
     def _parts(self) -> dict[str, list[int]]:
-        """Return the indices of each split's records, before any frame is looked at."""
+        """The indices of each split's records, before any frame is decoded."""
         return split_records(self._records, self._split, self._split_seed, self.root)
 
     @cached_property
@@ -185,29 +164,21 @@ class PoseDataModule(LightningDataModule):
         return self.reader.records()
 
     @cached_property
-    def _index(self) -> dict[str, int]:
-        return {record.key: i for i, record in enumerate(self._records)}
-
-    @cached_property
-    def _cache(self) -> FrameCache:
+    def _decoder(self) -> FrameDecoder:
         size = f"{self._image_width}x{self._image_height}"
-        content = (
-            self.source,
-            self.root.resolve(),
-            self.objects,
-            self.meshes.root,
-            size,
-            sorted(self._options.items()),
-        )
-        return open_cache(
-            self._cache_kind,
-            Path(self._cache_dir or self.root / ".cache"),
-            f"1 {content}",
-            self._read,
+        options = sorted(self._options.items())
+        content = (self.source, self.root.resolve(), self.objects, self.meshes.root, size, options)
+        folder = Path(self._cache_dir or self.root / ".cache")
+        return FrameDecoder(
+            self.reader,
+            self._records,
+            self._image_width,
+            self._image_height,
+            partial(open_cache, self._cache_kind, folder, f"1 {content}"),
         )
 
     def prepare_data(self) -> None:
-        """Render the scenes where the source is our own and they are not there yet."""
+        """Render the scenes if the source is `scenes` and they do not exist yet."""
         if self.source == "scenes":
             ensure_scenes(self.root, self._generate)
 
@@ -216,10 +187,14 @@ class PoseDataModule(LightningDataModule):
         for name in _STAGES[stage]:
             if name not in self._datasets:
                 self._datasets[name] = self._prepare(name)
-                log.info("%s", self._told(name))
+                log.info("%s", self._summarize(name))
 
     def object_model(self, object_id: int) -> ObjectModel:
-        """Return what methods and metrics know of a class."""
+        """Return a class as methods and metrics use it.
+
+        Raises:
+            UserError: The dataset has photographs, and meshes are the built-in ones.
+        """
         name = self.objects[object_id]
         if self.source in ("ycb_video", "bop") and str(self.meshes.root) == BUILTIN:
             raise UserError(
@@ -237,12 +212,12 @@ class PoseDataModule(LightningDataModule):
 
     @property
     def train_dataset(self) -> FrameDataset:
-        """Return the training frames, augmented."""
+        """The training frames, augmented."""
         return self._dataset("train")
 
     @property
     def val_dataset(self) -> FrameDataset:
-        """Return the validation frames.
+        """The validation frames.
 
         Raises:
             UserError: The split leaves none.
@@ -257,7 +232,7 @@ class PoseDataModule(LightningDataModule):
 
     @property
     def test_dataset(self) -> FrameDataset:
-        """Return the test frames."""
+        """The test frames."""
         return self._dataset("test")
 
     def set_epoch(self, epoch: int) -> None:
@@ -268,26 +243,23 @@ class PoseDataModule(LightningDataModule):
         """Return shuffled, augmented batches."""
         dataset = self.train_dataset
         order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch)
-        return self._loader(
-            dataset, self._batch_size, sampler=order, drop_last=len(dataset) >= self._batch_size
-        )
+        full = len(dataset) >= self._batch_size
+        return make_loader(dataset, self._batch_size, self._workers, sampler=order, drop_last=full)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         """Return validation batches in order."""
-        return self._loader(self.val_dataset, self._batch_size_test)
+        return make_loader(self.val_dataset, self._batch_size_test, self._workers)
 
     def test_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""
-        return self._loader(self.test_dataset, self._batch_size_test)
+        return make_loader(self.test_dataset, self._batch_size_test, self._workers)
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         """Return test batches in order."""
         return self.test_dataloader()
 
     def split_record(self) -> dict[str, dict[str, int]]:
-        """Return which scenes each split has, with their frames: what the run writes down before it
-        trains.
-        """
+        """Return the scenes of each split with their number of frames."""
         records = self._records
         return {
             name: dict(sorted(Counter(records[i].group for i in part).items()))
@@ -295,9 +267,7 @@ class PoseDataModule(LightningDataModule):
         }
 
     def describe(self) -> dict[str, Any]:
-        """Return what the log should say: objects, frames and scenes a split, and what was left out
-        and why.
-        """
+        """Return objects, frames and scenes of each split, and the frames left out by reason."""
         splits = {}
         for name, dataset in self._datasets.items():
             splits[name] = {
@@ -315,8 +285,8 @@ class PoseDataModule(LightningDataModule):
             "notes": dict(self.reader.notes),
         }
 
-    def _told(self, split: str) -> str:
-        """Return a split in a sentence."""
+    def _summarize(self, split: str) -> str:
+        """Return a sentence about a split."""
         own = self.describe()["splits"][split]
         left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
         return f"{split}: {own['frames']} frames of {own['scenes']} scenes" + (
@@ -342,7 +312,7 @@ class PoseDataModule(LightningDataModule):
         want = Criteria(self._least[split], limit, self._on_error)
         title = f"decoding {split} frames"
         chosen, self._left_out[split] = usable(
-            records, self._fetch, want, max(self._workers, 2), title, self._progress
+            records, self._decoder.fetch, want, max(self._workers, 2), title, self._progress
         )
         if part and not chosen and limit != 0:
             raise UserError(
@@ -350,35 +320,5 @@ class PoseDataModule(LightningDataModule):
                 f"{dict(self._left_out[split])}"
             )
         return FrameDataset(
-            chosen, self._cache, self._augment if split == "train" else None, self._seed
-        )
-
-    def _fetch(self, record: FrameRecord) -> Prepared | BadData:
-        kept = self._cache.find(record)
-        if kept is not None:
-            return kept
-        try:
-            sample = self._read(record)
-            sample = dataclasses.replace(sample, visibility=self.reader.visible_share(sample))
-        except BadData as error:
-            return error
-        return self._cache.keep(record, sample)
-
-    def _read(self, record: FrameRecord) -> Sample:
-        """Decode a frame and resize it."""
-        sample = self.reader.read(self._index[record.key])
-        height, width = sample.mask.shape
-        return resize(sample, *network_size(height, width, self._image_width, self._image_height))
-
-    def _loader(self, dataset: FrameDataset, batch_size: int, **how: Any) -> DataLoader[Batch]:
-        # a forked worker would wait for ever for OpenCV threads that only its parent has
-        if self._workers > 0:
-            cv2.setNumThreads(1)
-        return ResumableLoader(
-            dataset,
-            batch_size=batch_size,
-            num_workers=self._workers,
-            persistent_workers=self._workers > 0,
-            pin_memory=torch.cuda.is_available(),
-            **how,
+            chosen, self._decoder.cache, self._augment if split == "train" else None, self._seed
         )

@@ -1,0 +1,51 @@
+"""Data loaders, and the number of their processes."""
+
+import os
+from typing import Any
+
+import cv2
+import torch
+from torch.utils.data import DataLoader
+
+from posefilter.data.dataset import FrameDataset, ResumableLoader
+from posefilter.types import Batch
+
+
+def spare_cores(most: int = 4) -> int:
+    """Return the number of loader processes: the cores that torch's threads do not use.
+
+    With a GPU that is all but one. The threads of one operation wait for each other, so a process
+    that takes the core of one delays all of them.
+
+    Args:
+        most: Largest number.
+    """
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
+    busy = 1 if torch.cuda.is_available() else torch.get_num_threads()
+    return max(0, min(most, cores - busy))
+
+
+def make_loader(
+    dataset: FrameDataset, batch_size: int, workers: int, **options: Any
+) -> DataLoader[Batch]:
+    """Return a loader that can be resumed.
+
+    Args:
+        dataset: The frames.
+        batch_size: Frames of a batch.
+        workers: Loader processes.
+        **options: Others of `DataLoader`.
+    """
+    # a forked worker would wait for ever for OpenCV threads that only its parent has
+    if workers > 0:
+        cv2.setNumThreads(1)
+    return ResumableLoader(
+        dataset,
+        batch_size=batch_size,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        pin_memory=torch.cuda.is_available(),
+        **options,
+    )
