@@ -1,4 +1,6 @@
-"""Tell whether a dataset fits its meshes: python check_data.py data=fat data.root=DIR meshes=DIR."""
+"""Tell whether a dataset fits its meshes: python check_data.py data=fat data.root=DIR
+meshes=DIR.
+"""
 
 import sys
 

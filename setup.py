@@ -1,4 +1,5 @@
-"""Put the configuration and the weights that ship into the wheel; all the rest is in pyproject.toml.
+"""Put the configuration and the weights that ship into the wheel; all the rest is in
+pyproject.toml.
 
 An editable install reads them where they are, at the top of the clone.
 """

@@ -1,7 +1,8 @@
 """Measure what a change of color alone costs a trained filter: the same images, recolored in known
 ways.
 
-    python bench/color_shift.py CHECKPOINT --source ycb_video --root DIR --meshes DIR [--images 20] [--out FILE.json]
+    python bench/color_shift.py CHECKPOINT --source ycb_video --root DIR --meshes DIR
+        [--images 20] [--out FILE.json]
 
 The depth, and so the geometry, is the same in every row. A filter whose figures fall relies on
 colors that another camera does not reproduce. `outscored` is the share of images in which a wrong
@@ -31,7 +32,9 @@ _SAME = np.eye(3)
 
 
 def shifts() -> dict[str, tuple[np.ndarray, float]]:
-    """Return the shifts by name: a 3 x 3 matrix and an exponent each (see `photometric.respond`)."""
+    """Return the shifts by name: a 3 x 3 matrix and an exponent each (see
+    `photometric.respond`).
+    """
     warm, cold = (np.diag(tint_gains(sign * np.array([0.12, 0.0, -0.12]))) for sign in (1, -1))
     out = {"as it is": (_SAME, 1.0)}
     out |= {

@@ -50,7 +50,8 @@ def validate(
     trainer = Trainer(
         logger=TensorBoardLogger(folder, name="", version="", default_hp_metric=False),
         callbacks=[first, *callbacks, last],
-        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False, inference_mode=False,
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+        inference_mode=False,
     )  # fmt: skip
     trainer.validate(method, datamodule=data, verbose=False)
     return last.ended[0] - first.began[0], last.ended[1] - first.began[1]

@@ -1,8 +1,10 @@
 """Run every run behind docs/results, the most telling first, and bring its tables up to date
 after each line of the plan.
 
-    python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]   # --only may be repeated
-    python bench/methods.py --meshes DIR --frames DIR    # and the real cracker box: YCB's meshes, YCB-Video's frames
+    python bench/methods.py [--only TABLE] [--list] [--root outputs/methods] [KEY=VALUE ...]
+    python bench/methods.py --meshes DIR --frames DIR    # and the real cracker box
+
+`--only` may be repeated; the real cracker box needs YCB's meshes and YCB-Video's frames.
 
 Each line of the plan is one sweep of train.py, or of evaluate.py on checkpoints of earlier lines,
 and is printed as it could be typed. Started again, it goes on: train.py skips the jobs that are
@@ -108,7 +110,10 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     ):
         seeds = f"experiment=memorize sweep={sweep} ablation={ablations} seed=1,2"
         lines += [Line(sweep, f"model={m} {seeds}", into=f"{m}_seeds") for m in models]
-        long = f"experiment=memorize sweep={sweep} ablation=paper trainer.max_steps=2000 trainer.val_check_interval=2000 seed=0"
+        long = (
+            f"experiment=memorize sweep={sweep} ablation=paper trainer.max_steps=2000 "
+            "trainer.val_check_interval=2000 seed=0"
+        )
         lines += [Line("paper_longer", f"model={','.join(models)} {long}", into=sweep)]
     lines += [
         Line("untrained", f"{memorize} variant=paper {UNTRAINED} seed=1,2,3,4"),
@@ -117,7 +122,8 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("held_out", f"{FOUR} seed=1,2"),
         Line(
             "held_out_less",
-            "model=patch_pf ablation=m9_context,pose_m17_fragments,m11_muon,m5_displacement_loss seed=0",
+            "model=patch_pf "
+            "ablation=m9_context,pose_m17_fragments,m11_muon,m5_displacement_loss seed=0",
         ),
         ablation("held_out_less", "filter/resample=none", HELD_OUT, "patch_pf"),
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),

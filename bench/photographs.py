@@ -132,7 +132,9 @@ def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
 
 
 def evaluate_commands(run: Run, root: Path, meshes: str, frames: str) -> list[list[str]]:
-    """Return what to run to test one filter on the photographs, and on 24 of the held-out renders."""
+    """Return what to run to test one filter on the photographs, and on 24 of the held-out
+    renders.
+    """
     checkpoint = root / "runs" / run.name / "checkpoints" / "best.ckpt"
     photographs = ["data=ycb_video", f"data.root={frames}", f"data.meshes={meshes}"]
     renders = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]

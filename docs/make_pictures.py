@@ -1,6 +1,7 @@
 """Make the pictures of README.md and docs/ from real runs: `make pictures`, never by hand.
 
-    python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR] [--meshes builtin|DIR] [--tour outputs/tour]
+    python docs/make_pictures.py [--checkpoint weights/NAME.ckpt] [--scenes DIR]
+        [--meshes builtin|DIR] [--tour outputs/tour]
                                  [--methods outputs/methods]
 
 Of a checkpoint: what it finds in rendered scenes that no training saw, its belief about one, and
@@ -265,7 +266,9 @@ def of_ablations(runs: Path, out: Path) -> None:
 
 
 def of_filters(methods: Path, out: Path) -> None:
-    """Write filters.jpg: quality and cost over the filter's size, a row a setting, a line a method."""
+    """Write filters.jpg: quality and cost over the filter's size, a row a setting, a line a
+    method.
+    """
     tiles = []
     for axis, table in SIZES.items():
         found = {
@@ -299,10 +302,23 @@ def screen(page: Path, dark: bool) -> np.ndarray:
     """Return a page's first screen as a browser shows it."""
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / "shot.png"
-        command = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-                   "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
-                   f"--user-data-dir={folder}/profile", f"--screenshot={shot}", "--window-size=900,1100",
-                   *(["--blink-settings=preferredColorScheme=0"] if dark else []), page.resolve().as_uri()]  # fmt: skip
+        command = [
+            str(BROWSER),
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-quic",
+            "--no-first-run",
+            "--disable-background-networking",
+            "--disable-component-update",
+            "--disable-sync",
+            "--hide-scrollbars",
+            f"--user-data-dir={folder}/profile",
+            f"--screenshot={shot}",
+            "--window-size=900,1100",
+            *(["--blink-settings=preferredColorScheme=0"] if dark else []),
+            page.resolve().as_uri(),
+        ]
         subprocess.run(command, check=True, capture_output=True, timeout=300)
         return np.asarray(Image.open(shot).convert("RGB"))
 

@@ -1,9 +1,10 @@
-"""What methods and their pieces provide, and what pieces require: plain names, matched by one check.
+"""What methods and their pieces provide, and what pieces require: plain names, matched by one
+check.
 
 A class says so by two class attributes, `provides` and `requires`, tuples of names; a subclass that
-says nothing has its parent's. What is chosen fits together where every requirement of every piece is
-provided by the method or by one of its pieces. A new method is checked, trained and drawn by these
-names alone.
+says nothing has its parent's. What is chosen fits together where every requirement of every piece
+is provided by the method or by one of its pieces. A new method is checked, trained and drawn by
+these names alone.
 """
 
 from collections.abc import Iterable, Mapping
@@ -69,7 +70,9 @@ def read_declared(kind: type) -> Declared:
 
 
 def list_parts(thing: Any) -> list[Any]:
-    """Return an object and all that it is made of: public attributes, torch's submodules, containers."""
+    """Return an object and all that it is made of: public attributes, torch's submodules,
+    containers.
+    """
     found: dict[int, Any] = {}
     waiting = [thing]
     while waiting:

@@ -113,7 +113,9 @@ class HasSurfacePoints(Protocol):
 
 @runtime_checkable
 class HasImagePatches(Protocol):
-    """A method whose particles each see a patch of the image: the figure of glimpses asks for it."""
+    """A method whose particles each see a patch of the image: the figure of glimpses asks for
+    it.
+    """
 
     def image_patches(self, scene: Scene, state: Tensor) -> Tensor:
         """Return what particles (B, N, 2) [px] see: (B, N, C, k, k), color in [-1, 1] first."""

@@ -64,7 +64,9 @@ class Method(torch.nn.Module):
 
 @pytest.fixture
 def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseErrors]:
-    """Return the folder of a test of two batches, and the metric that its metrics.json would have."""
+    """Return the folder of a test of two batches, and the metric that its metrics.json would
+    have.
+    """
     monkeypatch.setattr("posefilter.callbacks.errors.PoseEstimator", Method)
     monkeypatch.setattr(
         "posefilter.callbacks.errors.find_shape", lambda trainer, method: method.model.hull

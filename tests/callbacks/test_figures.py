@@ -116,7 +116,8 @@ class Told(PoseEstimator):
 
 def validate(folder: Path, *callbacks: Any) -> None:
     trainer = Trainer(
-        accelerator="cpu", logger=TensorBoardLogger(folder, name="", version=""), callbacks=list(callbacks),
+        accelerator="cpu", logger=TensorBoardLogger(folder, name="", version=""),
+        callbacks=list(callbacks),
         enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
     )  # fmt: skip
     trainer.validate(Told(), DataLoader(scenes(), batch_size=3), verbose=False)  # type: ignore[arg-type]
@@ -161,7 +162,8 @@ def test_pictures_are_on_the_board_and_in_the_folder(
     }
     tags = sorted(board.Tags()["images"])  # as TensorBoard orders them
     assert tags == [
-        "1_poses/overlays", "1_poses/worst", "2_filter/animation", "2_filter/health", "2_filter/particles",
+        "1_poses/overlays", "1_poses/worst", "2_filter/animation", "2_filter/health",
+        "2_filter/particles",
         "3_belief/belief",
     ]  # fmt: skip
     for tag, file in (

@@ -123,11 +123,16 @@ def test_layout_is_read_back_in_the_storys_order(tmp_path: Path) -> None:
 
 def test_every_chart_finds_what_methods_log() -> None:
     logged = [
-        "val/score", "val/add/auc", "val/add_s/auc", "val/add/median_mm", "val/add/recall_01d", "val/iou",
-        "val/particles_on_object", "train/total", "train/likelihood", "train/learning_rate", "train/coordinate_error_mm",
-        "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00", "filter/spread_px/step_00",
-        "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/coverage_50", "val/belief/mass_2cm",
-        "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_share", "speed/drawing_share",
+        "val/score", "val/add/auc", "val/add_s/auc", "val/add/median_mm", "val/add/recall_01d",
+        "val/iou",
+        "val/particles_on_object", "train/total", "train/likelihood", "train/learning_rate",
+        "train/coordinate_error_mm",
+        "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00",
+        "filter/spread_px/step_00",
+        "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/coverage_50",
+        "val/belief/mass_2cm",
+        "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_share",
+        "speed/drawing_share",
     ]  # fmt: skip
     for charts in LAYOUT.values():
         for title, (_, tags) in charts.items():

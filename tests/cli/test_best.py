@@ -43,8 +43,15 @@ def test_of_equal_validations_the_latest_is_kept(
         mode="max",
         enable_version_counter=False,
     )
-    trainer = Trainer(max_epochs=3, callbacks=[keep], logger=False, accelerator="cpu", enable_progress_bar=False,
-                      enable_model_summary=False, num_sanity_val_steps=0)  # fmt: skip
+    trainer = Trainer(
+        max_epochs=3,
+        callbacks=[keep],
+        logger=False,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
     one = DataLoader([torch.zeros(1)])
     trainer.fit(Scored(scores), one, one)
     assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == step

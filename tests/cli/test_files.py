@@ -1,4 +1,6 @@
-"""Files are whole or not there, and a run goes on from the checkpoint before where the last is broken."""
+"""Files are whole or not there, and a run goes on from the checkpoint before where the last is
+broken.
+"""
 
 import shutil
 import subprocess
@@ -32,8 +34,15 @@ class Small(LightningModule):
 
 def fit(folder: Path, steps: int, minutes: float | None, start: Path | None = None) -> list[str]:
     """Train without validations; return the files that are there at the end."""
-    trainer = Trainer(max_steps=steps, callbacks=[Last(str(folder), minutes)], plugins=WholeCheckpoints(), logger=False,
-                      accelerator="cpu", enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
+    trainer = Trainer(
+        max_steps=steps,
+        callbacks=[Last(str(folder), minutes)],
+        plugins=WholeCheckpoints(),
+        logger=False,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
     trainer.fit(Small(), DataLoader([torch.zeros(1)] * 10), ckpt_path=start, weights_only=True)
     return sorted(file.name for file in folder.glob("*"))
 

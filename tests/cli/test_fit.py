@@ -1,4 +1,6 @@
-"""Choices are matched by what classes declare, before torch is imported, and a refusal names what fits."""
+"""Choices are matched by what classes declare, before torch is imported, and a refusal names what
+fits.
+"""
 
 import re
 import subprocess
@@ -74,7 +76,8 @@ REFUSED = {
     "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrast"),
     "model=patch_pf loss=contrast": (
         "candidate poses",
-        "choose loss=add, add_s, balanced_bce, bce, chamfer, chamfer_rgbd, confidence, focal or offset",
+        "choose loss=add, add_s, balanced_bce, bce, chamfer, chamfer_rgbd, confidence, focal or "
+        "offset",
     ),
     "model=cnn_patch loss=add": ("loss=balanced_bce, bce, chamfer, chamfer_rgbd, focal or offset",),
     "model=patch_pf filter/refine=rescore": ("filter/refine=rescore", "choose filter/refine=none"),

@@ -32,7 +32,8 @@ REFUSED = {
     "onboard": "mesh: is missing; name an .obj, .ply or .glb file",
     "onboard mesh=nowhere.obj": "mesh=nowhere.obj: no such file",
     "report run=nowhere": "run=nowhere: no such folder",
-    "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, 003_cracker_box",
+    "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, "
+    "003_cracker_box",
     "fly": "fly: there is no such command; choose train, evaluate",
 }
 OWN = {**os.environ, "PYTHONPATH": str(HOME / "src")}  # wherever it is started

@@ -28,7 +28,9 @@ CONF = Path(__file__).parents[2] / "conf"
 def test_training_is_shared_where_nothing_that_it_reads_differs(
     common: list[str], changed: list[str], same: bool, tmp_path: Path
 ) -> None:
-    """pose_pf scores candidates and rolls out no filter; a truncated roll-out has as many particles."""
+    """pose_pf scores candidates and rolls out no filter; a truncated roll-out has as many
+    particles.
+    """
     changed = [f"model.{c}" if c.startswith("train_pixels") else c for c in changed]
     one = compose_job("train", CONF, common, tmp_path / "one")
     other = compose_job("train", CONF, [*common, *changed], tmp_path / "other")

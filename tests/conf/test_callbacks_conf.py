@@ -1,4 +1,6 @@
-"""One line of config switches the looking off; runs are told apart by their choices and settings."""
+"""One line of config switches the looking off; runs are told apart by their choices and
+settings.
+"""
 
 from pathlib import Path
 

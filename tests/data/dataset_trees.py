@@ -1,4 +1,6 @@
-"""Small datasets with analytic truth: an L of two boxes, its depth by intersecting rays with slabs."""
+"""Small datasets with analytic truth: an L of two boxes, its depth by intersecting rays with
+slabs.
+"""
 
 import json
 from pathlib import Path
@@ -134,7 +136,9 @@ def fat_frame(
     eye: str = "left",
     ending: str = "jpg",
 ) -> None:
-    """Write one camera's frame: objects as (class, segment id, camera_from_object of the left eye)."""
+    """Write one camera's frame: objects as (class, segment id, camera_from_object of the left
+    eye).
+    """
     shift = np.eye(4)
     shift[0, 3] = -0.06 if eye == "right" else 0.0
     poses = [shift @ p for _, _, p in objects]

@@ -92,8 +92,15 @@ def test_materials_are_put_into_one_picture(tmp_path: Path) -> None:
     assert surface_colors(mesh, np.array([0]), weights)[0].tolist() == pytest.approx(
         [1, 0, 0], abs=1e-6
     )
-    plain = Mesh("p", mesh.vertices, mesh.faces[1:], np.array([[[0, 0], [1, 0], [0, 1]]], dtype=np.float32), picture, None,
-                 mesh.corner_normals[1:])  # fmt: skip
+    plain = Mesh(
+        "p",
+        mesh.vertices,
+        mesh.faces[1:],
+        np.array([[[0, 0], [1, 0], [0, 1]]], dtype=np.float32),
+        picture,
+        None,
+        mesh.corner_normals[1:],
+    )
     assert surface_colors(mesh, np.array([1]), weights) == pytest.approx(
         surface_colors(plain, np.array([0]), weights), abs=0.01
     )

@@ -1,4 +1,6 @@
-"""Animations and silhouettes: outlines lie on the object, and frames go from one cloud to the next."""
+"""Animations and silhouettes: outlines lie on the object, and frames go from one cloud to the
+next.
+"""
 
 from io import BytesIO
 

@@ -34,7 +34,9 @@ def two_images() -> Batch:
 
 
 def hypotheses_of_belief() -> torch.Tensor:
-    """Return the poses that the belief about the second image is drawn from, (4, 4, 4), far apart."""
+    """Return the poses that the belief about the second image is drawn from, (4, 4, 4), far
+    apart.
+    """
     g = torch.Generator().manual_seed(1)
     place = torch.tensor([[0.0, 0, 0.8], [0.3, 0, 0.8], [0, 0.3, 0.9], [-0.3, 0, 1.0]])
     return make_pose(random_rotation(4, generator=g), place)

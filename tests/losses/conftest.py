@@ -50,7 +50,9 @@ def batch() -> Batch:
 
 @pytest.fixture
 def make_trace() -> Callable[..., Trace]:
-    """Build a trace from its places (T, N, 2), and of the readings whichever parts a test is about."""
+    """Build a trace from its places (T, N, 2), and of the readings whichever parts a test is
+    about.
+    """
 
     def make(
         state: torch.Tensor,

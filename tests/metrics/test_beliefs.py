@@ -57,7 +57,9 @@ def test_mass_counts_weight_not_particles() -> None:
 
 
 def ranks(believed: float, real: float, images: int = 1500) -> torch.Tensor:
-    """Ranks where the belief says that its center is off by `believed`, while it is off by `real`."""
+    """Ranks where the belief says that its center is off by `believed`, while it is off by
+    `real`.
+    """
     g = Generator().manual_seed(0)
     middle = truths(images, g)
     truth = around(middle, real, 1, g)[:, 0]

@@ -100,7 +100,9 @@ def test_told_the_truth_every_particle_reaches_the_object(
 
 
 def test_told_only_the_mean_they_drift_together_and_miss() -> None:
-    """What a network that sees nothing of use can learn at best: the signs tell it from the truth."""
+    """What a network that sees nothing of use can learn at best: the signs tell it from the
+    truth.
+    """
     batch = scenes()
     pieces = (
         UniformPixels(),

@@ -115,8 +115,13 @@ def test_the_pixels_motion_ends_as_it_was_drawn() -> None:
         optimizer.zero_grad()
         taught(method)
         optimizer.step()
-    same = {part for part in ("latent", "pose", "likelihood", "displacement")
-            if all(torch.equal(drawn[n], p) for n, p in method.net.named_parameters() if n.startswith(part))}  # fmt: skip
+    same = {
+        part
+        for part in ("latent", "pose", "likelihood", "displacement")
+        if all(
+            torch.equal(drawn[n], p) for n, p in method.net.named_parameters() if n.startswith(part)
+        )
+    }
     assert same == {"likelihood", "displacement"}
 
 

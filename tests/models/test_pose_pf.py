@@ -68,7 +68,9 @@ def error(method: PosePF, count: int = 16, more: tuple[int, int] = (0, 0)) -> to
 
 
 def widened(batch: Batch, columns: int, rows: int) -> Batch:
-    """Return the batch with background on the right and below; what was to be seen keeps its place."""
+    """Return the batch with background on the right and below; what was to be seen keeps its
+    place.
+    """
     rgb, depth, mask = (
         pad(x, (0, columns, 0, rows), value=v)
         for x, v in zip(batch[:3], (0.5, 1.5, 0), strict=True)

@@ -144,10 +144,22 @@ def test_progress_is_the_share_of_the_steps_that_are_done() -> None:
 
 
 # twenty steps: stages end at 0.4 and 0.6 of them, so that steps 8 and 12 are the first of the next
-THREE = {0: {"displacement"}, 7: {"displacement"}, 8: {"loss", "likelihood", "pose", "relevance"},
-         11: {"loss", "likelihood", "pose", "relevance"}, 12: set(), 19: set()}  # fmt: skip
-THREE_MOTION = {0: {"loss", "displacement"}, 7: {"loss", "displacement"}, 8: {"likelihood", "sides", "relevance"},
-                11: {"likelihood", "sides", "relevance"}, 12: set(), 19: set()}  # fmt: skip
+THREE = {
+    0: {"displacement"},
+    7: {"displacement"},
+    8: {"loss", "likelihood", "pose", "relevance"},
+    11: {"loss", "likelihood", "pose", "relevance"},
+    12: set(),
+    19: set(),
+}
+THREE_MOTION = {
+    0: {"loss", "displacement"},
+    7: {"loss", "displacement"},
+    8: {"likelihood", "sides", "relevance"},
+    11: {"likelihood", "sides", "relevance"},
+    12: set(),
+    19: set(),
+}
 
 
 @pytest.mark.parametrize(
@@ -211,8 +223,16 @@ def test_a_training_walks_through_its_stages() -> None:
     """With a trainer that counts for itself: over two epochs, and where two batches make a step."""
     torch.manual_seed(0)
     watch = Watch()
-    trainer = Trainer(max_steps=5, accumulate_grad_batches=2, callbacks=[watch], accelerator="cpu", logger=False,
-                      enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
+    trainer = Trainer(
+        max_steps=5,
+        accumulate_grad_batches=2,
+        callbacks=[watch],
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
     trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement")), data)
     first, second = {"loss", "displacement"}, {"likelihood", "sides", "relevance"}

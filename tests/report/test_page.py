@@ -209,7 +209,10 @@ def test_the_browser_notices(run: Path, tmp_path: Path) -> None:
     can fail.
     """
     text = make_run_page(read_run(run), [], "x").render()
-    bad = '<img src="data:image/png;base64,AAAA"><div style="width:700px">x</div><script>1</script></body>'
+    bad = (
+        '<img src="data:image/png;base64,AAAA"><div style="width:700px">x</div>'
+        "<script>1</script></body>"
+    )
     (tmp_path / "bad.html").write_text(text.replace("</body>", bad))
     with browser(tmp_path / "profile") as page:
         page.open((tmp_path / "bad.html").as_uri(), 390, phone=False)
@@ -220,7 +223,9 @@ def test_the_browser_notices(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_command(run: Path, sweep: Path) -> None:
-    """`report.py` writes the page beside the run; a mistake is one line, and leaves nothing behind."""
+    """`report.py` writes the page beside the run; a mistake is one line, and leaves nothing
+    behind.
+    """
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(HOME / "report.py"), *arguments]

@@ -28,7 +28,9 @@ def numbers(metrics: dict) -> dict:
 
 
 def check_registry(metrics: dict) -> None:
-    """Assert that each number which a run writes down is known by name: nothing else can be shown."""
+    """Assert that each number which a run writes down is known by name: nothing else can be
+    shown.
+    """
     keys = [key for key in list_numbers(metrics) if key != "seed" and not key.startswith("data/")]
     assert len(keys) > 10
     assert all(find_metric(key).label for key in keys)

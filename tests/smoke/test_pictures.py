@@ -87,7 +87,9 @@ def test_the_tour_is_pictured_as_far_as_it_was_run(
 def test_what_a_filter_s_size_buys_is_pictured_where_it_was_measured(
     script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A row a setting, a chart a figure, a color a method; one without a pose has no line in ADD's."""
+    """A row a setting, a chart a figure, a color a method; one without a pose has no line in
+    ADD's.
+    """
     script.of_filters(tmp_path, tmp_path / "out")
     assert "left as it is: filters.jpg" in capsys.readouterr().out
     for axis, table in script.SIZES.items():

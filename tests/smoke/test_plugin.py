@@ -1,4 +1,6 @@
-"""The example plug-in: a loss, a likelihood, a reader and a method of one's own, trained and tested."""
+"""The example plug-in: a loss, a likelihood, a reader and a method of one's own, trained and
+tested.
+"""
 
 import json
 from pathlib import Path

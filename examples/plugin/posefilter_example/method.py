@@ -15,7 +15,9 @@ from posefilter.types import Batch, ParticleOutput, Particles, Step, Trace
 
 
 class ColorWalk(PoseEstimator):
-    """A small network turns the color and depth under a particle into a likelihood and a displacement."""
+    """A small network turns the color and depth under a particle into a likelihood and a
+    displacement.
+    """
 
     provides: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 

@@ -11,7 +11,9 @@ from posefilter.meshes.store import MeshStore
 
 
 class NpzReader(BaseReader):
-    """Each file has rgb, depth, mask, intrinsics and camera_from_object, as `Sample` describes them."""
+    """Each file has rgb, depth, mask, intrinsics and camera_from_object, as `Sample` describes
+    them.
+    """
 
     def __init__(
         self, root: str | Path, objects: str | Sequence[str] | None = None,

@@ -36,8 +36,8 @@ class Diagnostics(TraceCallback):
     """Log where the particles are, step by step, after each validation; draw it of a test, with
     trajectories of some images.
 
-    The numbers themselves are among the method's metrics (val/diagnostics/...).  Silent for methods whose
-    particles are no pixels.
+    The numbers themselves are among the method's metrics (val/diagnostics/...).  Silent for methods
+    whose particles are no pixels.
 
     Args:
         folder: Where figures and animations are written; nowhere if null.

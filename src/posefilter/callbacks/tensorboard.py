@@ -18,9 +18,11 @@ from posefilter.figures.canvas import to_jpeg
 # What is in no group is only written to the run's folder.
 GROUPS = {
     "overlays": "1_poses", "worst": "1_poses",
-    "particles": "2_filter", "animation": "2_filter", "trajectories": "2_filter", "health": "2_filter",
+    "particles": "2_filter", "animation": "2_filter", "trajectories": "2_filter",
+    "health": "2_filter",
     "belief": "3_belief",
-    "field": "4_network", "proposals": "4_network", "relevance": "4_network", "glimpses": "4_network",
+    "field": "4_network", "proposals": "4_network", "relevance": "4_network",
+    "glimpses": "4_network",
     "diagnostics": "5_diagnostics",
 }  # fmt: skip
 TEST = "6_test"

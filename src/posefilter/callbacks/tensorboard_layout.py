@@ -93,7 +93,8 @@ LAYOUT: dict[str, dict[str, Chart]] = {
 # and what the test found.
 METRICS = (
     "val/score", "val/best_score",
-    "test/add/auc", "test/add/recall_01d", "test/add/median_mm", "test/add_s/auc", "test/iou", "test/particles_on_object",
+    "test/add/auc", "test/add/recall_01d", "test/add/median_mm", "test/add_s/auc", "test/iou",
+    "test/particles_on_object",
     "test/seconds_per_image", "test/belief/mass_2cm", "test/belief/coverage_90",
 )  # fmt: skip
 # TensorBoard shows the settings that differ first, five of them unless asked for more; these always

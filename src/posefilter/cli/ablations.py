@@ -169,7 +169,8 @@ ABLATIONS = (
     Ablation("box_c13_muon", "Also Muon.", "box_c12_gated", ("optimizer=muon",)),
     Ablation(
         "box_c14_size",
-        "Also the working method's size: ten steps in tests, a narrower network with two layers more.",
+        "Also the working method's size: ten steps in tests, a narrower network with two layers "
+        "more.",
         "box_c13_muon",
         (f"{SIZE}=${{model}}",),
     ),
@@ -214,7 +215,8 @@ ABLATIONS = (
     ),
     Ablation(
         "m8_truncated",
-        "Working, with full training roll-outs of particles half of which start on or around the object.",
+        "Working, with full training roll-outs of particles half of which start on or around the "
+        "object.",
         "working",
         ("model/train_rollout=full", "filter/initialize=informed"),
     ),
@@ -274,8 +276,8 @@ ABLATIONS = (
 )
 
 # Left out of the detectors' sweep: s5_position equals paper (a whole-pixel glimpse has no gradient
-# through its position), so s9 equals s4; s3, s6 and s8 say nothing about a detector; from c3_bounded
-# to c5_displacement_loss the gradient of 30 steps overflows.
+# through its position), so s9 equals s4; s3, s6 and s8 say nothing about a detector; from
+# c3_bounded to c5_displacement_loss the gradient of 30 steps overflows.
 _NOT_OF_DETECTORS = (
     "s3_balanced", "s5_position", "s6_informed", "s8_resample", "s9_displacement_loss_and_position",
     "c3_bounded", "c4_balanced", "c5_displacement_loss",

@@ -229,7 +229,8 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         found = re.search(r"Could not override '([^']+)'", text)
         if found:
             key = found[1]
-            return f"{key}: there is no such setting{near(key, known_keys(name, conf, arguments, key))}"
+            nearest = near(key, known_keys(name, conf, arguments, key))
+            return f"{key}: there is no such setting{nearest}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: is missing; give {error.full_key}=..."
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):

@@ -248,8 +248,8 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
 
 
 def keep_training_results(folder: Path) -> None:
-    """Set what a run's own test has written aside, before an evaluation in its folder writes others:
-    `metrics_train.json`, `errors_train.csv`.
+    """Set what a run's own test has written aside, before an evaluation in its folder writes
+    others: `metrics_train.json`, `errors_train.csv`.
     """
     if not (folder / "metrics.json").is_file() or holds_evaluation(folder):
         return

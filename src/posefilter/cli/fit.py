@@ -217,7 +217,8 @@ def list_fitting(
 def find_choice(
     key: str, target: str, choices: Mapping[str, str], groups: Groups
 ) -> tuple[str, str] | None:
-    """Return the (group, name) of the choice that puts a class at a place; None where there is none.
+    """Return the (group, name) of the choice that puts a class at a place; None where there is
+    none.
 
     Args:
         key: The place, such as `loss` or `filter.resample`.

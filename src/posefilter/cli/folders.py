@@ -55,8 +55,9 @@ def holds_evaluation(folder: Path) -> bool:
 
 
 def remove_if_empty(folder: Path, command: str) -> None:
-    """Remove the folder of a command that has failed at once: nothing is in it but what Hydra wrote,
-    the settings and the command's log. With it go the folders from `outputs` on that are empty then.
+    """Remove the folder of a command that has failed at once: nothing is in it but what Hydra
+    wrote, the settings and the command's log. With it go the folders from `outputs` on that are
+    empty then.
     """
     hydra, log = folder / ".hydra", folder / f"{command}.log"
     if not folder.is_dir() or folder.samefile(".") or {*folder.iterdir()} - {hydra, log}:

@@ -51,14 +51,16 @@ def instantiate(node: Any, where: str, **given: Any) -> Any:
         given: Arguments that no file can hold.
 
     Raises:
-        UserError: The key, for a target that may not be built (see `trust`), or arguments that are unknown, missing or of
-            the wrong type.
+        UserError: The key, for a target that may not be built (see `trust`), or arguments that are
+            unknown, missing or of the wrong type.
     """
     return _build(node, where, Scope.CONFIG, given)
 
 
 def instantiate_recipe(node: Any, where: str) -> Any:
-    """Build what a node of a checkpoint's recipe describes: as `instantiate`, but components alone."""
+    """Build what a node of a checkpoint's recipe describes: as `instantiate`, but components
+    alone.
+    """
     return _build(node, where, Scope.RECIPE, {})
 
 

@@ -1,4 +1,6 @@
-"""From a mesh to trained weights and a report, in stages; interrupted and typed again, it goes on."""
+"""From a mesh to trained weights and a report, in stages; interrupted and typed again, it goes
+on.
+"""
 
 import math
 from collections.abc import Callable

@@ -31,8 +31,8 @@ def list_targets(node: Any, place: str) -> Iterator[tuple[str, str]]:
 
 
 def list_places(node: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """Yield (place, value) of each value in a node of plain settings that is not a mapping with keys,
-    outer ones first.
+    """Yield (place, value) of each value in a node of plain settings that is not a mapping with
+    keys, outer ones first.
     """
     if isinstance(node, Mapping) and node:
         for key, value in sorted(

@@ -82,7 +82,8 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
         said: How the user named the checkpoint, for messages.
 
     Raises:
-        UserError: It is no recipe, too large, or holds an interpolation that is no reference to another of its settings.
+        UserError: It is no recipe, too large, or holds an interpolation that is no reference to
+            another of its settings.
     """
     if not (isinstance(recipe, dict) and set(recipe) == {"choices", "settings"}):
         raise UserError(f"{said}: its recipe should hold choices and settings, nothing else")

@@ -1,5 +1,5 @@
-"""What was done before, and need not be done again: a sweep's finished job, the training of one that
-learned the same, the steps of a run that was cut short.
+"""What was done before, and need not be done again: a sweep's finished job, the training of one
+that learned the same, the steps of a run that was cut short.
 """
 
 import json
@@ -40,8 +40,8 @@ def finished(job: Job) -> dict[str, Any] | None:
 
 
 def check_same(job: Job) -> None:
-    """Raise UserError where the folder of a sweep's job holds results of a job with other overrides,
-    as far as they decide a result.
+    """Raise UserError where the folder of a sweep's job holds results of a job with other
+    overrides, as far as they decide a result.
     """
     metrics = own_metrics(job.folder) if job.swept else {}
     others = {*deciding(metrics.get("overrides", []))} ^ {*deciding(job.overrides)}

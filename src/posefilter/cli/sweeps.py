@@ -44,7 +44,9 @@ class SweepSummary(Callback):
 
 
 def summarize(folder: Path) -> list[Row]:
-    """Write the three files of a sweep's folder; return its rows, none where no job has ended yet."""
+    """Write the three files of a sweep's folder; return its rows, none where no job has ended
+    yet.
+    """
     if not any(any(folder.glob(f"*/**/{mark}")) for mark in ("metrics.json", FAILED)):
         return []
     from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run

@@ -223,7 +223,9 @@ class Color:
 
 
 def jitter_color(rgb: np.ndarray, rng: Generator, strength: float) -> np.ndarray:
-    """Return the image (H, W, 3) uint8 as another camera under another light would have taken it."""
+    """Return the image (H, W, 3) uint8 as another camera under another light would have taken
+    it.
+    """
     k = strength
     gain = np.exp(rng.normal(size=3) * 0.1 * k + rng.normal() * 0.25 * k)
     gamma = np.exp(rng.normal() * 0.2 * k)

@@ -48,7 +48,9 @@ class FrameCache(Protocol):
     """Somewhere to keep samples."""
 
     def find(self, record: FrameRecord) -> Prepared | None:
-        """Return what is kept of a record, None for nothing, or where its files have changed since."""
+        """Return what is kept of a record, None for nothing, or where its files have changed
+        since.
+        """
         ...
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:

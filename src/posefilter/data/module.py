@@ -301,7 +301,9 @@ class PoseDataModule(LightningDataModule):
         return self._datasets[split]
 
     def _prepare(self, split: str) -> FrameDataset:
-        """Decode a split's frames into the cache; return those that can be used, at most the limit."""
+        """Decode a split's frames into the cache; return those that can be used, at most the
+        limit.
+        """
         part, limit = self._parts[split], self._limits[split]
         if limit is not None:  # smaller limits take a part of what larger ones take
             same_as = self._split.get(split)

@@ -33,7 +33,8 @@ class ColorResponse:
         mixing: standard deviation of the off-diagonal entries of the mixing matrix.
         tint: standard deviation of the logarithm of each channel's gain.
         gamma: standard deviation of the logarithm of the exponent.
-        target: "image", or "object" for the pixels of the mask alone, as faded or retouched print has it.
+        target: "image", or "object" for the pixels of the mask alone, as faded or retouched print
+            has it.
         probability: share of samples that are changed.
     """
 
@@ -123,7 +124,9 @@ class MotionBlur:
 
 @dataclasses.dataclass(frozen=True)
 class Jpeg:
-    """Compress the image as a JPEG of a quality drawn from a range (100 is best), and read it back."""
+    """Compress the image as a JPEG of a quality drawn from a range (100 is best), and read it
+    back.
+    """
 
     quality: tuple[int, int] = (40, 95)
     probability: float = 0.3

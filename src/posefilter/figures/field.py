@@ -99,7 +99,10 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
         ("beats truth", _ABOVE),
         *((f"turn {name}" if name == "x" else name, c) for name, c in list_axes()),
     ]
-    note = "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along the object's axes"
+    note = (
+        "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along "
+        "the object's axes"
+    )
     parts = [
         draw_text("at noise levels of", CAPTION),
         *(arrange_grid(row, len(row)) for row in rows),

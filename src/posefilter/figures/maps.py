@@ -33,7 +33,9 @@ _PROPOSED: Color = (255, 190, 40)
 
 
 class Proposals(NamedTuple):
-    """What the proposal network makes of one image of h x w cells, and what would have been right."""
+    """What the proposal network makes of one image of h x w cells, and what would have been
+    right.
+    """
 
     chance: np.ndarray  # (h, w) that the cell shows the object
     coordinates: np.ndarray  # (h, w, 3) object point, from the object's center, over its radius
@@ -95,7 +97,8 @@ def draw_proposals(
         ),
     ]
     entries = [("true outline", TRUTH), ("pose's center", _PROPOSED), *list_axes()]
-    reach = f"points: red, green, blue are the object's x, y, z, from -{1000 * radius:.0f} to {1000 * radius:.0f} mm"
+    span = f"{1000 * radius:.0f}"
+    reach = f"points: red, green, blue are the object's x, y, z, from -{span} to {span} mm"
     return compose_figure(
         title,
         arrange_grid(tiles, 2),
@@ -144,7 +147,8 @@ def draw_relevance(
     wide, half = (full_view(rgb.shape[0], rgb.shape[1], tile_width(columns)) for columns in (1, 2))
     heat = draw_heat_map(rgb, relevance, wide)
     draw_lines(heat, [wide.place(line) for line in trace_outline(mask)], TRUTH, 3, closed=True)
-    mean = f"{average_relevance(relevance, mask):.2f} on the object, {average_relevance(relevance, ~mask):.2f} elsewhere"
+    on, off = average_relevance(relevance, mask), average_relevance(relevance, ~mask)
+    mean = f"{on:.2f} on the object, {off:.2f} elsewhere"
     tiles = []
     for name, (pixels, weights) in (("first", first), ("last", last)):
         picture = draw_particles(rgb, pixels, weights, half)

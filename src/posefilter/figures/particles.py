@@ -173,7 +173,8 @@ def measure_off_frame(pixels: np.ndarray, height: int, width: int) -> float:
 
 def describe_step(trace: Trace, image: int, number: int, unit: str) -> str:
     """Tell which step it is, its noise level, and how many particles are effective."""
-    return f"step {number}: {describe_noise(trace, image, number, unit)}, {describe_effective(trace, image, number)}"
+    noise = describe_noise(trace, image, number, unit)
+    return f"step {number}: {noise}, {describe_effective(trace, image, number)}"
 
 
 def describe_noise(trace: Trace, image: int, number: int, unit: str) -> str:

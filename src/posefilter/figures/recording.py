@@ -85,7 +85,9 @@ def _log_scene(rr: Any, stream: Any, shown: ViewData) -> None:
 
 
 def _log_particles(rr: Any, stream: Any, shown: ViewData, moment: Moment) -> None:
-    """Log the particles of one step, in space and on the photograph, in the color of their weight."""
+    """Log the particles of one step, in space and on the photograph, in the color of their
+    weight.
+    """
     colors = color_by_weight(moment.weights)
     dots = rr.Points3D(moment.centers, colors=colors, radii=[shown.radius / 40])
     stream.log("particles/centers", dots, rr.AnyValues(weight=moment.weights))
@@ -104,7 +106,9 @@ def _log_particles(rr: Any, stream: Any, shown: ViewData, moment: Moment) -> Non
 def _axes(
     poses: np.ndarray, shown: ViewData
 ) -> tuple[list[np.ndarray], list[tuple[int, int, int]]]:
-    """Return the axes of poses (M, 4, 4) as 3 M lines from the object's center, and their colors."""
+    """Return the axes of poses (M, 4, 4) as 3 M lines from the object's center, and their
+    colors.
+    """
     ends = shown.center + 0.35 * shown.radius * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     camera = ends @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     return [one[[0, k]] for one in camera for k in (1, 2, 3)], list(AXES) * len(poses)

@@ -65,7 +65,8 @@ def describe_turn(turn: Turn) -> str:
 def _measure(turn: Turn) -> str:
     texture = "same texture" if turn.texture else "another texture"
     return (
-        f"surface {1000 * max(turn.distance, 0):.1f} mm off, farthest {1000 * max(turn.far, 0):.1f} "
+        f"surface {1000 * max(turn.distance, 0):.1f} mm off, farthest "
+        f"{1000 * max(turn.far, 0):.1f} "
         f"mm; color difference {turn.color:.2f}: {texture}"
     )
 

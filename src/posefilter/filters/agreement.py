@@ -21,7 +21,8 @@ def require_surface_points(method: Method) -> HasSurfacePoints:
     """
     if not isinstance(method, HasSurfacePoints):
         raise UserError(
-            f"filter/estimate=agreement: no particle of {type(method).__name__} stands on a measured "
+            f"filter/estimate=agreement: no particle of {type(method).__name__} stands on a "
+            "measured "
             f"point; choose filter/estimate=argmax"
         )
     return method

@@ -123,7 +123,8 @@ class PersistentParticles(nn.Module):
         super().__init__()
         if particles < 1 or levels < 2:
             raise UserError(
-                f"model.candidate_sampler: levels={levels} must be 2 or more, particles={particles} 1 "
+                f"model.candidate_sampler: levels={levels} must be 2 or more, "
+                f"particles={particles} 1 "
                 f"or more, or 0 for none"
             )
         self.particles, self.levels, self.sharpest, self.step = particles, levels, sharpest, step

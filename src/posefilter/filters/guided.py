@@ -72,7 +72,8 @@ class Guided:
         """
         if not isinstance(scene, HasRelevance):
             raise UserError(
-                "filter/resample=guided: the method makes no map of relevance; choose an encoder that "
+                "filter/resample=guided: the method makes no map of relevance; choose an encoder "
+                "that "
                 "does, such as unet"
             )
         relevance = scene.relevance.detach()

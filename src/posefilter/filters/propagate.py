@@ -110,7 +110,8 @@ class AxisTurns:
         """
         if not isinstance(space, PoseSpace):
             raise UserError(
-                "propagate: turns about an axis need particles that are poses; leave them out for a "
+                "propagate: turns about an axis need particles that are poses; leave them out for "
+                "a "
                 "method on pixels"
             )
         size, device = state.shape[:2], state.device

@@ -41,7 +41,8 @@ def require_scorer(method: Method) -> ScoresPoses:
     """Return the method as one that scores poses; raise UserError if it cannot."""
     if not isinstance(method, ScoresPoses):
         raise UserError(
-            f"filter/refine: {type(method).__name__} cannot score poses on their own; choose filter/refine=none"
+            f"filter/refine: {type(method).__name__} cannot score poses on their own; choose "
+            "filter/refine=none"
         )
     return method
 

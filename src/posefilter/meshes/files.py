@@ -131,7 +131,9 @@ def _read_other(path: Path) -> RawMesh:
 
 
 def _check_ply_texture(path: Path) -> None:
-    """Raise UserError unless the texture that a PLY's header names can be read: trimesh ignores it."""
+    """Raise UserError unless the texture that a PLY's header names can be read: trimesh ignores
+    it.
+    """
     header = path.read_bytes()[:4096].partition(b"end_header")[0].decode(errors="replace")
     for line in header.splitlines():
         if line.lower().startswith("comment texturefile "):

@@ -28,8 +28,8 @@ from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
 ANY = 0  # the fold of a turn by any angle
 FOLDS = (2, 3, 4)
-# Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance, and
-# of the distance that a fiftieth of the samples exceed, which holes and handles raise.
+# Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance,
+# and of the distance that a fiftieth of the samples exceed, which holes and handles raise.
 MEAN_EXCESS, FAR_EXCESS = 0.01, 0.02
 # of the color difference, in [0, 1], that a twentieth of the samples exceed
 MOST_COLOR = 0.18

@@ -1,9 +1,9 @@
 """What each number of metrics.json is called, how it is written, and which way is better.
 
 One table for all who show numbers.  Keys are those of metrics.json, nested ones joined by "/"
-(`add/auc`).  A list, one number an iteration, is read at its ends: `diagnostics/off_frame/first` and
-`diagnostics/off_frame/last`.  `filter/...` are the filter's quantities by iteration and `train/...` those
-of a training, which are only logged.
+(`add/auc`).  A list, one number an iteration, is read at its ends: `diagnostics/off_frame/first`
+and `diagnostics/off_frame/last`.  `filter/...` are the filter's quantities by iteration and
+`train/...` those of a training, which are only logged.
 """
 
 import math
@@ -332,8 +332,8 @@ def find_metric(key: str) -> MetricInfo:
 
     Args:
         key: Its key.  That of a logged scalar (`val/add/auc`), of a range of visibility
-            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list (`diagnostics/off_frame/last`)
-            lead to the same number.
+            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list
+            (`diagnostics/off_frame/last`) lead to the same number.
 
     Raises:
         UserError: Where there is no such number.

@@ -1,4 +1,6 @@
-"""Base class of the four image-space methods: a particle is a pixel and sees the image around it."""
+"""Base class of the four image-space methods: a particle is a pixel and sees the image around
+it.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -191,7 +193,9 @@ class ImageSpace(PoseEstimator):
         ).all(-1)
 
     def image_patches(self, scene: ImageScene, state: Tensor) -> Tensor:
-        """Crop the patch at each particle.  (B, N, 2) [px] -> (B, N, 4, k, k), channels as `image`."""
+        """Crop the patch at each particle.  (B, N, 2) [px] -> (B, N, 4, k, k), channels as
+        `image`.
+        """
         patches: Tensor = self.glimpse(scene.image, state)
         return patches
 
@@ -287,7 +291,8 @@ def check_latent_width(width: int, required: int | None) -> None:
     """
     if required not in (None, width):
         raise UserError(
-            f"model.net.latent_width={width}: model/box_head=votes needs {required}, one for each of "
+            f"model.net.latent_width={width}: model/box_head=votes needs {required}, one for each "
+            "of "
             "the box's sides"
         )
 

@@ -44,7 +44,9 @@ def check_loss_schedule(loss_schedule: Sequence[Stage], names: Sequence[str]) ->
 
 
 def factors_at(loss_schedule: Sequence[Stage], progress: float) -> Mapping[str, float]:
-    """Return the factors at a fraction `progress` of the training, in [0, 1]; none without stages."""
+    """Return the factors at a fraction `progress` of the training, in [0, 1]; none without
+    stages.
+    """
     for stage in loss_schedule:
         if progress < stage.until:
             return stage.factors

@@ -184,7 +184,9 @@ class PosePF(PoseEstimator):
         return losses
 
     def set_object(self, model: ObjectModel) -> None:
-        """Set the object of the proposal network too, and count how often the truth is outscored."""
+        """Set the object of the proposal network too, and count how often the truth is
+        outscored.
+        """
         super().set_object(model)
         self._axes = tuple(tuple(axis) for axis in box_axes(model.points).T.tolist())
         if self.proposals is not None:

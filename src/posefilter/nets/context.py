@@ -60,7 +60,8 @@ class Pyramid(nn.Module):
         super().__init__()
         if levels < 1:
             raise UserError(
-                f"model.encoder.levels={levels}: must be 1 or more; choose model/encoder=none for none"
+                f"model.encoder.levels={levels}: must be 1 or more; choose model/encoder=none for "
+                "none"
             )
         self.strides = tuple(2 ** (i + 1) for i in range(levels))
         self.width = levels * 9 * 5
@@ -74,7 +75,8 @@ class Pyramid(nn.Module):
         side = min(rgb.shape[-2:])
         if self.strides[-1] > side:
             raise UserError(
-                f"model.encoder.levels={len(self.strides)}: a cell of the last would be larger than the "
+                f"model.encoder.levels={len(self.strides)}: a cell of the last would be larger "
+                "than the "
                 f"image; "
                 f"choose {side.bit_length() - 1} or fewer"
             )

@@ -81,9 +81,9 @@ def in_bfloat16(rgb: Tensor) -> torch.autocast:
 class UNet(nn.Module):
     """Trunk of a U-Net with residual blocks, strides 4 to 32 and back to 8.
 
-    Color enters at full resolution, geometry at half. Subclasses create the layers by `build_trunk`,
-    then `up8`: names and order of parameters are those of existing checkpoints and optimizer
-    states.
+    Color enters at full resolution, geometry at half. Subclasses create the layers by
+    `build_trunk`, then `up8`: names and order of parameters are those of existing checkpoints and
+    optimizer states.
     """
 
     up8: nn.Module  # of each subclass, laid next: what follows on the way up at stride 8

@@ -187,7 +187,8 @@ class PoseLikelihood(nn.Module):
         """
         if points.context is None:
             raise UserError(
-                "model/likelihood=contextual reads the proposal network; choose model/proposals=dense or "
+                "model/likelihood=contextual reads the proposal network; choose "
+                "model/proposals=dense or "
                 "model/likelihood=contrastive"
             )
         log_share, predicted, logit, features = points.context.split(

@@ -1,4 +1,6 @@
-"""The pictures that a run left: which section each belongs to, and how each is packed into a page."""
+"""The pictures that a run left: which section each belongs to, and how each is packed into a
+page.
+"""
 
 import base64
 import re
@@ -53,7 +55,9 @@ class StoredImage(NamedTuple):
 
 
 def read_images(folder: Path) -> list[StoredImage]:
-    """Return the pictures of a folder, sorted by name as people count; empty where there is none."""
+    """Return the pictures of a folder, sorted by name as people count; empty where there is
+    none.
+    """
     if not folder.is_dir():
         return []
     files = sorted(

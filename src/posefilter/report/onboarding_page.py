@@ -1,4 +1,6 @@
-"""Lay out what came of onboarding an object: a run's page, with the mesh and where the time went."""
+"""Lay out what came of onboarding an object: a run's page, with the mesh and where the time
+went.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -33,7 +33,8 @@ from posefilter.report.page import Page
 from posefilter.report.settings import Change
 
 HEADLINE = (
-    "add/auc", "add_s/auc", "add/recall_01d", "add/median_mm", "iou", "particles_on_object", "seconds_per_image",
+    "add/auc", "add_s/auc", "add/recall_01d", "add/median_mm", "iou", "particles_on_object",
+    "seconds_per_image",
 )  # fmt: skip
 ROWS = (
     "instances", "missed", "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm",
@@ -50,7 +51,8 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
 
     Args:
         run: What its folder holds.
-        changed: Settings that differ from the defaults; None where there is nothing to compare with.
+        changed: Settings that differ from the defaults; None where there is nothing to compare
+            with.
         command: What made the page.
     """
     images = group_by_section([p for p in run.pictures if name_figure(p.name) != "health"])
@@ -154,7 +156,9 @@ def list_diagnostics(run: Run) -> list[Block]:
 
 
 def show_worst_and_best(images: Mapping[str, list[StoredImage]]) -> list[Block]:
-    """Return the worst and the best images, those of the test before those of the last validation."""
+    """Return the worst and the best images, those of the test before those of the last
+    validation.
+    """
     out: list[Block] = []
     for title, key in (("Worst", "worst"), ("Best", "best"), ("Estimates", "overlays")):
         ordered = sorted(images[key], key=lambda image: not image.name.startswith("test"))

@@ -73,7 +73,9 @@ def draw_summary(rows: Sequence[Row], axes: Sequence[str]) -> Figure:
 
 
 def split_rows(rows: Sequence[Row], key: str, swept: Sequence[str]) -> dict[str, list[Row]]:
-    """Return the rows by another swept setting of few values, which gets colors; else all as one."""
+    """Return the rows by another swept setting of few values, which gets colors; else all as
+    one.
+    """
     others = [other for other in swept if other != key]
     few = [other for other in others if len({row[other] for row in rows}) <= len(LIGHT.lines)]
     out: dict[str, list[Row]] = {}

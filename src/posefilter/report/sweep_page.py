@@ -133,7 +133,10 @@ def tabulate_groups(
         for group in found
     ]
     head = [*sweep.shown, "runs", *(info.title for info in infos)]
-    say = "The best is marked. Where there are several seeds: mean ± half the range from the worst to the best."
+    say = (
+        "The best is marked. Where there are several seeds: mean ± half the range from the worst "
+        "to the best."
+    )
     numeric = range(len(sweep.shown), len(head))
     return [
         Paragraph([say]),
@@ -279,7 +282,8 @@ def format_spread(values: Sequence[float], info: MetricInfo) -> str:
     """Return the least and the greatest of some numbers, and their standard deviation."""
     if len(values) < 2:
         return "–"
-    return f"{info.format(min(values))} to {info.format(max(values))} (sd {info.format(stdev(values))})"
+    low, high, sd = (info.format(x) for x in (min(values), max(values), stdev(values)))
+    return f"{low} to {high} (sd {sd})"
 
 
 def show_best(winner: Job, best: Run | None, changed: Sequence[Change] | None) -> list[Block]:

@@ -19,7 +19,8 @@ SILENT = ("out", "resume", "console", "threads")
 COLUMNS = {  # of summary.csv, and the metrics that they hold
     key.replace("/", "_"): key
     for key in (
-        "add/auc", "add/recall_01d", "add/median_mm", "add_s/auc", "iou", "particles_on_object", "seconds_per_image",
+        "add/auc", "add/recall_01d", "add/median_mm", "add_s/auc", "iou", "particles_on_object",
+        "seconds_per_image",
     )
 }  # fmt: skip
 Value = int | float | str

@@ -46,7 +46,9 @@ class View:
         return np.array([x / self.K[0, 0], y / self.K[1, 1], 1.0])
 
     def holds(self, one: Placed, largest_truncation: float) -> bool:
-        """Return whether at most `largest_truncation` of an object's outline is out of the frame."""
+        """Return whether at most `largest_truncation` of an object's outline is out of the
+        frame.
+        """
         if one.hull[:, 2].min() < _NEAREST:
             return False
         pixels = one.hull[:, :2] / one.hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [

@@ -11,7 +11,9 @@ Color = np.ndarray  # (3,) float in [0, 1]
 def noise_field(
     rng: np.random.Generator, size: int, octaves: Sequence[int] = (4, 8, 16, 32, 64)
 ) -> np.ndarray:
-    """Return smooth noise in [0, 1], a sum of octaves with random weights.  -> (size, size) float32."""
+    """Return smooth noise in [0, 1], a sum of octaves with random weights.  -> (size, size)
+    float32.
+    """
     field = np.zeros((size, size), np.float32)
     for cells in octaves:
         coarse = rng.standard_normal((cells, cells), dtype=np.float32)

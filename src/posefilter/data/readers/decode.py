@@ -19,7 +19,9 @@ _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def read_color(path: Path) -> np.ndarray:
-    """Read a color image; gray is spread to three channels, alpha dropped.  -> (H, W, 3) uint8 RGB."""
+    """Read a color image; gray is spread to three channels, alpha dropped.  -> (H, W, 3) uint8
+    RGB.
+    """
     image = _read_image(path)
     if image.dtype != np.uint8:
         raise BadData(path, "color image is not 8-bit", f"found {image.dtype}")

@@ -190,7 +190,9 @@ class FatReader(BaseReader):
         return mask
 
     def _settings(self, folder: Path) -> tuple[dict[str, FatClass], dict[str, FatCamera]] | None:
-        """Return a folder's classes and cameras, None where they are broken and on_error is "skip"."""
+        """Return a folder's classes and cameras, None where they are broken and on_error is
+        "skip".
+        """
         try:
             objects, cameras = (
                 check_inside(folder / f"_{kind}_settings.json", self.root)
