@@ -8,17 +8,17 @@ import numpy as np
 import torch
 from PIL import Image
 
-from posefilter.figures.animation import (
-    Animation,
+from posefilter.figures.animation import Animation
+from posefilter.figures.canvas import TRUTH, full_view
+from posefilter.figures.gif import encode_gif
+from posefilter.figures.layout import WIDTH
+from posefilter.figures.particles import color_by_weight, draw_iterations
+from posefilter.figures.silhouettes import (
     compute_coverage,
     draw_silhouettes,
-    encode_gif,
     outline_hulls,
     project_hulls,
 )
-from posefilter.figures.canvas import TRUTH, full_view
-from posefilter.figures.layout import WIDTH
-from posefilter.figures.particles import color_by_weight, draw_iterations
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PixelSpace, PoseSpace

@@ -9,7 +9,6 @@ import torch
 
 from posefilter.figures.belief import (
     Mark,
-    compute_marginals,
     draw_belief,
     draw_rotations,
     find_longest_axis,
@@ -19,6 +18,7 @@ from posefilter.figures.belief import (
 from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import halve
 from posefilter.figures.layout import WIDTH
+from posefilter.figures.marginals import compute_marginals
 from posefilter.figures.mollweide import (
     color_by_turn,
     draw_blank_map,

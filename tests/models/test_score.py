@@ -2,7 +2,7 @@
 
 import pytest
 
-from posefilter.models.base import compute_checkpoint_score
+from posefilter.metrics.results import compute_checkpoint_score
 
 
 def detector(on: float, iou: float) -> dict[str, object]:

@@ -8,7 +8,8 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.registry import find_metric
-from posefilter.report.sweep_page import chart_over, format_mean, format_spread, make_sweep_page
+from posefilter.report.sweep_charts import chart_over
+from posefilter.report.sweep_page import format_mean, format_spread, make_sweep_page
 from posefilter.report.sweeps import (
     find_best_group,
     find_best_job,

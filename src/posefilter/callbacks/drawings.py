@@ -22,18 +22,14 @@ from posefilter.callbacks.fields import (
 from posefilter.callbacks.gallery import KeptImage, draw_gallery
 from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
 from posefilter.capabilities import Capability
-from posefilter.figures.animation import (
-    Animation,
-    draw_silhouettes,
-    encode_gif,
-    outline_hulls,
-    project_hulls,
-)
+from posefilter.figures.animation import Animation
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.field import draw_point_field, draw_pose_field
+from posefilter.figures.gif import encode_gif
 from posefilter.figures.maps import draw_proposals, draw_relevance
 from posefilter.figures.overlay import Shape, trace_outline
 from posefilter.figures.particles import draw_iterations, normalize_weights
+from posefilter.figures.silhouettes import draw_silhouettes, outline_hulls, project_hulls
 from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator

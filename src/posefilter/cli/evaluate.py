@@ -36,7 +36,7 @@ from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
-from posefilter.models.base import compute_checkpoint_score
+from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.paths import check_links
 from posefilter.types import ObjectModel
 

@@ -20,7 +20,8 @@ from posefilter.cli.reuse import finished, learned_from, start_from, take_over
 from posefilter.cli.warm_start import warm_start
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped
-from posefilter.models.base import PoseEstimator, compute_checkpoint_score
+from posefilter.metrics.results import compute_checkpoint_score
+from posefilter.models.base import PoseEstimator
 from posefilter.paths import stays_inside
 
 log = logging.getLogger(__name__)

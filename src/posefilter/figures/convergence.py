@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw
 
-from posefilter.figures.animation import outline_hulls, project_hulls
 from posefilter.figures.canvas import ESTIMATE, View, draw_lines, full_view, load_font
 from posefilter.figures.overlay import Shape, draw_pose
 from posefilter.figures.particles import choose_by_weight, color_by_weight, normalize_weights
+from posefilter.figures.silhouettes import outline_hulls, project_hulls
 from posefilter.geometry.pose import origin_of, pose_about, rotation_of
 from posefilter.geometry.rotation import exp_so3, log_so3
 from posefilter.types import Trace

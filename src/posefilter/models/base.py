@@ -1,7 +1,6 @@
 """The base class of all methods: every Lightning hook, so that a method's own file is short."""
 
 import logging
-import math
 import time
 from collections.abc import Callable, Iterable
 from functools import cached_property
@@ -22,8 +21,9 @@ from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
-from posefilter.metrics.scores import overall
+from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.metrics.visibility import ErrorsByVisibility
+from posefilter.models.clipping import clip_submodules
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -202,15 +202,7 @@ class PoseEstimator(LightningModule):
         Raises:
             FloatingPointError: 20 steps in a row had such a gradient in any submodule.
         """
-        skipped = []
-        for name, part in self.named_children():
-            parameters = [p for p in part.parameters() if p.grad is not None]
-            if parameters and not bool(
-                nn.utils.clip_grad_norm_(parameters, gradient_clip_val or math.inf).isfinite()
-            ):
-                skipped.append(name)
-                for parameter in parameters:
-                    parameter.grad = None  # zeros would still move it, by momentum
+        skipped = clip_submodules(self, gradient_clip_val)
         self.skipped_steps += bool(skipped)
         self.skipped_in_a_row = self.skipped_in_a_row + 1 if skipped else 0
         if skipped and self.skipped_steps in (1, 10, 100, 1000, 10_000):
@@ -340,20 +332,3 @@ class PoseEstimator(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set the object that the checkpoint holds."""
         self.set_object(ObjectModel(**checkpoint["object_model"]))
-
-
-def compute_checkpoint_score(results: dict[str, Any]) -> float:
-    """Return the score by which checkpoints are compared, from metrics.json (see `overall`)."""
-    auc = float(results["add"]["auc"]) if results["add"] else None
-    return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
-
-
-def flatten(results: dict[str, Any], prefix: str = "") -> dict[str, float]:
-    """Return nested numbers by joined names; values that are no numbers are left out."""
-    out: dict[str, float] = {}
-    for name, value in results.items():
-        if isinstance(value, dict):
-            out |= flatten(value, f"{prefix}{name}/")
-        elif isinstance(value, int | float):
-            out[prefix + name] = float(value)
-    return out

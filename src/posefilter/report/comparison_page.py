@@ -26,7 +26,8 @@ from posefilter.report.charts import Line, Panel
 from posefilter.report.gather import Run, read_run
 from posefilter.report.image_errors import chart_errors
 from posefilter.report.page import Page
-from posefilter.report.run_page import compare_numbers, list_changes
+from posefilter.report.result_tables import compare_numbers
+from posefilter.report.run_page import list_changes
 from posefilter.report.settings import compare_settings
 
 LISTED = 10  # images in a table of the greatest changes

@@ -2,22 +2,17 @@
 `-meta.mat`, and `data_syn`.
 """
 
-import io
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import scipy.io
 import torch
 
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import (
     expect_size,
-    list_folder,
     numbers,
     read_color,
     read_depth,
@@ -25,19 +20,22 @@ from posefilter.data.readers.decode import (
 )
 from posefilter.data.readers.naming import choose_objects
 from posefilter.data.readers.plausible import check_camera, check_sample, check_units
+from posefilter.data.readers.ycb_video_files import (
+    FRAME,
+    SYNTHETIC,
+    list_scenes,
+    list_stems,
+    read_class_names,
+    read_frame_list,
+    read_meta,
+)
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
-from posefilter.limits import read_bytes, read_lines
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
-from posefilter.paths import check_inside, is_plain_name
+from posefilter.paths import check_inside
 
-_FRAME = re.compile(r"[0-9]{1,9}")
-_KEYS = ["cls_indexes", "poses", "factor_depth", "intrinsic_matrix"]
-# bytes of a -meta.mat, of which there may be 2 MB, and of a list
-_LARGEST_META, _LONGEST_LIST = 1 << 25, 1 << 22
-# rendered frames have no scenes: blocks stand in, numbered from here
-_SYN, _SYN_SCENE, _SYN_BLOCK = "data_syn", 1000, 100
+_SYN_SCENE, _SYN_BLOCK = 1000, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +83,7 @@ class YCBVideoReader(BaseReader):
         if mesh_frame not in ("original", "ycb_video"):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose original or ycb_video")
         self._mesh_frame = mesh_frame
-        self._classes = _class_names(self.root)
+        self._classes = read_class_names(self.root)
         usable = [
             c for c in self._classes if mesh_frame == "ycb_video" or c not in ycb.WITHOUT_GEOMETRY
         ]
@@ -174,24 +172,24 @@ class YCBVideoReader(BaseReader):
         """Yield (scene_id, im_id, name, path without its ending) of every frame, in order."""
         if not self.root.is_dir():
             raise UserError(f"{self.root}: no such folder (data.root)")
-        folders = dict(_scene_folders(self.root, parts))
+        folders = dict(list_scenes(self.root, parts))
         if not folders:
             raise UserError(
                 f"{self.root}: no YCB-Video scenes here: no <scene>/NNNNNN-meta.mat "
                 f"in data or data_syn"
             )
         if listed is not None:
-            names = _read_list(self.root, listed)
+            names = read_frame_list(self.root, listed)
         else:
             names = [
                 f"{scene}/{stem}"
                 for scene, folder in sorted(folders.items())
-                for stem in sorted(_stems(folder))
+                for stem in sorted(list_stems(folder))
             ]
         missing = 0
         for name in names:
             scene, stem = name.rsplit("/", 1)
-            if not _FRAME.fullmatch(stem):
+            if not FRAME.fullmatch(stem):
                 raise UserError(
                     f"{folders.get(scene, self.root)}/{stem}: frames are named by "
                     f"numbers, such as 000001"
@@ -201,7 +199,7 @@ class YCBVideoReader(BaseReader):
                 continue
             scene_id = (
                 _SYN_SCENE + int(stem) // _SYN_BLOCK
-                if scene == _SYN
+                if scene == SYNTHETIC
                 else int("".join(c for c in scene if c in "0123456789")[:9] or 0)
             )
             yield scene_id, int(stem), name, folders[scene] / stem
@@ -214,7 +212,7 @@ class YCBVideoReader(BaseReader):
 
     def _list_frame(self, scene_id: int, im_id: int, name: str, stem: Path) -> list[_Entry]:
         path = stem.with_name(f"{stem.name}-meta.mat")
-        meta = _read_meta(check_inside(path, self.root))
+        meta = read_meta(check_inside(path, self.root))
         try:
             indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
         except (TypeError, ValueError) as error:
@@ -250,7 +248,7 @@ class YCBVideoReader(BaseReader):
             same = [j for j, other in enumerate(classes) if other == each]
             twins = tuple(self._in_mesh_frame(poses[j], each, path) for j in same)
             scene = name.rsplit("/", 1)[0]
-            group = f"{scene}/{im_id // _SYN_BLOCK}" if scene == _SYN else scene
+            group = f"{scene}/{im_id // _SYN_BLOCK}" if scene == SYNTHETIC else scene
             record = FrameRecord(name, group, scene_id, im_id, int(indices[k]), each, k, files)
             entries.append(
                 _Entry(
@@ -265,61 +263,3 @@ class YCBVideoReader(BaseReader):
         if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
             raise BadData(path, "'poses' holds a matrix that is no rotation", name)
         return pose @ self._native[name]
-
-
-def _class_names(root: Path) -> tuple[str, ...]:
-    for path in (
-        root / "image_sets" / "classes.txt",
-        root / "classes.txt",
-        root.parent / "classes.txt",
-    ):
-        if path.is_file():
-            names = tuple(read_lines(path, _LONGEST_LIST))
-            wrong = [name for name in names if not is_plain_name(name)]
-            if wrong:
-                raise UserError(f"{path}: class with an impossible name {wrong[0][:40]!r}")
-            return names
-    return ycb.CLASSES
-
-
-def _scene_folders(root: Path, parts: set[str]) -> Iterator[tuple[str, Path]]:
-    """Yield scenes by name: those of `data` by number, `data_syn` as one."""
-    if _stems(root):
-        yield (_SYN if root.name == _SYN else root.name), root
-        return
-    if _SYN in parts and (root / _SYN).is_dir():
-        yield _SYN, root / _SYN
-    data = root / "data" if (root / "data").is_dir() else root
-    if "data" in parts:
-        for name in list_folder(data):
-            if _FRAME.fullmatch(name) and (data / name).is_dir():
-                yield name, data / name
-
-
-def _stems(folder: Path) -> list[str]:
-    names = list_folder(folder)
-    return [name.removesuffix("-meta.mat") for name in names if name.endswith("-meta.mat")]
-
-
-def _read_list(root: Path, listed: str | Path) -> list[str]:
-    candidates = [Path(listed), root / listed, root / "image_sets" / listed, root.parent / listed]
-    path = next((p for p in candidates if p.is_file()), None)
-    if path is None:
-        raise UserError(f"{listed}: no such list of frames (data.options.frames), nor below {root}")
-    names = read_lines(path, _LONGEST_LIST)
-    if not names or any("/" not in name for name in names):
-        raise UserError(f"{path}: not a list of frames; expected lines such as 0048/000001")
-    return names
-
-
-def _read_meta(path: Path) -> dict[str, Any]:
-    """Return the few arrays that are needed of a -meta.mat file."""
-    data = io.BytesIO(read_bytes(path, _LARGEST_META))
-    try:
-        meta = scipy.io.loadmat(data, variable_names=_KEYS)
-    except Exception as error:  # the file decides what breaks: the parser raises anything
-        raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error
-    for key in _KEYS:
-        if key not in meta:
-            raise BadData(path, f"missing key '{key}'")
-    return meta

@@ -1,0 +1,139 @@
+"""Draw the marginals of a belief over one pose: three shifts and three turns."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from posefilter.figures.canvas import Color, arrange_grid
+from posefilter.figures.curves import choose_ticks
+from posefilter.figures.layout import (
+    CAPTION,
+    DETAIL,
+    add_caption,
+    draw_text,
+    tile_width,
+)
+from posefilter.figures.panels import Axis, draw_histogram_panel
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import log_so3
+from posefilter.types import ObjectModel
+
+TRUTH: Color = (21, 153, 71)  # darker than on photographs: these are read on white
+
+
+ESTIMATE: Color = (214, 33, 156)
+
+
+OBJECT_AXES = "xyz"
+
+
+CAMERA_AXES = ("right", "down", "away")  # camera axes
+
+
+def compute_shifts_and_turns(
+    poses: torch.Tensor, reference: torch.Tensor, mean: torch.Tensor, center: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return centers less `mean`, camera axes (*, 3) [m], and turns from the reference, object axes
+    (*, 3) [rad].
+    """
+    turn = log_so3(rotation_of(reference).mT @ rotation_of(poses))
+    return origin_of(poses, center) - mean, turn
+
+
+class Marginal(NamedTuple):
+    """One axis of the belief."""
+
+    mass: np.ndarray  # (M,) shares of the belief
+    edges: np.ndarray  # (M + 1,)
+    marks: tuple[float, ...]  # the estimate's value, and the truth's where it is known
+    beyond: float  # share of the belief outside the edges
+
+
+def compute_marginals(
+    poses: torch.Tensor,
+    weights: torch.Tensor,
+    best: torch.Tensor,
+    true: torch.Tensor | None,
+    center: torch.Tensor,
+) -> tuple[list[Marginal], list[Marginal]]:
+    """Return three shifts from the mean, camera axes [mm], and three turns from the estimate,
+    object axes [degrees].
+    """
+    mean = (weights[:, None] * origin_of(poses, center)).sum(0)
+    parts = [
+        compute_shifts_and_turns(p, best, mean, center)
+        for p in (poses, best, true)
+        if p is not None
+    ]
+    out: tuple[list[Marginal], list[Marginal]] = ([], [])
+    for kind, unit in enumerate((1000.0, 180 / math.pi)):
+        for i in range(3):
+            marks = [float(part[kind][i]) * unit for part in parts[1:]]
+            out[kind].append(
+                compute_histogram(parts[0][kind][:, i].numpy() * unit, weights.numpy(), marks)
+            )
+    return out
+
+
+def draw_marginals(
+    poses: torch.Tensor,
+    weights: torch.Tensor,
+    best: torch.Tensor,
+    true: torch.Tensor | None,
+    model: ObjectModel,
+) -> list[np.ndarray]:
+    """Draw six weighted histograms, in two rows with what they are above them."""
+    shifts, turns = compute_marginals(poses, weights, best, true, model.center.cpu().double())
+    names = [
+        [f"{CAMERA_AXES[i]} [mm]" for i in range(3)],
+        [f"about {name} [degrees]" for name in OBJECT_AXES],
+    ]
+    out = []
+    for kind, row, labels in (
+        ("shift of the center", shifts, names[0]),
+        ("turn about the object's axes", turns, names[1]),
+    ):
+        out.append(draw_text(kind, CAPTION))
+        out.append(
+            arrange_grid(
+                [draw_marginal(one, label) for one, label in zip(row, labels, strict=True)], 3
+            )
+        )
+    return out
+
+
+def draw_marginal(one: Marginal, label: str) -> np.ndarray:
+    """Draw one histogram."""
+    low, high = float(one.edges[0]), float(one.edges[-1])
+    top = 1.1 * max(float(one.mass.max()), 1e-6)
+    x, y = (
+        Axis(label, low, high, choose_ticks(low, high, 3, 3 if max(-low, high) < 100 else 2)),
+        Axis("share", 0, top, choose_ticks(0, top, 2)),
+    )
+    marks = list(zip(one.marks, (ESTIMATE, TRUTH), strict=False))[::-1]
+    note = f"{one.beyond:.1%} lies beyond" if one.beyond >= 5e-4 else ""
+    return add_caption(
+        draw_histogram_panel(one.mass, one.edges, marks, x, y, tile_width(3), 160), note, DETAIL
+    )
+
+
+def compute_histogram(
+    values: np.ndarray, weights: np.ndarray, marks: list[float], bins: int = 25
+) -> Marginal:
+    """Return a weighted histogram of the middle 95 % and a margin, wide enough for the marks."""
+    order = np.argsort(values)
+    mass = np.cumsum(weights[order])
+    low, high = (
+        float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)])
+        for q in (0.025, 0.975)
+    )
+    margin = max(0.3 * (high - low), 1e-2)
+    low, high = min(low - margin, *marks), max(high + margin, *marks)
+    pad = 0.02 * (high - low)
+    mass, edges = np.histogram(
+        values, np.linspace(low - pad, high + pad, bins + 1), weights=weights
+    )
+    beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
+    return Marginal(mass, edges, (*marks,), beyond)

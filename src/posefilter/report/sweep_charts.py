@@ -1,0 +1,111 @@
+"""Charts of a sweep's page: metrics over the swept settings and over time."""
+
+from collections.abc import Mapping, Sequence
+from statistics import mean
+
+from posefilter.metrics.registry import MetricInfo, find_metric
+from posefilter.report.charts import Line, Panel
+from posefilter.report.sweeps import (
+    Group,
+    Sweep,
+    Value,
+)  # fmt: skip
+
+MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
+
+
+def spell(place: Mapping[str, Value]) -> str:
+    """Return a place among the axes as it would be typed."""
+    return " ".join(f"{axis}={value}" for axis, value in place.items())
+
+
+def chart_over(
+    axis: str, sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]
+) -> list[Panel]:
+    """Return a chart for each metric over one axis; another axis of few values becomes lines."""
+    values = sweep.values(axis)
+    if len(values) < 2:
+        return []
+    numeric = not any(isinstance(value, str) for value in values)
+    spots = {value: float(value) if numeric else float(i) for i, value in enumerate(values)}
+    others = [
+        other
+        for other in sweep.shown
+        if other != axis and 1 < len(sweep.values(other)) <= MOST_LINES
+    ]
+    kinds = [(others[0], value) for value in sweep.values(others[0])] if others else [None]
+    low = min(spots.values())
+    log_x = numeric and low > 0 and max(spots.values()) / low >= 8
+    out = []
+    for info in infos:
+        lines = [
+            line_over(
+                axis,
+                spots,
+                [g for g in found if kind is None or g.place[kind[0]] == kind[1]],
+                info,
+                kind,
+            )
+            for kind in kinds
+        ]
+        lines = [line for line in lines if len(line.x)]
+        if lines:
+            categories = () if numeric else [str(v) for v in values]
+            out.append(
+                Panel(
+                    info.label,
+                    axis,
+                    info.unit,
+                    lines,
+                    info.limits,
+                    categories,
+                    log_x,
+                    ticks=tuple(spots.values()),
+                )
+            )
+    return out
+
+
+def line_over(
+    axis: str,
+    spots: Mapping[Value, float],
+    found: Sequence[Group],
+    info: MetricInfo,
+    kind: tuple[str, Value] | None,
+) -> Line:
+    """Return means over an axis with the range, and single runs, of some groups."""
+    at = {
+        spot: [info.convert(y) for g in found if g.place[axis] == value for y in g.of(info.key)]
+        for value, spot in spots.items()
+    }
+    at = {spot: ys for spot, ys in at.items() if ys}
+    several = any(len(ys) > 1 for ys in at.values())
+    return Line(
+        f"{kind[0]}={kind[1]}" if kind else "mean",
+        list(at),
+        [sum(ys) / len(ys) for ys in at.values()],
+        [min(ys) for ys in at.values()] if several else (),
+        [max(ys) for ys in at.values()] if several else (),
+        [(spot, y) for spot, ys in at.items() for y in ys] if several else (),
+    )
+
+
+def chart_against_time(found: Sequence[Group]) -> list[Panel]:
+    """Return quality against what it costs, a dot a setting."""
+    if len(found) < 2:
+        return []
+    cost = find_metric("seconds_per_image")
+    # what sweeps maximize: the one, or else the other
+    for info in map(find_metric, ("add/auc", "particles_on_object")):
+        pairs = [
+            (group, group.of(cost.key), [info.convert(y) for y in group.of(info.key)])
+            for group in found
+        ]
+        lines = [Line(spell(g.place), [mean(x)], [mean(y)]) for g, x, y in pairs if x and y]
+        if len(lines) > MOST_LINES:  # too many for a legend: the table tells them apart
+            lines = [
+                Line("a setting", [line.x[0] for line in lines], [line.y[0] for line in lines])
+            ]
+        if lines:
+            return [Panel(info.label, cost.title, info.unit, lines, info.limits, joined=False)]
+    return []
