@@ -42,7 +42,6 @@ def fat_settings(real_data: Path) -> dict[str, dict]:
 def test_ids_count_from_one() -> None:
     assert len(ycb.CLASSES) == 21
     assert ycb.ycbvideo_index("002_master_chef_can") == 1
-    assert ycb.fat_segmentation_id("061_foam_brick") == 252
     with pytest.raises(KeyError):
         ycb.ycbvideo_from_original("036_wood_block")
 
@@ -54,7 +53,7 @@ def test_order_is_that_of_ycb_video(real_data: Path) -> None:
 def test_ids_and_sizes_are_those_of_fat(fat_settings: dict[str, dict]) -> None:
     assert list(fat_settings) == list(ycb.CLASSES)
     for name, entry in fat_settings.items():
-        assert ycb.fat_segmentation_id(name) == entry["segmentation_class_id"]
+        assert 12 * ycb.ycbvideo_index(name) == entry["segmentation_class_id"]
         assert np.array(ycb.SIZES_ALIGNED[name]) * 100 == pytest.approx(
             np.array(entry["cuboid_dimensions"]), abs=2e-3
         )

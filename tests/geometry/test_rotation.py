@@ -9,7 +9,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Generator
 
-from posefilter.geometry.grid import so3_grid
 from posefilter.geometry.pose import fit_rigid, invert, make_pose, move_about
 from posefilter.geometry.rotation import (
     angle_between,
@@ -116,33 +115,3 @@ def test_gradients_of_fits_and_projections() -> None:
     source, target = V[:10], V[10:20].clone().requires_grad_()
     weights = V[20:30, 0].abs().clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda t, w: fit_rigid(source, t, w), (target, weights))
-
-
-@pytest.mark.parametrize(
-    ("level", "farthest", "average"), [(0, 57, 29), (1, 28, 14.5), (2, 14, 7.3)]
-)
-def test_the_grid_is_even(level: int, farthest: float, average: float) -> None:
-    grid = so3_grid(level)
-    assert grid.shape == (72 * 8**level, 3, 3)
-    torch.testing.assert_close(
-        grid @ grid.transpose(1, 2), torch.eye(3).expand_as(grid), atol=1e-5, rtol=0
-    )
-    trace = (
-        random_rotation(5000, generator=Generator().manual_seed(0)).flatten(1) @ grid.flatten(1).T
-    )
-    angle = torch.rad2deg(torch.acos(((trace.max(1).values - 1) / 2).clamp(-1, 1)))
-    assert angle.max() < farthest
-    assert angle.mean() < average
-    assert grid.mean(0).abs().max() < 1e-5
-    counts = torch.bincount(trace.argmax(1), minlength=len(grid)).double()
-    if level == 0:
-        assert counts.min() > 0.4 * counts.mean()
-        assert counts.max() < 2.0 * counts.mean()
-
-
-def test_the_grid_is_nested() -> None:
-    ancestors, resampled = so3_grid(1), so3_grid(2)
-    angle = angle_between(ancestors.repeat_interleave(8, 0), resampled)
-    assert angle.rad2deg().median() < 16
-    shuffled = angle_between(ancestors.repeat(8, 1, 1), resampled)  # the order of another nesting
-    assert shuffled.rad2deg().median() > 60

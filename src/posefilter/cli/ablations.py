@@ -285,11 +285,6 @@ _NOT_OF_DETECTORS = (
 _BY_NAME = {ablation.name: ablation for ablation in ABLATIONS}
 
 
-def find_ablation(name: str) -> Ablation | None:
-    """Return a row of the table, None where there is none of that name."""
-    return _BY_NAME.get(name)
-
-
 def find_parent(ablation: Ablation) -> Ablation:
     """Return the row that a row builds on.
 

@@ -3,7 +3,6 @@
 import ctypes
 import platform
 import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
@@ -88,8 +87,3 @@ def git_state() -> str | None:
         )
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def command_line() -> str:
-    """Return what was typed."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

@@ -112,11 +112,6 @@ def ycbvideo_index(name: str) -> int:
     return CLASSES.index(name) + 1
 
 
-def fat_segmentation_id(name: str) -> int:
-    """Return a class's id in the segmentation images of FAT's `mixed` scenes."""
-    return 12 * ycbvideo_index(name)
-
-
 def ycbvideo_from_original(name: str) -> np.ndarray:
     """Return the transform (4, 4) [m] from the frame of the google_16k mesh to YCB-Video's.
 
