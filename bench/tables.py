@@ -12,8 +12,8 @@ A table stands between two comments of a page:
 differ in their seed alone become one row: the mean, and the sample standard deviation over seeds;
 with `spread=interval` the 95 % confidence interval of the mean (Student's t) in its place.
 `omit` leaves settings out of the column `changed` by shell patterns: those that a command above the
-table has for all rows. Rows keep the order of the file. A table of more than ten rows is refused. `--check` writes
-nothing, and fails where a page is not up to date.
+table has for all rows. Rows keep the order of the file. A table of more than ten rows is refused.
+`--check` writes nothing, and fails where a page is not up to date.
 """
 
 import argparse
