@@ -8,11 +8,13 @@ import pytest
 from posefilter.cli import onboard as command
 from posefilter.cli import run_command
 from posefilter.errors import Stopped
+from posefilter.meshes.builtin import catalog
+from posefilter.meshes.write import write_obj
 
 HOME = Path(__file__).parents[2]
 TOY = [
     "mesh=brick",
-    "frames=30",
+    "frames=18",
     "steps=4",
     "test_frames=2",
     "warm_start=null",
@@ -21,8 +23,8 @@ TOY = [
     "console=json",
     "settings=['data.image_width=160','data.generate.size=[160,120]','data.batch_size=2',"
     "'data.batch_size_test=2','data.workers=0','data.limit_train=8','filter.particles=16',"
-    "'filter.first_particles=null','filter.steps=2','data.generate.distractors=[1,2]',"
-    "'data.points=200','logger=none','data.limit_val=2']",
+    "'filter.first_particles=null','filter.steps=2','data.generate.distractors=[1,1]',"
+    "'data.points=200','logger=none','data.limit_val=1','data.generate.frames_per_scene=3']",
 ]
 
 
@@ -34,7 +36,8 @@ def test_it_goes_on_after_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "brick"
-    typed = [*TOY, f"out={out}"]
+    write_obj(catalog.build("bowl"), tmp_path / "few" / "bowl")
+    typed = [*TOY, f"clutter={tmp_path / 'few'}", f"out={out}"]
 
     def interrupted(run: object) -> dict:
         raise Stopped(2)
