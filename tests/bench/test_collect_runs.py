@@ -71,7 +71,7 @@ def test_only_tables_with_runs_are_replaced(
     assert rows[0]["AUROC"] == "", "a figure that a run has not"
 
 
-def test_a_folder_without_runs_is_told(
+def test_a_folder_without_runs_is_refused(
     collect: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -79,7 +79,7 @@ def test_slices_of_an_oracle_have_their_top_at_the_truth_and_its_exact_shape() -
             )
 
 
-def test_an_oracle_that_is_told_a_shifted_pose_has_its_top_there() -> None:
+def test_an_oracle_of_a_shifted_pose_has_its_maximum_there() -> None:
     wrong = TRUE @ make_pose(torch.eye(3), torch.tensor([0.0, 0.03, -0.03]))
     # 15 mm a cell
     field = evaluate_pose_field(Oracle(wrong), None, TRUE, model(), (0.01,), cells=9)
@@ -125,7 +125,7 @@ def test_a_pixel_is_read_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("depthwise", [False, True])
-def test_slices_for_a_point_are_highest_next_to_the_place_that_the_likelihood_favors(
+def test_slices_for_a_point_are_highest_where_the_likelihood_is(
     depthwise: bool,
 ) -> None:
     image = flatten_images(scene().rgb, scene().depth, scene().intrinsics)
@@ -204,7 +204,7 @@ def test_ticks_are_round() -> None:
     ]
 
 
-def test_context_is_asked_for_at_the_place_in_question_not_where_the_pixel_is() -> None:
+def test_context_is_queried_at_the_hypothesis_not_at_the_pixel() -> None:
     class Told(PoseLikelihood):
         def score_at_level(self, points: Points, level: Tensor, radius: float) -> Tensor:
             assert points.context is not None

@@ -141,7 +141,7 @@ def test_best_and_worst_are_the_best_and_the_worst(run: tuple[Path, Figures, Fil
     assert kept["worst"][0].error == pytest.approx(0.07, abs=0.01)
 
 
-def test_pictures_are_on_the_board_and_in_the_folder(
+def test_figures_are_in_tensorboard_and_in_the_folder(
     run: tuple[Path, Figures, FilterHealth],
 ) -> None:
     folder = run[0]
@@ -216,7 +216,7 @@ def test_health_is_the_mean_over_all_images(run: tuple[Path, Figures, FilterHeal
     assert all(0 < share <= 1 for share in curves["ess"])
 
 
-def test_looking_changes_nothing(tmp_path: Path) -> None:
+def test_drawing_changes_nothing(tmp_path: Path) -> None:
     torch.manual_seed(3)
     np.random.seed(3)  # noqa: NPY002
     before, other = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index, union-attr]  # noqa: NPY002

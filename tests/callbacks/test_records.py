@@ -95,7 +95,7 @@ def test_malformed_lines_are_named(tmp_path: Path, line: str, says: str) -> None
         read_poses_csv(tmp_path / "other.csv")
 
 
-def test_native_poses_map_native_points_to_the_same_place() -> None:
+def test_native_poses_map_native_points_to_the_same_points() -> None:
     camera_from_object, native_from_mesh = poses(4), poses(1, seed=1)[0]
     point = np.array([0.03, -0.02, 0.1, 1.0])
     native = to_native(camera_from_object, native_from_mesh)

@@ -10,7 +10,9 @@ from posefilter.callbacks.speed import Speed
 from posefilter.callbacks.tensorboard import Budget
 
 
-def test_images_waiting_and_validations_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_waiting_and_validations_are_timed_separately(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = [0.0]
     monkeypatch.setattr(speed.time, "perf_counter", lambda: now[0])
     logged: list[dict[str, float]] = []

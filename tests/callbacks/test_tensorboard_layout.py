@@ -110,7 +110,7 @@ def test_what_matters_is_shown_first(tmp_path: Path) -> None:
     assert [info.name for info in experiment.hparam_infos][:6] == ["augment", *names[:5]]
 
 
-def test_layout_is_read_back_in_the_storys_order(tmp_path: Path) -> None:
+def test_layout_is_loaded_in_its_order(tmp_path: Path) -> None:
     run(tmp_path, 50)
     board = EventAccumulator(str(tmp_path))
     board.Reload()

@@ -47,7 +47,7 @@ def test_bars_are_for_terminals(
     assert isinstance(progress("json"), Lines)
 
 
-def test_a_long_training_gives_signs_of_life(
+def test_a_long_training_prints_its_progress(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One a pause, also where a validation spoke last; earlier validations' figures are not told
@@ -70,7 +70,7 @@ def test_a_long_training_gives_signs_of_life(
     assert capsys.readouterr().out.count("\n") == 1
 
 
-def test_a_long_test_gives_signs_of_life(
+def test_a_long_test_prints_its_progress(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [1000.0]

@@ -58,7 +58,7 @@ def test_a_checkpoint_is_written_by_time_too_and_the_one_before_is_kept(tmp_path
     assert [step(run / name) for name in ("last.ckpt", "last.previous.ckpt")] == [3, 2]
 
 
-def test_a_broken_checkpoint_does_not_take_the_place_of_the_one_before(tmp_path: Path) -> None:
+def test_a_broken_checkpoint_does_not_replace_the_one_before(tmp_path: Path) -> None:
     fit(tmp_path, 3, 0.0)
     (tmp_path / "last.ckpt").write_bytes(b"broken")
     fit(tmp_path, 3, 0.0, start=shutil.copy(tmp_path / "last.previous.ckpt", tmp_path / "it.ckpt"))

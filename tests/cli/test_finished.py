@@ -40,7 +40,7 @@ def test_a_job_is_done_if_nothing_that_decides_its_result_differs(
         finished(job(tmp_path, overrides))
 
 
-def test_a_default_that_has_changed_since_is_told() -> None:
+def test_a_default_that_has_changed_since_is_reported() -> None:
     then = {
         "choices": {"model": "downsized", "optimizer": "adamw"},
         "settings": {"filter": {"steps": 6}, "threads": 1},

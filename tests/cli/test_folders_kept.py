@@ -83,7 +83,7 @@ def test_what_is_above_the_folder_goes_with_it_where_it_is_ours(
     assert (tmp_path / "empty").is_dir()
 
 
-def test_a_sweep_of_predictions_stays_in_its_folder_and_tells_what_failed(
+def test_a_sweep_of_predictions_stays_in_its_folder_and_reports_what_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -25,7 +25,7 @@ CONF = Path(__file__).parents[2] / "conf"
     ],
     ids=lambda value: ",".join(value) if isinstance(value, list) else None,
 )
-def test_training_is_shared_where_nothing_that_it_reads_differs(
+def test_training_is_shared_where_no_setting_of_it_differs(
     common: list[str], changed: list[str], same: bool, tmp_path: Path
 ) -> None:
     """pose_pf scores candidates and rolls out no filter; a truncated roll-out has as many

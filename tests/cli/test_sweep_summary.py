@@ -30,7 +30,7 @@ def sweep(folder: Path, key: str, words: list[str]) -> Path:
     return folder
 
 
-def test_a_ladder_is_read_as_one_climbs_it(tmp_path: Path) -> None:
+def test_ablations_are_in_the_order_of_the_table(tmp_path: Path) -> None:
     ablations = ["paper", "s1_glimpse", "c1_normalization", "c10_resample", "working"]
     summarize(sweep(tmp_path, "ablation", ablations))
     with (tmp_path / "summary.csv").open() as file:

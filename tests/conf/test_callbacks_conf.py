@@ -31,7 +31,7 @@ def kinds(job: Job) -> list[type]:
     return [type(callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
 
 
-def test_none_leaves_the_checkpoints_and_nothing_that_looks(tmp_path: Path) -> None:
+def test_none_leaves_only_the_checkpoints(tmp_path: Path) -> None:
     usual, none = kinds(compose(tmp_path)), kinds(compose(tmp_path, "callbacks=none"))
     assert Figures in usual
     assert [kind for kind in none if issubclass(kind, Checkpoint)] == [Best, Last]
@@ -46,7 +46,7 @@ def test_a_single_figure_is_switched_off_by_its_name(tmp_path: Path) -> None:
     assert "belief" in figures.drawings
 
 
-def test_a_run_is_told_apart_by_choices_and_settings_but_not_by_where_it_is(tmp_path: Path) -> None:
+def test_runs_are_distinguished_by_choices_and_settings_not_by_their_folder(tmp_path: Path) -> None:
     job = compose(
         tmp_path, "filter/refine=none", "filter.particles=50", f"out={tmp_path}", "seed=3"
     )

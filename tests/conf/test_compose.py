@@ -209,7 +209,7 @@ class TestBuilding:
         with pytest.raises(UserError, match="may not be built"):
             instantiate({"_target_": name}, "x")
 
-    def test_misspelt_names_are_told(self) -> None:
+    def test_misspelt_names_are_refused(self) -> None:
         with pytest.raises(UserError, match="did you mean 'Adam'"):
             instantiate({"_target_": "torch.optim.AdamV"}, "optimizer")
         node = {
@@ -220,7 +220,7 @@ class TestBuilding:
         with pytest.raises(UserError, match=r"resample.threshhold.*did you mean 'threshold'"):
             instantiate(node, "resample")
 
-    def test_missing_and_wrong_arguments_are_told(self) -> None:
+    def test_missing_and_wrong_arguments_are_refused(self) -> None:
         with pytest.raises(UserError, match=r"schedule.sigma: is missing"):
             instantiate({"_target_": "posefilter.filters.schedule.Constant"}, "schedule")
         with pytest.raises(UserError, match=r"schedule.sigma=True: must be a number"):

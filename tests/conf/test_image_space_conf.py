@@ -118,7 +118,7 @@ REMEDIES = [
 
 @pytest.mark.parametrize("model", ["patch_pf", "downsized"])
 @pytest.mark.parametrize("change", REMEDIES)
-def test_each_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
+def test_each_modification_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
     method = build(tmp_path, f"model={model}", *change.split())
     step(method)
     with torch.no_grad():
@@ -126,7 +126,7 @@ def test_each_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> N
     assert trace.belief.best.isfinite().all()
 
 
-def test_the_motions_margin_is_as_much_of_the_object_at_either_width(tmp_path: Path) -> None:
+def test_the_margin_of_the_displacement_scales_with_the_image(tmp_path: Path) -> None:
     margins = {
         model: build(tmp_path, f"model={model}").aux_losses["displacement"].loss.label.margin_px
         for model in KINDS
@@ -148,7 +148,7 @@ def test_the_motions_margin_is_as_much_of_the_object_at_either_width(tmp_path: P
     ],
 )
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf"])
-def test_each_pose_remedy_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
+def test_each_pose_modification_is_one_choice(model: str, change: str, tmp_path: Path) -> None:
     step(build(tmp_path, f"model={model}", *change.split()))
 
 

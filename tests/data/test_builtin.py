@@ -162,7 +162,7 @@ def test_the_carton_shows_its_print_upright_and_unmirrored(face: str) -> None:
     assert min(error, key=lambda key: error[key]) == "as it is"
 
 
-def test_every_face_of_the_carton_is_told_from_every_other_even_when_small() -> None:
+def test_faces_of_the_carton_differ_even_when_small() -> None:
     mesh = builtin.build("carton")
     small = {
         face: _picture(mesh, face, 40, 40).reshape(5, 8, 5, 8, 3).mean(axis=(1, 3))

@@ -57,7 +57,7 @@ def test_pose_depth_mask_and_camera_are_the_truth(tmp_path):
     assert np.isnan(sample.visibility)
 
 
-def test_canary_the_column_reading_of_the_transform_is_another_pose(tmp_path):
+def test_canary_the_transform_by_columns_is_another_pose(tmp_path):
     """Had F been taken for columns, or its factor 100 left in, the test above would notice."""
     folder = one_frame(tmp_path)
     F = np.array(
@@ -128,7 +128,7 @@ def test_visibility_is_the_share_of_pixels_not_what_the_json_says(tmp_path, mesh
     np.testing.assert_array_equal(reader.others(0), index == 1)
 
 
-def test_two_instances_are_told_apart_by_their_geometry(tmp_path, meshes):
+def test_two_instances_are_distinguished_by_their_geometry(tmp_path, meshes):
     folder = fat_folder(tmp_path / "mixed" / "temple_1", {"toy": 24})
     poses = [pose(), pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.35))]
     fat_frame(folder, 0, [("toy", 24, p) for p in poses])
@@ -155,7 +155,7 @@ def test_single_scene_folder_and_parts(tmp_path):
     assert FatReader(folder).records()[0].group == "kitchen_0"
 
 
-def test_hidden_objects_are_left_out_and_counted_at_reading(tmp_path):
+def test_hidden_objects_are_left_out_and_counted(tmp_path):
     folder = fat_folder(tmp_path / "mixed" / "temple_1", {"toy": 24, "other": 36})
     # behind the wall
     fat_frame(folder, 0, [("toy", 24, pose(position=(0, 0, 2.0))), ("other", 36, pose())])

@@ -62,7 +62,7 @@ def test_a_printed_can_turns_by_shape_alone_and_may_be_upside_down() -> None:
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl"])
-def test_a_handle_and_a_foot_are_seen(name: str) -> None:
+def test_a_handle_and_a_foot_break_symmetry(name: str) -> None:
     turns = find_symmetries(catalog.build(name))
     expected = [ANY] if name == "bowl" else []
     assert folds(turns, texture=False) == folds(turns, texture=True) == expected

@@ -45,7 +45,7 @@ def test_what_a_closed_printed_box_is(brick: Mesh) -> None:
     assert list_concerns(facts) == []
 
 
-def test_a_hole_a_turned_surface_and_a_lost_texture_are_told(brick: Mesh) -> None:
+def test_a_hole_a_flipped_face_and_a_lost_texture_are_reported(brick: Mesh) -> None:
     halved = replace(brick, faces=brick.faces[: len(brick.faces) // 2])
     inward = replace(brick, faces=brick.faces[:, ::-1])
     plain = replace(brick, corner_uv=None, texture=brick.texture[:1, :1])

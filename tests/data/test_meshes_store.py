@@ -151,7 +151,7 @@ def test_symmetry_group_is_closed() -> None:
             assert np.abs(group - a @ b).max(axis=(1, 2)).min() < 1e-9
 
 
-def test_turn_about_leaves_its_line() -> None:
+def test_a_rotation_keeps_the_points_of_its_axis() -> None:
     axis, point = np.array([0.6, 0, 0.8]), np.array([0.1, 0.2, 0.3])
     turn = rotation_about(axis, 1.0, point)
     assert turn @ [*(point + 0.7 * axis), 1] == pytest.approx([*(point + 0.7 * axis), 1])
@@ -160,7 +160,7 @@ def test_turn_about_leaves_its_line() -> None:
     assert moved @ np.cross(axis, [0, 1, 0]) == pytest.approx(np.sin(1.0))  # right-handed
 
 
-def test_an_unknown_mesh_is_told_what_there_is(tmp_path: Path) -> None:
+def test_an_unknown_mesh_is_refused_with_the_names_there_are(tmp_path: Path) -> None:
     message = _fails(MeshStore("builtin"), "cracker")
     assert "there are banana, bleach_bottle," in message
     assert "data.meshes=DIR" in message

@@ -141,7 +141,7 @@ def test_the_object_changes_apart_from_its_surroundings() -> None:
     np.testing.assert_array_equal(apply(ColorResponse(target="object"), hidden).rgb, before.rgb)
 
 
-def test_the_drawn_hues_have_the_spread_that_is_asked_for() -> None:
+def test_the_drawn_hues_have_the_given_spread() -> None:
     """The standard deviation of hue is measured on a saturated color, to within its sampling error
     (3 sigma).
     """

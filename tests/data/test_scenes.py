@@ -144,7 +144,7 @@ def test_without_occlusion_nothing_hides_the_target(scene: SceneSet) -> None:
     assert visible_shares(layouts).min() > 0.85
 
 
-def test_the_foreseen_share_is_near_the_rendered_one(scene: SceneSet) -> None:
+def test_the_predicted_visibility_is_near_the_rendered_one(scene: SceneSet) -> None:
     layouts = draw(scene, SceneSettings(occluded_share=0.6), 20)
     foreseen = np.array([View(K, H, W).visible(list(layout.placed)) for layout in layouts])
     assert np.median(np.abs(foreseen - visible_shares(layouts))) < 0.06

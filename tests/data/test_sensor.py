@@ -39,7 +39,7 @@ def test_the_ideal_sensor_changes_nothing() -> None:
     assert np.abs(photo / 255 - np.clip(rgb, 0, 1)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_the_same_generator_gives_the_same_reading() -> None:
+def test_the_same_generator_gives_the_same_images() -> None:
     a, b, c = (
         simulate_sensor(GREY, step_scene(), sensor_model("kinect"), np.random.default_rng(s))
         for s in (1, 1, 2)

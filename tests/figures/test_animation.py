@@ -121,7 +121,7 @@ def test_close_ups_are_beside_their_frames_however_few_steps_there_are() -> None
             assert abs(filled.sum() - count * 218) < 10
 
 
-def test_pixels_move_from_their_parents_to_themselves() -> None:
+def test_pixels_move_from_their_ancestors_to_their_own_positions() -> None:
     first, second = (
         torch.tensor([[10.0, 10.0], [60.0, 40.0]]),
         torch.tensor([[70.0, 40.0], [70.0, 50.0]]),

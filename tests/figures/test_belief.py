@@ -220,7 +220,7 @@ def test_marginals_are_in_the_units_they_say() -> None:
     assert shifts[0].edges[0] < min(shifts[0].marks) < max(shifts[0].marks) < shifts[0].edges[-1]
 
 
-def test_what_lies_beyond_a_histogram_is_told() -> None:
+def test_what_lies_beyond_a_histogram_is_reported() -> None:
     belief, _, _ = two_modes(share=0.01)
     poses, weights, best = select_single(belief)
     beyond = [
@@ -232,7 +232,7 @@ def test_what_lies_beyond_a_histogram_is_told() -> None:
     assert all(one == pytest.approx(0, abs=0.06) for one in beyond)
 
 
-def test_a_second_pose_is_told_with_its_share() -> None:
+def test_a_second_pose_is_reported_with_its_share() -> None:
     """How sure the estimate's own mode is, without the other one; how heavy, far and turned the
     other is.
     """
@@ -250,7 +250,7 @@ def test_a_second_pose_is_told_with_its_share() -> None:
     assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)
 
 
-def test_one_pose_is_told_as_one_and_a_lost_estimate_as_lost() -> None:
+def test_a_single_pose_and_a_lost_estimate_are_reported() -> None:
     belief, _, b = two_modes(share=0.0)
     poses, weights, best = select_single(belief)
     keep = weights > 1e-12

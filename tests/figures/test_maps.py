@@ -47,7 +47,7 @@ def test_relevance_is_averaged_over_the_mask() -> None:
     assert np.isnan(average_relevance(relevance, np.zeros_like(MASK)))
 
 
-def test_figure_of_relevance_shows_map_rim_and_both_clouds() -> None:
+def test_figure_of_relevance_shows_map_outline_and_both_sets_of_particles() -> None:
     relevance = np.zeros((6, 8))
     relevance[2:4, 4:6] = 1.0
     weights = np.full(20, 0.05)

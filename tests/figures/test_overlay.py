@@ -72,7 +72,7 @@ def test_outline_lies_on_the_edge_of_the_mask(carton: Mesh, kind: str) -> None:
     assert edge_distances(picture, moved, ESTIMATE)[1] > 12
 
 
-def test_axes_start_at_the_centre_of_the_box(carton: Mesh) -> None:
+def test_axes_start_at_the_center_of_the_box(carton: Mesh) -> None:
     picture = draw_overlay(GREY, K, pose(), carton)
     model = object_model(carton, count=10)
     shown = full_view(H, W, 640)

@@ -72,7 +72,7 @@ def test_colors_span_a_tenth_to_ten_times_the_mean() -> None:
     assert (color_by_weight(weights)[0] == colors[0]).all()  # clipped
 
 
-def test_rows_of_pixels_tells_who_left_the_frame() -> None:
+def test_rows_of_pixels_count_particles_off_the_frame() -> None:
     states = torch.tensor([[[10.0, 10.0], [30.0, 20.0]], [[12.0, 10.0], [300.0, 20.0]]])
     trace = trace_of(states, torch.full((2, 2), 0.5))
     figure = draw_iterations(RGB, K, trace, 0, PixelSpace())

@@ -25,7 +25,7 @@ def places(picture: np.ndarray, color: tuple[int, int, int], rows: slice) -> np.
     return np.argwhere((picture[rows] == color).all(-1))
 
 
-def test_who_stands_on_the_mask() -> None:
+def test_which_particles_are_on_the_mask() -> None:
     assert find_hits(MASK, LAST).tolist() == [True, False, True]
     assert find_hits(MASK, STATES).shape == (5, 3)
     assert not find_hits(MASK, np.array([[1e9, np.nan], [-5.0, 12.0]])).any()

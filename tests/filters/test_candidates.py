@@ -48,7 +48,7 @@ def test_half_turns_are_half_turns_about_the_center() -> None:
     assert (angle_between(turned[..., :3, :3], poses[..., :3, :3]) - torch.pi).abs().max() < 2e-3
 
 
-def test_jiggle_has_the_size_it_is_told() -> None:
+def test_jitter_has_the_given_size() -> None:
     poses = torch.eye(4).expand(1, 20_000, 4, 4)
     moved = perturb(poses, torch.full((1, 20_000), 0.02), SPACE, generator())
     assert abs(moved[0, :, 0, 3].std().item() - 0.02) < 5e-4

@@ -22,13 +22,13 @@ def cloud_of(N: int, seed: int) -> Particles:
     return Particles(state, torch.zeros(2, N, 0), weights, torch.arange(N).expand(2, N))
 
 
-def test_look_up_reads_the_cell_under_the_particle() -> None:
+def test_sampling_takes_the_cell_under_the_particle() -> None:
     relevance = torch.arange(6.0).view(1, 1, 2, 3)
     state = torch.tensor([[[-0.5, -0.5], [9.4, 9.4], [9.6, 9.4], [29.0, 19.0], [500.0, -70.0]]])
     assert gather_relevance(relevance, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
 
 
-def test_guided_resampling_keeps_the_weighted_mean_and_sends_children_to_the_relevant() -> None:
+def test_guided_resampling_keeps_the_weighted_mean_and_prefers_relevant_particles() -> None:
     particles = cloud_of(40, 0)
     relevance = torch.full((2, 1, 6, 8), 0.1)
     relevance[..., :4] = 1.0  # the left half

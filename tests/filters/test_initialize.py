@@ -161,7 +161,7 @@ def test_informed_starts_read_the_mask_in_training_only() -> None:
         (FromProposals(), Pixels(), "proposes no poses"),
     ],
 )
-def test_what_does_not_fit_is_said(piece: Initialize, method: object, words: str) -> None:
+def test_what_does_not_fit_is_refused(piece: Initialize, method: object, words: str) -> None:
     with pytest.raises(UserError, match=words):
         run(piece, method)
 

@@ -159,7 +159,7 @@ def test_every_step_is_what_its_words_say() -> None:
     assert [(step.number, step.steps) for step in trace.steps] == [(t, 4) for t in range(4)]
 
 
-def test_memory_follows_its_particle() -> None:
+def test_a_latent_follows_its_particle() -> None:
     method = Hill(GOALS)
     trace = build(propagate=Identity())(None, method, Generator().manual_seed(0))
     for t, particles in enumerate(trace.particles):
@@ -172,7 +172,7 @@ def test_memory_follows_its_particle() -> None:
             torch.testing.assert_close(particles.state, ancestors)
 
 
-def test_a_first_cloud_may_be_larger() -> None:
+def test_the_first_step_may_have_more_particles() -> None:
     trace = build(first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
     assert [particles.state.shape[1] for particles in trace.particles] == [300, 50, 50, 50]
     assert trace.particles[1].ancestors.max() >= 50

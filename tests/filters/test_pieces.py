@@ -60,7 +60,7 @@ def test_gaussian_moves_have_the_size_of_the_noise_level() -> None:
     assert float(turn) == pytest.approx(0.2 * 3**0.5, rel=0.05)
 
 
-def test_learned_motion_and_chains() -> None:
+def test_learned_displacement_and_chains() -> None:
     state, displacement, g = (
         torch.zeros(1, 3, 2),
         torch.tensor([[[1.0, 2.0]] * 3]),

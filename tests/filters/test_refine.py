@@ -179,7 +179,7 @@ def test_chains_and_nothing() -> None:
     assert off(found).max() < 0.002
 
 
-def test_what_cannot_be_refined_is_said() -> None:
+def test_what_cannot_be_refined_is_refused() -> None:
     class Blind:
         space = PixelSpace()
 

@@ -41,7 +41,7 @@ def test_of_equal_values_the_first_is_the_least() -> None:
     assert torch.equal(argmin(values), values.argmin(-1))
 
 
-def test_an_empty_mask_pulls_nowhere() -> None:
+def test_an_empty_mask_gives_no_displacement() -> None:
     mask = blobs(0)
     mask[1] = False
     places = torch.rand(3, 5, 2) * 20

@@ -115,7 +115,7 @@ def test_angles_are_a_metric(shape: tuple[int, ...], dtype: torch.dtype, atol: f
 
 @shapes
 @dtypes
-def test_moving_about_the_centre_keeps_turn_and_shift_apart(
+def test_moves_about_the_center_separate_rotation_and_translation(
     shape: tuple[int, ...], dtype: torch.dtype, atol: float
 ) -> None:
     T = polished(poses(shape, dtype, 0))

@@ -90,7 +90,7 @@ def test_the_law_catches_a_resampler_that_ignores_weights() -> None:
 
 
 @every
-def test_the_same_generator_gives_the_same_children(resampler: Resample) -> None:
+def test_the_same_generator_draws_the_same_ancestors(resampler: Resample) -> None:
     particles = cloud_of(3, 30)
     a = resampler(particles, 30, SPACE, Generator().manual_seed(5))
     b = resampler(particles, 30, SPACE, Generator().manual_seed(5))
@@ -101,7 +101,7 @@ def test_the_same_generator_gives_the_same_children(resampler: Resample) -> None
 @pytest.mark.parametrize(
     "scheme", [Systematic(), Stratified(), Multinomial()], ids=lambda x: type(x).__name__
 )
-def test_places_are_looked_up_as_a_loop_would(scheme: InverseCDF) -> None:
+def test_inverse_cdf_lookup_equals_a_loop(scheme: InverseCDF) -> None:
     particles = cloud_of(3, 20)
     resampled = scheme(particles, 30, SPACE, Generator().manual_seed(2))
     uniforms = scheme.uniforms(3, 30, Generator().manual_seed(2), torch.device("cpu"))
@@ -120,7 +120,7 @@ def test_systematic_rounds_each_share_up_or_down() -> None:
     assert ((counts - 100 * particles.log_weights.exp()).abs() < 1).all()
 
 
-def test_a_particle_of_no_weight_has_no_children() -> None:
+def test_a_particle_of_no_weight_is_no_ancestor() -> None:
     log_w = torch.tensor([[-math.inf, 0.0, -math.inf, -math.inf]])
     for uniforms in (torch.zeros(1, 3), torch.full((1, 3), 1 - 2**-24), torch.rand(1, 3)):
         assert (inverse_cdf(log_w, uniforms) == 1).all()

@@ -103,7 +103,7 @@ def test_the_others_are_too_sure_of_one_image(reweight: Reweight) -> None:
     )
 
 
-def test_reading_one_image_t_times_in_sequence_narrows_it_by_the_root_of_t() -> None:
+def test_measuring_one_image_t_times_narrows_it_by_the_root_of_t() -> None:
     output = torch.randn(4, 50)
     weights = torch.full((4, 50), -math.log(50))
     for _ in range(3):

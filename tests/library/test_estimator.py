@@ -115,7 +115,7 @@ def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> No
     assert result.modes[0].mass > 0.9
 
 
-def test_a_wrong_depth_scale_is_told(estimator: posefilter.Estimator) -> None:
+def test_a_wrong_depth_scale_is_reported(estimator: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     (warning,) = estimator.predict(rgb, 10 * depth, K).warnings
     assert "depth_scale" in warning

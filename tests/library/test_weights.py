@@ -125,7 +125,7 @@ def test_a_damaged_file_in_the_cache_is_fetched_anew(server: Server, tmp_path: P
         ("", 500, "cannot be fetched"),
     ],
 )
-def test_what_cannot_be_fetched_is_told_in_one_line(
+def test_what_cannot_be_fetched_is_one_line(
     server: Server, tmp_path: Path, registry: str, status: int, told: str
 ) -> None:
     server.registry, server.status = registry, status
@@ -134,7 +134,7 @@ def test_what_cannot_be_fetched_is_told_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_only_the_web_is_asked_and_only_for_names(
+def test_only_names_are_fetched(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UserError, match="only http and https"):

@@ -43,7 +43,7 @@ def test_all_mask_pixels_or_an_even_selection_count(batch, model, make_trace) ->
     assert few(trace, batch, model) != everything(trace, batch, model)
 
 
-def test_towards_object_points_at_the_nearest_or_the_centre_within_reach(
+def test_towards_object_points_at_the_nearest_pixel_or_the_center_within_reach(
     batch, model, make_trace
 ) -> None:
     trace = make_trace(f64([[[12.0, 3.0], [6.0, 4.0]]]))
@@ -59,7 +59,7 @@ def test_towards_object_points_at_the_nearest_or_the_centre_within_reach(
         TowardsObject("rim")
 
 
-def test_lesson_is_zero_for_the_truth_and_huber_else(batch, model, make_trace) -> None:
+def test_displacement_loss_is_zero_for_the_truth_and_huber_else(batch, model, make_trace) -> None:
     state = f64([[[12.0, 3.0], [6.0, 4.0]]])
     candidate_sampler = DirectDisplacement(TowardsObject(), width=0.1)
     assert (
@@ -76,7 +76,7 @@ def test_lesson_is_zero_for_the_truth_and_huber_else(batch, model, make_trace) -
     assert got == pytest.approx((far + near) / 2)
 
 
-def test_lesson_leaves_earlier_steps_alone(batch, model, make_trace) -> None:
+def test_displacement_loss_has_no_gradient_to_earlier_steps(batch, model, make_trace) -> None:
     first = f64([[[0.5, 0.5]]]).requires_grad_()
     state = f64([[[12.0, 3.0]]])
     trace = make_trace(

@@ -43,7 +43,7 @@ def test_focal_scales_the_entropy_by_how_wrong_it_is(batch, model, make_trace) -
     torch.testing.assert_close(plain, Bce(OnObject())(trace, batch, model))
 
 
-def test_steps_choose_which_readings_are_judged(batch, model, make_trace) -> None:
+def test_steps_choose_which_outputs_count(batch, model, make_trace) -> None:
     state = torch.cat([places(OFF), places(ON)])
     trace = make_trace(state, torch.cat([logs(0.5), logs(0.25)]))
     assert Bce(OnObject(), "last")(trace, batch, model).item() == pytest.approx(-math.log(0.25))

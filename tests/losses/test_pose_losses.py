@@ -93,7 +93,7 @@ def test_own_point_measures_where_the_particles_surface_point_lands(
     assert SurfacePointLoss()(trace, blind, model).item() == 0
 
 
-def test_own_points_told_as_fragments_are_judged_by_the_true_fragment_and_the_place_in_it(
+def test_fragments_are_scored_by_the_true_fragment_and_the_position_in_it(
     batch, model, make_trace
 ) -> None:
     # pixel (6, 3), over the radius

@@ -56,7 +56,7 @@ def test_auroc_equals_counting_pairs() -> None:
     assert math.isnan(auroc(score, torch.zeros(60, dtype=torch.bool)).item())
 
 
-def test_shares_of_places() -> None:
+def test_shares_of_particles_on_object_at_edges_and_in_corners() -> None:
     state = torch.tensor([[[100.0, 50.0], [122.0, 50.0], [2.0, 2.0], [100.0, 99.0], [-5.0, 50.0]]])
     assert off_frame(state, 200, 100).item() == pytest.approx(0.2)
     edge, corner = near_edge(state, 200, 100)

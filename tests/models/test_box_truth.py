@@ -53,7 +53,7 @@ def telling(method: CnnPatch, batch: Batch, box: torch.Tensor) -> Trace:
     return trace._replace(outputs=outputs)
 
 
-def test_what_the_lesson_asks_for_scores_full_marks() -> None:
+def test_the_target_of_the_sides_has_an_iou_of_one() -> None:
     method, batch = working(CnnPatch, 9).eval(), half_hidden()
     height, width = batch.rgb.shape[-2:]
     whole = box_of_pose(

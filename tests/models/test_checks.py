@@ -91,7 +91,7 @@ def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: 
 
 @pytest.mark.parametrize("variant", ["paper", "working"])
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
-def test_votes_are_refused_where_the_memory_is_a_latent(
+def test_votes_are_refused_where_the_network_reads_the_latent(
     model: str, variant: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as refusal:
@@ -127,7 +127,7 @@ LEGAL = [
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "cnn_patch"])
-def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> None:
+def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_path: Path) -> None:
     batch = scenes(2)
     method = images(tmp_path, f"model={model}", "model/train_rollout=full", *WIDE)
     with pytest.raises(UserError) as refusal:
@@ -147,7 +147,7 @@ def test_a_training_rolls_out_clouds_of_one_size(model: str, tmp_path: Path) -> 
         assert all(loss.isfinite().all() for loss in losses.values())
 
 
-def test_a_short_filters_own_first_cloud_is_named_as_it_is_typed(tmp_path: Path) -> None:
+def test_first_particles_of_a_training_filter_are_named_by_their_key(tmp_path: Path) -> None:
     wide = [
         "model.train_filter.first_particles=200",
         "model.train_filter.resample._target_=posefilter.filters.resample.Systematic",
@@ -284,7 +284,7 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
         ),
     ],
 )
-def test_a_pose_that_nobody_tells_is_not_judged(
+def test_a_pose_that_nothing_provides_is_not_scored(
     choice: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as refusal:

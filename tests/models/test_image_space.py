@@ -186,7 +186,7 @@ def test_the_papers_sizes() -> None:
     assert method.net.displacement[0].in_features == 7 + 1 + 256
 
 
-def test_no_gradient_of_what_is_seen_reaches_the_motion_through_an_integer_cut() -> None:
+def test_no_gradient_of_a_patch_reaches_the_displacement_through_an_integer_cut() -> None:
     """The paper's likelihood cannot teach method 1 where to go: only a place that is told can, or a
     smooth glimpse.
     """
@@ -207,7 +207,7 @@ def test_no_gradient_of_what_is_seen_reaches_the_motion_through_an_integer_cut()
     assert not reaches(paper(PatchPF, 3, loss=bce, truncate=1))
 
 
-def test_neither_mask_nor_pose_is_looked_at_in_evaluation() -> None:
+def test_neither_mask_nor_pose_is_used_in_evaluation() -> None:
     torch.manual_seed(0)
     method = working(PatchPF, 3).eval()
     batch = scenes(2)

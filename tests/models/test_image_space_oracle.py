@@ -74,7 +74,7 @@ def scenes() -> Batch:
 
 @pytest.mark.parametrize("resample", [NoResampling(), Systematic()], ids=["never", "systematic"])
 @pytest.mark.parametrize("head", [Unbounded(), Bounded(0.25)], ids=["unbounded", "bounded"])
-def test_told_the_truth_every_particle_reaches_the_object(
+def test_with_true_displacements_every_particle_reaches_the_object(
     head: torch.nn.Module, resample: NoResampling
 ) -> None:
     batch = scenes()
@@ -99,7 +99,7 @@ def test_told_the_truth_every_particle_reaches_the_object(
     assert found["on_object"][-1] == 1.0
 
 
-def test_told_only_the_mean_they_drift_together_and_miss() -> None:
+def test_with_mean_displacements_they_drift_together_and_miss() -> None:
     """What a network that sees nothing of use can learn at best: the signs tell it from the
     truth.
     """

@@ -19,7 +19,7 @@ def test_singular_values_come_to_about_one() -> None:
         assert ((u @ v) * y).sum() / (u @ v).norm() / y.norm() > 0.97  # and the directions stay
 
 
-def test_a_step_has_the_size_it_is_told_whatever_the_gradient() -> None:
+def test_a_step_has_the_given_size_whatever_the_gradient() -> None:
     torch.manual_seed(0)
     for scale in (1e-3, 1e3):
         weight = torch.nn.Parameter(torch.zeros(40, 6, 3, 3))

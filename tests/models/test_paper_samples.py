@@ -78,7 +78,7 @@ def test_which_networks_learn(method, learning: set[str]) -> None:
     } == learning
 
 
-def test_a_stopped_place_keeps_the_likelihoods_loss_out_of_the_motion() -> None:
+def test_a_detached_position_blocks_the_likelihoods_gradient_of_the_displacement() -> None:
     """Through the place, a loss that asks "am I on the object?" teaches to leave for where the
     answer is surely no.
     """
@@ -106,7 +106,7 @@ def test_the_detectors_likelihood_is_never_taught(unit: str | float) -> None:
     assert v > 0
 
 
-def test_the_pixels_motion_ends_as_it_was_drawn() -> None:
+def test_the_displacement_of_pixel_pf_is_never_trained() -> None:
     torch.manual_seed(0)
     method = paper(PixelPF, 1)
     drawn = {name: value.clone() for name, value in method.net.named_parameters()}
@@ -125,7 +125,7 @@ def test_the_pixels_motion_ends_as_it_was_drawn() -> None:
     assert same == {"likelihood", "displacement"}
 
 
-def test_what_no_loss_reads_is_asked_for_no_gradient() -> None:
+def test_outputs_without_a_loss_have_no_gradient() -> None:
     """Not even for one of zeros: where a place reaches no loss, most of the backward pass would be
     spent on it.
     """

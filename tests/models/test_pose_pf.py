@@ -141,7 +141,7 @@ def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
     assert (scores[:, :1] > scores[:, 1:]).float().mean() > 0.97
 
 
-def test_neither_mask_nor_truth_is_looked_at(trained: PosePF) -> None:
+def test_neither_mask_nor_truth_is_used(trained: PosePF) -> None:
     trained.eval()
     batch = scenes(3, seed=30_000)
     blind = batch._replace(
@@ -162,7 +162,7 @@ def test_without_proposals_the_start_must_be_another(trained: PosePF) -> None:
         error(method, 1)
 
 
-def test_the_papers_samples_lie_where_they_are_said_to() -> None:
+def test_the_papers_samples_lie_along_the_rays() -> None:
     method = PosePF(
         PaperLikelihood(),
         LabeledRays(rays=8),
@@ -230,7 +230,7 @@ def test_every_ray_of_an_image_has_the_same_weight_and_padding_none() -> None:
     ).all()
 
 
-def test_the_papers_lesson_refuses_another_likelihood() -> None:
+def test_labeled_rays_refuse_another_likelihood() -> None:
     method = working()
     method.candidate_sampler = LabeledRays()
     with pytest.raises(UserError, match="model/likelihood=paper"):

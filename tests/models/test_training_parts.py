@@ -292,7 +292,7 @@ def test_a_cut_gradient_changes_no_value(kind: type[ImageSpace], truncate: int) 
     assert (whole.outputs[-1].latent - whole.outputs[0].latent).abs().max() > 0.01
 
 
-def test_a_step_that_is_cut_looks_back_at_none() -> None:
+def test_a_truncated_step_has_no_gradient_of_earlier_ones() -> None:
     torch.manual_seed(0)
     # reads patch, context and place
     method = working(PatchPF, 3, detach_position=False, train_filter=run_filter(12, 6))
@@ -318,7 +318,7 @@ def test_a_latent_is_cut_into_stretches() -> None:
     assert len(pairs(roll(method, None), "latent")) == 15
 
 
-def test_places_that_are_judged_are_not_cut() -> None:
+def test_positions_with_a_loss_are_not_truncated() -> None:
     """A loss on where particles went teaches every displacement that led there: only what was
     looked at is cut.
     """

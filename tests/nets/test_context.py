@@ -132,7 +132,7 @@ def test_resnet_weight_mistakes_end_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [(240, 320), (241, 321)])
-def test_wide_images_are_averaged_down_for_context_and_looked_up_where_they_are(
+def test_wide_images_are_downsampled_and_sampled_at_the_same_positions(
     size: tuple[int, int],
 ) -> None:
     g = torch.Generator().manual_seed(3)
@@ -158,7 +158,7 @@ def test_wide_images_are_averaged_down_for_context_and_looked_up_where_they_are(
     torch.testing.assert_close(*found, atol=1e-5, rtol=1e-5)
 
 
-def test_images_that_are_not_too_wide_are_looked_at_as_they_are() -> None:
+def test_images_that_are_not_too_wide_keep_their_size() -> None:
     torch.manual_seed(0)
     bounded, free = ConvEncoder(most_px=160).eval(), ConvEncoder().eval()
     free.load_state_dict(bounded.state_dict())

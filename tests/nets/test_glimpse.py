@@ -36,7 +36,7 @@ def test_smooth_glimpse_equals_integer_cut_at_whole_pixels_and_only_there(size: 
     assert (smooth(image, between) - cut(image, between)).abs().max() > 0.05
 
 
-def test_only_the_smooth_glimpse_has_a_gradient_towards_its_place() -> None:
+def test_only_the_smooth_glimpse_has_a_gradient_of_its_position() -> None:
     ramp = torch.arange(30.0).expand(1, 1, 20, 30) * 2
     pixels = torch.tensor([[[10.3, 8.6]]], requires_grad=True)
     SmoothGlimpse(3)(ramp, pixels).sum().backward()

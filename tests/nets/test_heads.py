@@ -24,7 +24,7 @@ def thing(center: torch.Tensor, radius: float, seed: int = 3) -> ObjectModel:
     return ObjectModel("thing", points, center, radius, 2 * radius, torch.eye(4)[None], points)
 
 
-def test_bounded_motion_stays_in_the_frame_and_unbounded_does_not() -> None:
+def test_a_bounded_displacement_stays_in_the_frame_and_an_unbounded_does_not() -> None:
     g = torch.Generator().manual_seed(0)
     state = torch.rand(4, 100, 2, generator=g) * torch.tensor([99.0, 49.0])
     raw, logit = torch.randn(4, 100, 2, generator=g) * 5, torch.zeros(4, 100)
@@ -94,7 +94,7 @@ def test_who_is_there_stays_there() -> None:
     assert raw.grad is not None
 
 
-def test_own_point_pose_brings_the_told_object_point_to_the_measured_one() -> None:
+def test_the_pose_maps_the_predicted_object_point_to_the_measured_one() -> None:
     g = torch.Generator().manual_seed(1)
     center, radius = torch.tensor([0.01, 0.02, -0.03]), 0.1
     raw, point = torch.randn(2, 6, 9, generator=g), torch.rand(2, 6, 3, generator=g) + 0.5

@@ -148,7 +148,7 @@ def test_context_is_read_where_the_point_is() -> None:
     assert (moved.context[..., 1:4] - points.position / RADIUS).norm(dim=-1)[middle].min() > 0.7
 
 
-def test_gradients_reach_the_features_but_not_what_is_said_of_the_object() -> None:
+def test_gradients_reach_the_features_but_not_the_predicted_coordinates() -> None:
     told = Coordinates(*(x.requires_grad_() for x in predicted()))
     net = PoseLikelihood(width=32, blocks=1, context=2)
     scene = flatten_images(*image(), K, told)

@@ -42,7 +42,7 @@ def test_a_resumed_run_is_one_curve() -> None:
     assert drop_repeats([*first, *resumed]).values == (1.0, 1.0, 2.0, 2.0)
 
 
-def test_signs_of_failure_are_found(run: Path) -> None:
+def test_diagnostics_are_found(run: Path) -> None:
     """Those beyond their limits, and no others."""
     found = {
         finding.diagnostic.key: (finding.value, finding.bad) for finding in diagnose(read_run(run))

@@ -133,7 +133,7 @@ def pair(run: Path, tmp_path: Path) -> tuple[Path, Path]:
     return run, other
 
 
-def test_images_are_matched_by_name_not_by_place(pair: tuple[Path, Path]) -> None:
+def test_images_are_matched_by_name_not_by_index(pair: tuple[Path, Path]) -> None:
     a, b = read_two_runs(f"{pair[0]},{pair[1]}")
     assert (a.folder, b.folder) == pair
     pairs = match_images(a.errors, b.errors)
@@ -176,7 +176,7 @@ def test_the_comparison_page(pair: tuple[Path, Path]) -> None:
     assert {"images-with-an-error-below-a-threshold-threshold-mm.png"} <= set(page.files())
 
 
-def test_what_cannot_be_compared_is_told(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_what_cannot_be_compared_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
     a, b = read_two_runs(f"{pair[0]},{pair[1]}")
     with pytest.raises(UserError, match="should be the folders of two runs"):
         read_two_runs(str(pair[0]))

@@ -57,7 +57,7 @@ def outside(page: str) -> Outside:
     return parser
 
 
-def test_the_page_tells_the_run(run: Path) -> None:
+def test_the_page_has_the_run_s_numbers(run: Path) -> None:
     """Figures, signs, settings, by their values; names are escaped; nothing is fetched."""
     content = make_run_page(
         read_run(run), [Change("filter.particles", "400", "9")], "python report.py run=x"

@@ -154,7 +154,7 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Job:
 
 
 @pytest.mark.parametrize("what", DATA)
-def test_a_recipe_chooses_no_place(
+def test_a_recipe_chooses_no_folder(
     what: str,
     evaluation: Job,
     content: dict[str, Any],

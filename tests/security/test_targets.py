@@ -132,7 +132,7 @@ def test_a_plug_in_is_not_trusted_because_a_checkpoint_says_so(
         method_of(read_checkpoint(path))
 
 
-def test_a_component_that_is_no_method_is_told(content: dict[str, Any], save: Save) -> None:
+def test_a_component_that_is_no_method_is_refused(content: dict[str, Any], save: Save) -> None:
     content["recipe"]["settings"]["model"] = {"_target_": "posefilter.losses.likelihood.Bce"}
     with pytest.raises(UserError, match="model"):
         method_of(read_checkpoint(save(content)))

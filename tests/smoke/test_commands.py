@@ -183,7 +183,7 @@ def test_pieces_change_at_test_time_and_sweeps_sum_up(
         assert beliefs["poses"].shape[1] == int(row["filter.particles"])
 
 
-def test_unknown_pieces_are_told(
+def test_unknown_components_are_refused(
     trained: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     typed = [
@@ -234,7 +234,7 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
 @pytest.mark.parametrize(
     ("view", "told"), [("true", "pip install -e '.[viz]'"), ("maybe", "choose true or false")]
 )
-def test_a_view_that_cannot_be_written_is_told_before_the_work(
+def test_a_view_that_cannot_be_written_is_refused_before_the_work(
     view: str,
     told: str,
     tmp_path: Path,
@@ -334,7 +334,7 @@ def test_plain_is_for_machines(
         ("filter/refine=rescore", "refine.*patch_pf"),
     ],
 )
-def test_pieces_that_do_not_fit_are_told_of_before_any_training(
+def test_components_that_do_not_fit_are_refused_before_any_training(
     choice: str, words: str, tiny_job, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError, match=words):

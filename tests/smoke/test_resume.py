@@ -107,7 +107,7 @@ class Sender(Lines):
     ],
     ids=["within an epoch", "at its end", "within a validation"],
 )
-def test_a_run_that_is_told_to_stop_says_how_to_go_on_and_goes_on_to_the_same_end(
+def test_a_stopped_run_prints_how_to_resume_and_ends_the_same(
     hook: str,
     step: int,
     number: int,

@@ -11,7 +11,7 @@ from tests.smoke.conftest import HOME, TINY
 from posefilter.cli import run_command
 
 
-def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_told(
+def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     typed = [*TINY, f"data.root={tiny_scenes}", "trainer.max_steps=2"]

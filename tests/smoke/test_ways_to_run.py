@@ -22,7 +22,7 @@ def read_csv(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(lines))
 
 
-def test_two_images_are_learned_by_heart(tiny_scenes: Path, tmp_path: Path) -> None:
+def test_two_images_are_memorized(tiny_scenes: Path, tmp_path: Path) -> None:
     """And every logger is told the loss and the settings, tags among them."""
     typed = ["debug=overfit", "logger=csv", "tags=[first,two words]", "trainer.log_every_n_steps=1"]
     typed += ["model=patch_pf", "trainer.max_steps=25", "trainer.val_check_interval=25"]
@@ -49,7 +49,7 @@ def test_a_profile_is_written(tiny_scenes: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("logger", ["wandb", "mlflow"])
-def test_a_logger_that_is_not_installed_is_told_in_one_line(
+def test_a_logger_that_is_not_installed_is_one_line(
     logger: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
