@@ -239,7 +239,7 @@ def test_drawing_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    method, figures = Told(), Figures(tmp_path, every=2, share=None)
+    method, figures = Told(), Figures(tmp_path, every_n_validations=2, share=None)
     trainer = Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
     )
@@ -302,16 +302,16 @@ def test_estimates_that_are_no_numbers_are_the_worst() -> None:
 
 
 def test_one_figure_alone_is_switched_off_by_its_name(tmp_path: Path) -> None:
-    assert set(Figures(without=["animation", "field"]).drawings) == set(DRAWINGS) - {
+    assert set(Figures(exclude=["animation", "field"]).drawings) == set(DRAWINGS) - {
         "animation",
         "field",
     }
     with pytest.raises(
         UserError,
-        match=r"figures.without=fild: there is no such figure; there "
+        match=r"figures.exclude=fild: there is no such figure; there "
         r"are .*field",
     ):
-        Figures(without=["fild"])
+        Figures(exclude=["fild"])
 
 
 def test_a_method_is_left_in_the_mode_that_it_was_in() -> None:

@@ -40,7 +40,7 @@ def test_none_leaves_only_the_checkpoints(tmp_path: Path) -> None:
 
 
 def test_a_single_figure_is_switched_off_by_its_name(tmp_path: Path) -> None:
-    trainer = build_trainer(compose(tmp_path, "callbacks.figures.without=[animation]"))
+    trainer = build_trainer(compose(tmp_path, "callbacks.figures.exclude=[animation]"))
     (figures,) = [c for c in trainer.callbacks if isinstance(c, Figures)]  # type: ignore[attr-defined]
     assert "animation" not in figures.drawings
     assert "belief" in figures.drawings

@@ -30,34 +30,46 @@ from posefilter.types import Batch, Trace
 
 
 class Figures(TraceCallback):
-    """Draw what happened after each `every`-th validation, into TensorBoard and `folder`.
+    """Draw figures of validations, into TensorBoard and `folder`.
 
-    folder: null for TensorBoard alone; first, best, worst: how many images of each kind; without:
-    names of figures that are left out; share: of the validations' time that drawing may take on the
-    whole (null: no limit): drawing that would take more is put off to a later validation, at the
-    latest to the end of the training. Only looks: neither the method nor any random generator is
-    touched.
+    Neither the method nor any random generator is changed.
+
+    Args:
+        folder: Where files are written; None: TensorBoard alone.
+        every_n_validations: Validations between figures.
+        first: The first images that are kept.
+        best: The best images that are kept.
+        worst: The worst images that are kept.
+        exclude: Names of figures that are not drawn.
+        share: Largest fraction of the validations' time that drawing takes; None: no limit. Drawing
+            that would take more is put off to a later validation, or to the end of the training.
+
+    Raises:
+        UserError: `exclude` names a figure that does not exist.
     """
 
     def __init__(
         self,
         folder: str | Path | None = None,
-        every: int = 1,
+        every_n_validations: int = 1,
         first: int = 5,
         best: int = 10,
         worst: int = 10,
-        without: Sequence[str] = (),
+        exclude: Sequence[str] = (),
         share: float | None = 0.04,
     ) -> None:
-        unknown = sorted(set(without) - set(DRAWINGS))
+        unknown = sorted(set(exclude) - set(DRAWINGS))
         if unknown:
             raise UserError(
-                f"callbacks.figures.without={unknown[0]}: there is no such figure; there are "
+                f"callbacks.figures.exclude={unknown[0]}: there is no such figure; there are "
                 f"{', '.join(DRAWINGS)}"
             )
         super().__init__(folder)
-        self.every, self.counts = every, {"first": first, "best": best, "worst": worst}
-        self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in without}
+        self.every_n_validations, self.counts = (
+            every_n_validations,
+            {"first": first, "best": best, "worst": worst},
+        )
+        self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in exclude}
         self.budget = Budget(share)
         self._validations = 0
         self._selection = ImageSelection(**self.counts)
@@ -74,7 +86,7 @@ class Figures(TraceCallback):
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch
     ) -> None:
         """Keep the images that may be drawn."""
-        if self._validations % self.every:
+        if self._validations % self.every_n_validations:
             return
         if self._points is None:
             self._points = subsample(method.model.points, 256).to(batch.rgb.device)

@@ -1,6 +1,4 @@
-"""How the filter fares, iteration by iteration: effective particles, spread, noise level and best
-log-likelihood.
-"""
+"""The filter's health by iteration: effective particles, spread, noise level, log-likelihood."""
 
 from pathlib import Path
 
@@ -21,9 +19,11 @@ class FilterHealth(TraceCallback):
     """Average over the validation images, and log `filter/<quantity>/step_<iteration>` and one
     figure.
 
-    folder: where the figure is written too (null: nowhere); most: iterations that become scalars,
-    evenly chosen; share: of the validations' time that the figure may take (null: no limit), else
-    it is left to a later validation.
+    Args:
+        folder: Where the figure is written too; None: nowhere.
+        most: Largest number of iterations that are logged as scalars, evenly chosen.
+        share: Largest fraction of the validations' time that the figure takes; None: no limit.
+            Drawing that would take more is put off to a later validation.
     """
 
     def __init__(
@@ -72,10 +72,16 @@ class FilterHealth(TraceCallback):
 
 
 def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
-    """Return each image's numbers by name, (B, T) each.
+    """Measure a run of the filter.
 
-    ess: 1 / sum w^2 over the number of particles, in (0, 1]; spread_*: weighted root mean square
-    distance from the mean; sigma_*: noise level; best_log_likelihood: of the image's best particle.
+    Args:
+        trace: Of B images over T steps.
+        space: The space of the particles.
+
+    Returns:
+        By name, (B, T) each: `ess`, 1 / sum w^2 over the number of particles, in (0, 1];
+        `spread_*`, weighted root mean square distance from the mean; `sigma_*`, noise level;
+        `best_log_likelihood`, of the image's best particle.
     """
     steps: list[dict[str, torch.Tensor]] = []
     for particles, output, step in zip(trace.particles, trace.outputs, trace.steps, strict=True):

@@ -1,6 +1,4 @@
-"""What a test said of each image, written down: poses in the format of the BOP challenge, and whole
-beliefs.
-"""
+"""Results of a test by image: poses in the format of the BOP challenge, and whole beliefs."""
 
 import csv
 import math
@@ -23,7 +21,7 @@ NativeFromMesh = Callable[[str], np.ndarray]
 
 
 class Outcome(NamedTuple):
-    """What the filter said of one image.
+    """The result of the filter for one image.
 
     Poses are camera_from_object in the mesh file's frame [m].
     """
@@ -31,7 +29,7 @@ class Outcome(NamedTuple):
     frame_id: int  # index into the split's records
     estimate: np.ndarray  # (4, 4) float64
     score: float
-    seconds: float  # that the image took; NaN where nobody measured
+    seconds: float  # that the image took; NaN where it was not measured
     poses: np.ndarray  # (N, 4, 4) float32
     weights: np.ndarray  # (N,) float32, summing to 1
 
@@ -48,9 +46,10 @@ class PoseRow(NamedTuple):
 
 
 class Records(TraceCallback):
-    """Collect what a test says of each image; `outcomes` is read when the test is over.
+    """Collect the `outcomes` of a test.
 
-    beliefs: whether particles are kept too.
+    Args:
+        beliefs: Keep the particles too.
     """
 
     def __init__(self, beliefs: bool = True) -> None:
@@ -75,7 +74,14 @@ class Records(TraceCallback):
 def collect_outcomes(
     trace: Trace, batch: Batch, seconds: float, beliefs: bool = True
 ) -> list[Outcome]:
-    """Return a run's belief image by image.  Without `beliefs` no particles are kept."""
+    """Return the outcome of each image of a batch.
+
+    Args:
+        trace: The run of the filter.
+        batch: Its B images.
+        seconds: That an image took.
+        beliefs: Keep the particles too.
+    """
     belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()
     poses = belief.poses.detach().cpu().float().numpy()
@@ -90,11 +96,15 @@ def collect_outcomes(
 def to_rows(
     outcomes: Sequence[Outcome], records: Sequence[FrameRecord], native_from_mesh: NativeFromMesh
 ) -> list[PoseRow]:
-    """Return the estimates as lines of a results file; one that is not finite is left out, and so
-    counts as a miss.
+    """Return the estimates as lines of a results file.
 
-    records: the split's, which `frame_id` indexes; native_from_mesh: given a class, its frame in
-    the dataset from the mesh file's (4, 4).
+    Estimates that are not finite are left out, and so count as missed.
+
+    Args:
+        outcomes: Of the images.
+        records: The split's, which `frame_id` indexes.
+        native_from_mesh: Given a class, the transform (4, 4) from the frame of the mesh file to the
+            dataset's own object frame [m].
     """
     rows = []
     for outcome in outcomes:

@@ -31,7 +31,7 @@ def export(job: Job) -> None:
     recipe = stripped["recipe"]
     recipe["settings"] = changed(recipe["settings"], changes(job.cfg))
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
-    size = write_weights(stripped, out, job.cfg.most_mb)
+    size = write_weights(stripped, out, job.cfg.max_mb)
     following = [
         f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
         f"intrinsics=fx,fy,cx,cy depth_scale=10000"
@@ -39,20 +39,20 @@ def export(job: Job) -> None:
     ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
 
 
-def write_weights(stripped: dict[str, Any], out: Path, most_mb: float) -> float:
+def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:
     """Write a stripped checkpoint; return its size [MB].
 
     Raises:
-        UserError: It cannot be used, or is larger than `most_mb`.
+        UserError: It cannot be used, or is larger than `max_mb`.
     """
     method_of(stripped)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.name}.part")
     torch.save(stripped, partial)
     size = partial.stat().st_size / 1e6
-    if size > most_mb:
+    if size > max_mb:
         partial.unlink()
-        raise UserError(f"out={out}: {size:.1f} MB, more than most_mb={most_mb}")
+        raise UserError(f"out={out}: {size:.1f} MB, more than max_mb={max_mb}")
     partial.replace(out)
     return size
 

@@ -52,6 +52,9 @@ KEYS = {
     "patch": "model.glimpse.size",
     "lessons": "model.aux_losses",
     "aux_losses": "model.aux_losses",
+    "callbacks.figures.every": "callbacks.figures.every_n_validations",
+    "callbacks.figures.without": "callbacks.figures.exclude",
+    "most_mb": "max_mb",
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
 _CHOICES = {
