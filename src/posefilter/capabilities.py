@@ -35,28 +35,28 @@ Capabilities = tuple[Capability, ...]
 
 # what is needed where a name is required, after "needs"
 MEANINGS: Mapping[str, str] = {
-    "candidates": "scored candidate poses to judge",
-    "displacement": "particles that learn where to move",
-    "free_latent": "a latent that the network itself does not read",
+    "candidates": "scored candidate poses",
+    "displacement": "particles with a learned displacement",
+    "free_latent": "a latent that is no input of the network",
     "image_patches": "particles that see a patch of the image",
-    "score_points": "a likelihood that judges single image points",
-    "score_samples": "a likelihood that judges colored points by themselves",
+    "score_points": "a likelihood that scores single image points",
+    "score_samples": "a likelihood that scores colored points by themselves",
     "object_coordinates": "a network that predicts object coordinates",
     "pixel_space": "particles that are pixels",
-    "pose": "particles that tell a pose",
+    "pose": "particles with a pose",
     "pose_space": "particles that are poses",
     "propose_poses": "a method that proposes poses",
-    "ray_samples": "points along labeled rays to judge",
-    "relevance": "a map of where to look in the image",
+    "ray_samples": "scored points along labeled rays",
+    "relevance": "a relevance map of the image",
     "rollout": "a training that rolls out the filter",
     "score_poses": "a method that scores any pose",
-    "surface_point_loss": "a loss that teaches each particle's own point of the object",
-    "surface_points": "particles that stand on a measured point of the object",
+    "surface_point_loss": "a loss on each particle's predicted object point",
+    "surface_points": "particles with a measured point of the object",
 }
 
 
 class Declared(NamedTuple):
-    """What a piece says of itself."""
+    """What a class declares."""
 
     provides: frozenset[str] = frozenset()
     requires: frozenset[str] = frozenset()

@@ -22,11 +22,11 @@ from posefilter.types import (
     Trace,
 )
 
-Scene = Any  # what a method keeps of an image: nothing, a pyramid, a feature map, proposals
+Scene = Any  # a method's encoded images: nothing, a pyramid, a feature map, proposals
 
 
 class Space(Protocol):
-    """Where particles live."""
+    """The space of the particles."""
 
     @property
     def dimensions(self) -> int:
@@ -64,7 +64,7 @@ class Method(Protocol):
         ...
 
     def encode(self, batch: Batch) -> Scene:
-        """Look at the images once.  Must not read `batch.mask` or `batch.camera_from_object`."""
+        """Encode the images.  Must not use `batch.mask` or `batch.camera_from_object`."""
         ...
 
     def measure(
@@ -76,7 +76,7 @@ class Method(Protocol):
 
 @runtime_checkable
 class ScoresPoses(Protocol):
-    """A method that can score any poses: refinement asks for it."""
+    """A method that can score any poses; required by refinement."""
 
     def score_poses(
         self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int
@@ -89,7 +89,7 @@ class ScoresPoses(Protocol):
 
 @runtime_checkable
 class ProposesPoses(Protocol):
-    """A method that can draw likely poses from an image: the start `from proposals` asks for it."""
+    """A method that can draw likely poses; required by `filter/initialize=from_proposals`."""
 
     def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
         """Return (B, particles, 4, 4) camera_from_object."""
@@ -98,8 +98,8 @@ class ProposesPoses(Protocol):
 
 @runtime_checkable
 class HasSurfacePoints(Protocol):
-    """A method whose particles each stand on one measured point of its object: the estimate
-    `agreement` asks for it.
+    """A method whose particles each have a measured point; required by
+    `filter/estimate=agreement`.
     """
 
     model: ObjectModel
@@ -113,9 +113,7 @@ class HasSurfacePoints(Protocol):
 
 @runtime_checkable
 class HasImagePatches(Protocol):
-    """A method whose particles each see a patch of the image: the figure of glimpses asks for
-    it.
-    """
+    """A method whose particles each see a patch of the image; required by figures of glimpses."""
 
     def image_patches(self, scene: Scene, state: Tensor) -> Tensor:
         """Return what particles (B, N, 2) [px] see: (B, N, C, k, k), color in [-1, 1] first."""
@@ -124,11 +122,11 @@ class HasImagePatches(Protocol):
 
 @runtime_checkable
 class HasRelevance(Protocol):
-    """A scene that tells where in its images to look: the start `from relevance` asks for it."""
+    """A scene with a relevance map; required by `filter/initialize=from_relevance`."""
 
     @property
     def relevance(self) -> Tensor:
-        """Return how much each cell matters, (B, 1, h, w) >= 0, cells evenly over the image."""
+        """The relevance of each cell, (B, 1, h, w) >= 0; cells cover the image evenly."""
         ...
 
 
@@ -154,12 +152,15 @@ class Reweight(Protocol):
     """Turn likelihoods into weights."""
 
     def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
-        """Return log weights (B, N), to be normalized by the caller; their log sum is the step's
-        log evidence.
+        """Return log weights (B, N); their log-sum-exp is the step's log evidence.
 
-        log_weights (B, N), normalized: what the particles start the step with; log_likelihood (B,
-        N): measured at this step; inherited (B, N): the log_likelihood of its ancestor at the
-        step before (zeros at the first).
+        The caller normalizes them.
+
+        Args:
+            log_weights: (B, N), normalized, before the step.
+            log_likelihood: (B, N) of this step.
+            inherited: (B, N) log-likelihood of each particle's ancestor at the step before; zeros
+                at the first.
         """
         ...
 
@@ -170,12 +171,12 @@ class Resample(Protocol):
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Return ancestors **and** the children's weights, which each scheme must set."""
+        """Draw `count` ancestors of each image, with the weights of the resampled particles."""
         ...
 
 
 class Propagate(Protocol):
-    """Move the children of a resampling."""
+    """Move resampled particles."""
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
@@ -210,7 +211,7 @@ class Refine(Protocol):
 
 
 class Label(Protocol):
-    """Say, for each particle, what the truth asks of it."""
+    """Compute the training target of each particle."""
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return a target for each particle of each step, (T, B, N) or (T, B, N, D)."""
@@ -218,7 +219,7 @@ class Label(Protocol):
 
 
 class Loss(Protocol):
-    """Judge a run of the filter, or a scored cloud of candidates."""
+    """A loss of a roll-out of the filter, or of scored candidates."""
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return one value an image, (B,)."""

@@ -37,10 +37,10 @@ _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks 
 
 
 class ScoresPoints(Protocol):
-    """A likelihood that judges single image points."""
+    """A likelihood that scores single image points."""
 
     def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
-        """Judge points at a noise level [m].  Points (B, N, P) -> (B, N, P)."""
+        """Score points at a noise level [m].  Points (B, N, P) -> (B, N, P)."""
         ...
 
 

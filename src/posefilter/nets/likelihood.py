@@ -213,7 +213,7 @@ class PoseLikelihood(nn.Module):
         return self.leave(torch.relu(x))[..., 0]
 
     def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
-        """Judge points one by one at one noise level [m].  Points (B, N, P) -> (B, N, P)."""
+        """Score points one by one at one noise level [m].  Points (B, N, P) -> (B, N, P)."""
         return self.score_at_level(points, self.level(points.position.new_tensor([sigma])), radius)
 
     def forward(

@@ -56,7 +56,7 @@ class PaperLikelihood(nn.Module):
         return self.net(torch.cat([position, color], dim=-1))[..., 0]
 
     def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
-        """Judge points one by one; `sigma` and `radius` are not used.  Points (B, N, P) -> (B, N,
+        """Score points one by one; `sigma` and `radius` are not used.  Points (B, N, P) -> (B, N,
         P).
         """
         return self.score_samples(points.position + center, points.color)
