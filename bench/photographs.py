@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "photographs.md"
 MARK, END = "<!-- table: {} -->", "<!-- end -->"
-HEAD = ["object", "method", "augment", "warm start", "steps", "CPU min", "images", "ADD AUC"]
+HEAD = ["run", "object", "method", "augment", "warm start", "steps", "CPU min", "images", "ADD AUC"]
 HEAD += ["ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm", "outscored %"]
 CRACKER = "weights/003_cracker_box.ckpt"
 DRILL = "{root}/runs/drill_patch_camera/checkpoints/best.ckpt"
@@ -44,6 +44,8 @@ TARGETS = (
     "061_foam_brick",
 )
 CLUTTER = ("021_bleach_cleanser", "052_extra_large_clamp")
+# camera as it was before it magnified the object
+FAR = "data.augment.steps.1.about=center data.augment.steps.1.zoom=[0.75,1.3]"
 SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
 
 
@@ -58,41 +60,64 @@ class Run(NamedTuple):
 
 
 def plan() -> list[Run]:
-    """Return all trainings; a warm start follows the run that it starts from."""
-    pair = f"data.limit_val=4 data.limit_test=20 warm_start={CRACKER}"
-    few = f"data/augment=camera data.limit_val=2 data.limit_test=2 warm_start={CRACKER}"
+    """Return all trainings; a warm start follows the run that it starts from.
+
+    A first part was trained before `data/augment=camera` magnified the object: FAR puts that back.
+    """
     whole = "data/augment=camera_whole"
+    short = "data/augment=camera data.limit_val=2 data.limit_test=2"
+    pair = f"{FAR} data.limit_val=4 data.limit_test=20 {_after(CRACKER)}"
+    few = f"{short} {FAR} {_after(CRACKER)}"
+
+    def near(name: str, target: str, steps: int, start: str = CRACKER) -> Run:
+        return Run(name, target, "pose_pf", steps, f"{short} {_after(start)}")
+
+    def far(name: str, target: str, steps: int, start: str = CRACKER) -> Run:
+        return Run(name, target, "pose_pf", steps, f"{short} {FAR} {_after(start)}")
+
+    mustard, sugar, drill = "006_mustard_bottle", "004_sugar_box", "035_power_drill"
+    gelatin, mug, foam = "009_gelatin_box", "025_mug", "061_foam_brick"
     return [
+        Run("mustard_pose_camera", mustard, "pose_pf", 300, f"data/augment=camera {pair}"),
         Run(
-            "mustard_pose_camera",
-            "006_mustard_bottle",
-            "pose_pf",
-            300,
-            f"data/augment=camera {pair}",
+            "mustard_pose_strong", mustard, "pose_pf", 300, pair.replace(FAR, "data/augment=strong")
         ),
-        Run(
-            "mustard_pose_strong",
-            "006_mustard_bottle",
-            "pose_pf",
-            300,
-            f"data/augment=strong {pair}",
-        ),
-        Run("sugar_pose_camera", "004_sugar_box", "pose_pf", 300, few),
-        Run("mug_pose_camera", "025_mug", "pose_pf", 300, few),
-        Run("gelatin_pose_camera", "009_gelatin_box", "pose_pf", 250, few),
+        Run("sugar_pose_camera", sugar, "pose_pf", 300, few),
+        Run("mug_pose_camera", mug, "pose_pf", 300, few),
+        Run("gelatin_pose_camera", gelatin, "pose_pf", 250, few),
         Run("chef_can_pose_camera", "002_master_chef_can", "pose_pf", 200, few),
-        Run("foam_pose_camera", "061_foam_brick", "pose_pf", 150, few),
-        Run("drill_pose_camera", "035_power_drill", "pose_pf", 300, few),
-        Run("drill_patch_camera", "035_power_drill", "patch_pf", 4000, whole),
-        Run(
-            "mustard_patch_camera",
-            "006_mustard_bottle",
-            "patch_pf",
-            1000,
-            f"{whole} warm_start={DRILL}",
-        ),
-        Run("sugar_patch_camera", "004_sugar_box", "patch_pf", 1000, f"{whole} warm_start={DRILL}"),
+        Run("foam_pose_camera", foam, "pose_pf", 150, few),
+        Run("drill_pose_camera", drill, "pose_pf", 300, few),
+        Run("drill_patch_camera", drill, "patch_pf", 4000, whole),
+        Run("mustard_patch_camera", mustard, "patch_pf", 1000, f"{whole} {_after(DRILL)}"),
+        Run("sugar_patch_camera", sugar, "patch_pf", 1000, f"{whole} {_after(DRILL)}"),
+        far("gelatin_a", gelatin, 1000, _best("gelatin_pose_camera")),
+        near("gelatin_b", gelatin, 600, _best("gelatin_a")),
+        near("gelatin_c", gelatin, 500, _best("gelatin_b")),
+        far("mug_a", mug, 1000, _best("mug_pose_camera")),
+        near("mug_b", mug, 600, _best("mug_a")),
+        far("foam_a", foam, 1000),
+        near("foam_b", foam, 600, _best("foam_a")),
+        near("chef_b", "002_master_chef_can", 700, _best("chef_can_pose_camera")),
+        near("drill_b", drill, 900),
+        near("meat_b", "010_potted_meat_can", 500),
+        near("soup_b", "005_tomato_soup_can", 500),
+        near("sugar_b", sugar, 400, _best("sugar_pose_camera")),
+        near("banana_b", "011_banana", 450),
+        near("bowl_b", "024_bowl", 450),
+        near("mustard_b", mustard, 400, _best("mustard_pose_camera")),
+        near("tuna_b", "007_tuna_fish_can", 450),
+        near("hammer_b", "048_hammer", 450),
     ]
+
+
+def _best(run: str) -> str:
+    """Return where a run's checkpoint is, below a root that is put in later."""
+    return f"{{root}}/runs/{run}/checkpoints/best.ckpt"
+
+
+def _after(checkpoint: str) -> str:
+    return f"warm_start={checkpoint}"
 
 
 def render_commands(root: Path, frames: int = 180) -> list[list[str]]:
@@ -171,17 +196,25 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
     if own is None or not tested or not tested["instances"]:
         return None
     words = dict(word.split("=", 1) for word in run.words.split())
-    start = {CRACKER: "cracker box", DRILL: "drill"}.get(words.get("warm_start", ""), "none")
+    start = _tell_start(words.get("warm_start", ""))
     cost = own["training"]["steps"] * own["training"]["cpu_seconds_per_step"] / 60
     first = [
+        f"`{run.name}`",
         run.object,
         f"`{run.model}`",
-        words["data/augment"],
+        words["data/augment"] + (", far" if FAR in run.words and "camera" in run.words else ""),
         start,
         str(run.steps),
         f"{cost:.1f}",
     ]
     return [*first, *_figures(tested)]
+
+
+def _tell_start(checkpoint: str) -> str:
+    """Return what a training began with, in words."""
+    if not checkpoint:
+        return "none"
+    return "cracker box" if checkpoint == CRACKER else f"`{checkpoint.split('/')[2]}`"
 
 
 def _read(path: Path) -> dict[str, Any] | None:

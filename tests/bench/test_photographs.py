@@ -82,11 +82,11 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     assert text.startswith("Above.\n")
     assert text.count("\nBelow.\n") == 2
     assert "old" not in text
-    rows = [line for line in text.splitlines() if line.startswith(f"| {run.object}")]
+    rows = [line for line in text.splitlines() if line.startswith(f"| `{run.name}`")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
-    assert [each[4:6] for each in cells] == [[str(run.steps), "5.0"]] * 2
-    assert cells[0][6:] == ["60", "88.0", "89.0", "90.0", "90.0", "4.2", "25"]
-    assert cells[1][6:] == ["20", "77.0", "78.0", "90.0", "90.0", "4.2", "25"]
+    assert [each[5:7] for each in cells] == [[str(run.steps), "5.0"]] * 2
+    assert cells[0][7:] == ["60", "88.0", "89.0", "90.0", "90.0", "4.2", "25"]
+    assert cells[1][7:] == ["20", "77.0", "78.0", "90.0", "90.0", "4.2", "25"]
     page_in_docs = photographs.PAGE.read_text()
     assert all(mark in page_in_docs for mark in marks)
 
