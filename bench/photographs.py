@@ -100,14 +100,14 @@ def plan() -> list[Run]:
         near("foam_b", foam, 600, _best("foam_a")),
         near("chef_b", "002_master_chef_can", 700, _best("chef_can_pose_camera")),
         near("drill_b", drill, 900),
-        near("meat_b", "010_potted_meat_can", 500),
-        near("soup_b", "005_tomato_soup_can", 500),
+        near("meat_b", "010_potted_meat_can", 350),
+        near("soup_b", "005_tomato_soup_can", 350),
         near("sugar_b", sugar, 400, _best("sugar_pose_camera")),
-        near("banana_b", "011_banana", 450),
-        near("bowl_b", "024_bowl", 450),
+        near("banana_b", "011_banana", 350),
+        near("bowl_b", "024_bowl", 350),
         near("mustard_b", mustard, 400, _best("mustard_pose_camera")),
-        near("tuna_b", "007_tuna_fish_can", 450),
-        near("hammer_b", "048_hammer", 450),
+        near("tuna_b", "007_tuna_fish_can", 350),
+        near("hammer_b", "048_hammer", 350),
     ]
 
 
