@@ -133,8 +133,8 @@ def test_slices_for_a_point_are_highest_where_the_likelihood_is(
         Knows(), image, TRUE, model(), (40, 30), True, (0.04, 0.004), depthwise
     )
     a, b = field.plane
-    row, column = np.unravel_index(field.judged[0].argmax(), field.judged[0].shape)
-    line = np.linspace(-field.reach, field.reach, field.judged.shape[1])
+    row, column = np.unravel_index(field.scores[0].argmax(), field.scores[0].shape)
+    line = np.linspace(-field.reach, field.reach, field.scores.shape[1])
     assert abs(line[column] - float(Knows.place[a])) < line[1] - line[0]
     assert abs(line[row] - float(Knows.place[b])) < line[1] - line[0]
     assert field.own[0] == pytest.approx(
@@ -150,8 +150,8 @@ def test_the_papers_likelihood_has_a_field_too() -> None:
         field = evaluate_point_field(
             PaperLikelihood(), image, TRUE, model(), (40, 30), True, (0.04,)
         )
-    assert np.isfinite(field.judged).all()
-    assert field.judged.std() > 0
+    assert np.isfinite(field.scores).all()
+    assert field.scores.std() > 0
 
 
 def test_pixels_are_chosen_well_on_the_object_and_near_it() -> None:
@@ -222,6 +222,6 @@ def test_context_is_queried_at_the_hypothesis_not_at_the_pixel() -> None:
     )
     assert 0 in field.plane
     # columns go along the plane's first axis
-    along_x = field.judged[0].mean(0 if field.plane[0] == 0 else 1)
+    along_x = field.scores[0].mean(0 if field.plane[0] == 0 else 1)
     assert along_x[:13] == pytest.approx(math.log(0.9), abs=1e-3)
     assert along_x[-13:] == pytest.approx(math.log(0.1), abs=1e-3)

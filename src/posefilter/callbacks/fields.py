@@ -174,9 +174,9 @@ def evaluate_point_field(
             for sigma in sigmas
         ]
     ).numpy()
-    judged = found[:, 1:].reshape(len(sigmas), cells, cells)
+    scores = found[:, 1:].reshape(len(sigmas), cells, cells)
     return PointField(
-        pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), judged, found[:, 0]
+        pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), scores, found[:, 0]
     )
 
 

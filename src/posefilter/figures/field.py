@@ -41,7 +41,7 @@ PLANES = ((0, 1), (0, 2), (1, 2))  # of object axes
 _NAMES = "xyz"
 _ABOVE: Color = (15, 15, 15)  # no color of the scale, and plain on its bright end, where it matters
 _COLUMN = tile_width(3)  # [px] one for each noise level, of which there are three at most
-_FINE = 5  # times finer than the cells that were judged: what lies between is interpolated
+_FINE = 5  # times finer than the cells that were scored: what lies between is interpolated
 
 
 class PoseField(NamedTuple):
@@ -65,7 +65,7 @@ class PointField(NamedTuple):
     plane: tuple[int, int]  # the two object axes that span the slice through `place`
     reach: float  # the slice goes from -reach to reach about the object's center [m]
     sigmas: tuple[float, ...]  # (L,) [m]
-    judged: np.ndarray  # (L, G, G), rows and columns as in PoseField
+    scores: np.ndarray  # (L, G, G), rows and columns as in PoseField
     own: np.ndarray  # (L,) at `place`
 
 
@@ -166,11 +166,11 @@ def draw_point_field(
         dots = 1000 * surface[near][:, [a, b]]
         marks = [Mark(1000 * float(field.place[a]), 1000 * float(field.place[b]), TRUTH)]
         x, y = (make_shift_axis(f"object's {_NAMES[axis]} [mm]", field.reach) for axis in (a, b))
-        most = max(float(np.abs(field.judged).max()), float(np.abs(field.own).max()), 1e-6)
+        most = max(float(np.abs(field.scores).max()), float(np.abs(field.own).max()), 1e-6)
         tiles = []
-        for sigma, judged, own in zip(field.sigmas, field.judged, field.own, strict=True):
+        for sigma, scores, own in zip(field.sigmas, field.scores, field.own, strict=True):
             panel = draw_heat_panel(
-                map_colors(judged, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots
+                map_colors(scores, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots
             )
             tiles.append(
                 add_caption(
@@ -183,7 +183,7 @@ def draw_point_field(
             arrange_grid(tiles, len(tiles)),
         ]
         parts.append(
-            draw_color_scale(f"judged: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION)
+            draw_color_scale(f"score: {-most:.2g}", f"{most:+.2g}", "RdBu_r", size=CAPTION)
         )
     entries = [("where the truth puts it", TRUTH), ("surface near the slice", SURFACE)]
     return compose_figure(title, *parts, draw_legend(entries))
