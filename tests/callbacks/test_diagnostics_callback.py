@@ -11,7 +11,13 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 from toy import scenes
 
-from posefilter.callbacks.diagnostics import Diagnostics, draw_diagnostics, has_pixel_particles
+from posefilter.callbacks.diagnostics import (
+    LISTS,
+    NUMBERS,
+    Diagnostics,
+    draw_diagnostics,
+    has_pixel_particles,
+)
 from posefilter.figures.canvas import AXES
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import FilterDiagnostics
@@ -72,6 +78,15 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     assert red[red[:, 1] > red[:, 1].max() - 3][:, 0].mean() < 110
     green = np.argwhere((picture == AXES[1]).all(-1) & (np.arange(len(picture)) < 400)[:, None])
     assert green[green[:, 1] > green[:, 1].max() - 3][:, 0].mean() > 340  # on the object: none
+
+
+def test_particles_that_coincide_have_no_line_to_draw() -> None:
+    shares = {name: [0.5, 0.5] for name in LISTS}
+    numbers = dict.fromkeys(NUMBERS, 0.5)
+    violet = LISTS["line_share"]
+    for values, drawn in (([0.9, 0.9], True), ([0.9, float("nan")], False)):
+        picture = draw_diagnostics(shares | numbers | {"line_share": values}, "signs")
+        assert bool((picture == violet).all(-1).any()) is drawn
 
 
 def test_methods_on_poses_are_left_alone(tmp_path: Path) -> None:

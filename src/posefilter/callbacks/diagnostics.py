@@ -123,12 +123,14 @@ def draw_diagnostics(found: dict[str, Any], title: str) -> np.ndarray:
 
     Returns:
         A figure (H, 600, 3) uint8: shares of particles on the object, off the frame, at an edge and
-        in a corner; below it the numbers that are one for all steps.
+        in a corner, and of their variance along a line; below it the numbers that are one for all
+        steps.
     """
     numbers = [(find_metric(f"diagnostics/{name}"), found[name]) for name in NUMBERS]
     foot = ", ".join(f"{info.short} {info.describe(value)}" for info, value in numbers)
     lines = {
         find_metric(f"diagnostics/{name}").label: (found[name], color)
         for name, color in LISTS.items()
+        if np.isfinite(found[name]).all()  # particles that all coincide are on no line
     }
     return draw_shares(lines, title, foot)
