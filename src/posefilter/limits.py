@@ -4,7 +4,9 @@ import io
 import struct
 import warnings
 from pathlib import Path
+from typing import Any
 
+import yaml
 from PIL import Image, UnidentifiedImageError
 
 from posefilter.errors import BadData
@@ -49,6 +51,16 @@ def read_lines(path: Path, most: int = 1 << 22) -> list[str]:
     except UnicodeDecodeError as error:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
     return [line.strip() for line in lines if line.strip()]
+
+
+class PlainLoader(yaml.SafeLoader):
+    """YAML without aliases: a few lines of them stand for more than fits into memory."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose a node.  Raises yaml.YAMLError for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("it has an alias (*name), which settings do not need")
+        return super().compose_node(parent, index)
 
 
 def check_picture(path: Path, data: bytes) -> None:

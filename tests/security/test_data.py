@@ -19,6 +19,8 @@ from posefilter.data.readers.decode import read_color, read_depth, read_json, re
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.meshes.files import read_mesh
+from posefilter.report.gather import read_run
+from posefilter.report.images import encode_image
 from posefilter.synthetic.generate import generate
 
 
@@ -238,6 +240,112 @@ def test_a_mesh_names_files_beside_it(what: str, secret: Path, tmp_path: Path, w
     (folder / "x.obj").write_text(OBJ.format(mtl=mtl))
     with watch, pytest.raises(UserError, match="leads out of"):
         read_mesh(folder / "x.obj", "x")
+
+
+def glb(change: dict[str, Any], binary: bytes = b"", count: int = 3) -> bytes:
+    """A GLB file of one triangle, with some of its content changed."""
+    corners = np.eye(3, dtype=np.float32).tobytes()
+    content: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": count, "type": "VEC3",
+             "min": [0, 0, 0], "max": [1, 1, 1]}
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36 + len(binary)}],
+    }  # fmt: skip
+    text = json.dumps({**content, **change}).encode()
+    text += b" " * (-len(text) % 4)
+    body = corners + binary + b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(body), 0x004E4942) + body
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+LARGE = png(30_000, 30_000)
+# 2^40 triangles: each node shows the next one twice
+TWICE = [{"children": [i + 1, i + 1]} for i in range(40)] + [{"mesh": 0}]
+GLBS = {
+    "2^40 elements": (glb({}, count=1 << 40), "too large"),
+    "2^40 zeros": (
+        glb({"accessors": [{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}]}),
+        "too large",
+    ),
+    "a negative count": (glb({}, count=-1), "too large"),
+    "nodes shown twice": (glb({"nodes": TWICE}), "no tree"),
+    "a node below itself": (glb({"nodes": [{"children": [1]}, {"children": [1]}]}), "no tree"),
+    "a mesh shown often": (
+        glb({"nodes": [{"mesh": 0}] * 9_000, "accessors": [{"count": 1 << 20}]}),
+        "too large",
+    ),
+    "another file's buffer": (
+        glb({"buffers": [{"byteLength": 36, "uri": "../secret/file.txt"}]}),
+        "in other files",
+    ),
+    "another file's image": (glb({"images": [{"uri": "/etc/passwd"}]}), "in other files"),
+    "an image of 9 * 10^8 pixels": (
+        glb(
+            {
+                "images": [{"bufferView": 1, "mimeType": "image/png"}],
+                "bufferViews": [
+                    {"buffer": 0, "byteLength": 36},
+                    {"buffer": 0, "byteOffset": 36, "byteLength": len(LARGE)},
+                ],
+            },
+            LARGE,
+        ),
+        "too large",
+    ),
+    "no header": (b"glTF" + b"\0" * 8, "no GLB file"),
+    "lists for mappings": (glb({"nodes": [[1]]}), "broken GLB file"),
+}
+
+
+@pytest.mark.parametrize("what", GLBS)
+def test_a_glb_file_is_not_believed(what: str, tmp_path: Path, watch: Any) -> None:
+    data, told = GLBS[what]
+    (tmp_path / "x.glb").write_bytes(data)
+    with watch, pytest.raises(UserError, match=told) as refusal:
+        read_mesh(tmp_path / "x.glb", "x")
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_honest_glb_file_is_read(tmp_path: Path) -> None:
+    (tmp_path / "x.glb").write_bytes(glb({}))
+    mesh = read_mesh(tmp_path / "x.glb", "x")
+    assert mesh.faces.shape == (1, 3)
+    np.testing.assert_allclose(mesh.vertices, np.eye(3))
+
+
+BOMB = "a: &a [x, x]\n" + "".join(
+    f"{chr(98 + i)}: &{chr(98 + i)} [{', '.join([f'*{chr(97 + i)}'] * 9)}]\n" for i in range(9)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [(BOMB, "alias"), ("a: &a [*a]", "alias"), ("a: !!python/name:os.system", "is no YAML"),
+     ("a" * (1 << 21), "too large"), ("[" * 5_000, "is no YAML")],
+    ids=["alias bomb", "loop", "function", "large", "deep"],
+)  # fmt: skip
+def test_a_runs_settings_are_plain(text: str, told: str, tmp_path: Path, watch: Any) -> None:
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "config.yaml").write_text(text)
+    with watch, pytest.raises(UserError, match=told) as refusal:
+        read_run(tmp_path)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("size", [(30_000, 30_000), (100_000, 100_000)])
+def test_a_picture_of_too_many_pixels_is_not_packed_into_a_page(
+    size: tuple[int, int], watch: Any
+) -> None:
+    with watch, pytest.raises(ValueError, match="too large"):
+        encode_image(png(*size))
 
 
 def test_a_texture_of_too_many_pixels_is_not_decoded(tmp_path: Path, watch: Any) -> None:

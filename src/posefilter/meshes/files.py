@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 
 from posefilter.errors import UserError
+from posefilter.meshes.glb import check_glb
 from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.meshes.obj import PLAIN, Material, RawMesh, read_image, read_obj
 
@@ -105,6 +106,8 @@ def _read_other(path: Path) -> RawMesh:
     """Read PLY and GLB with trimesh; the parts of a scene become one mesh."""
     if path.suffix.lower() == ".ply":
         _check_ply_texture(path)
+    else:
+        check_glb(path)
     loaded = trimesh.load(path, process=False)
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]

@@ -8,12 +8,14 @@ from typing import Any
 import yaml
 
 from posefilter.errors import UserError
+from posefilter.limits import PlainLoader, read_bytes
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
 from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
+_MOST_YAML = 1 << 20  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
 
 
@@ -133,12 +135,13 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return a YAML file's mapping, empty where there is no file.
 
-    Raises UserError where it is malformed.
+    Raises UserError where it is malformed, larger than settings are, or has aliases.
     """
     if not path.is_file():
         return {}
     try:
-        content = yaml.safe_load(path.read_text())
+        # a SafeLoader, which makes nothing but plain data
+        content = yaml.load(read_bytes(path, _MOST_YAML).decode(), Loader=PlainLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise UserError(f"{path}: is no YAML ({str(error).splitlines()[0]})") from error
     if not isinstance(content, dict):

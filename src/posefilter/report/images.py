@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 from PIL import Image, UnidentifiedImageError
 
+from posefilter.errors import BadData
+from posefilter.limits import check_picture
+
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
 SECTIONS = {  # the first whose words a picture's name has; what is in none is "more"
     "worst": {"worst"},
@@ -93,9 +96,10 @@ def encode_image(data: bytes) -> tuple[str, int, int]:
     """Return a picture as a data URI with its width and height [px]: large ones smaller, animations
     as they are.
 
-    Raises ValueError where the bytes are no picture.
+    Raises ValueError where the bytes are no picture, or one of more pixels than can be decoded.
     """
     try:
+        check_picture(Path("picture"), data)
         with Image.open(BytesIO(data)) as image:
             kind, (width, height) = (image.format or "").lower(), image.size
             if len(data) > KEPT_BYTES and getattr(image, "n_frames", 1) == 1:
@@ -106,7 +110,7 @@ def encode_image(data: bytes) -> tuple[str, int, int]:
                 data, kind = stream.getvalue(), "webp"
             else:
                 image.load()
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+    except (BadData, UnidentifiedImageError, OSError, SyntaxError) as error:
         raise ValueError(f"no picture: {error}") from error
     return f"data:image/{kind};base64,{base64.b64encode(data).decode()}", width, height
 

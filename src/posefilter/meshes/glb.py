@@ -1,0 +1,85 @@
+"""What a GLB file of somebody else may hold: checked before its reader makes arrays of it.
+
+The reader believes the file's own counts: an accessor without a buffer is filled with as many zeros
+as it says, a node that is listed twice is copied for each, and so is what is below it.
+"""
+
+import json
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from posefilter.errors import UserError
+from posefilter.limits import check_picture, read_bytes
+
+MOST_ELEMENTS = 1 << 24  # of an accessor, and of all that the nodes show
+_MOST_NODES = 10_000
+_MOST_JSON = 1 << 24  # [bytes]
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
+
+
+def check_glb(path: Path) -> None:
+    """Check a GLB file's claims.
+
+    Raises:
+        UserError: It is no GLB, names other files, claims more than meshes have, its nodes are no
+            tree, or a texture has too many pixels.
+    """
+    data = read_bytes(path)
+    chunks = dict(_chunks(data))
+    if _JSON not in chunks or len(chunks[_JSON]) > _MOST_JSON:
+        raise UserError(f"{path}: no GLB file, or one with too long a header")
+    try:
+        content = json.loads(chunks[_JSON])
+        _check_counts(content, path)
+        _check_nodes(content, path)
+        _check_images(content, chunks.get(_BINARY, b""), path)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path}: a broken GLB file ({type(error).__name__}: {error})") from error
+
+
+def _chunks(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield (kind, content) of each chunk; nothing where the file is none or cut short."""
+    if data[:4] != b"glTF":
+        return
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<II", data, at)
+        yield kind, data[at + 8 : at + 8 + length]
+        at += 8 + length
+
+
+def _check_counts(content: Mapping[str, Any], path: Path) -> None:
+    for part in ("buffers", "images"):
+        for one in content.get(part, []):
+            if "uri" in one:
+                raise UserError(f"{path}: its {part} are in other files; embed them")
+    for accessor in content.get("accessors", []):
+        if not 0 <= accessor["count"] <= MOST_ELEMENTS:
+            raise UserError(f"{path}: too large: {accessor['count']:,} elements in one array")
+
+
+def _check_nodes(content: Mapping[str, Any], path: Path) -> None:
+    """Check that each node has at most one parent, and that what they show together is bounded."""
+    nodes = content.get("nodes", [])
+    parents = Counter(child for node in nodes for child in node.get("children", []))
+    if len(nodes) > _MOST_NODES or any(count > 1 for count in parents.values()):
+        raise UserError(f"{path}: its nodes are no tree, or more than {_MOST_NODES:,}")
+    meshes, accessors = content.get("meshes", []), content.get("accessors", [])
+    shown = 0
+    for node in nodes:
+        for part in meshes[node["mesh"]]["primitives"] if "mesh" in node else []:
+            places = (*part.get("attributes", {}).values(), part.get("indices"))
+            shown += sum(accessors[place]["count"] for place in places if place is not None)
+    if shown > MOST_ELEMENTS:
+        raise UserError(f"{path}: too large: its nodes show {shown:,} elements")
+
+
+def _check_images(content: Mapping[str, Any], binary: bytes, path: Path) -> None:
+    views = content.get("bufferViews", [])
+    for image in content.get("images", []):
+        view = views[image["bufferView"]]
+        start = view.get("byteOffset", 0)
+        check_picture(path, binary[start : start + view["byteLength"]])
