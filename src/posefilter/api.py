@@ -43,7 +43,9 @@ def load(
         UserError: A file is missing or holds no checkpoint, or an override does not fit it.
     """
     wanted = changes(compose(overrides, "predict")) if overrides else {}
-    methods = [method_of(read_checkpoint(one), wanted) for one in expand_weights(weights)]
+    methods = [
+        method_of(read_checkpoint(one), wanted, lightning=False) for one in expand_weights(weights)
+    ]
     return Estimator(methods, device)
 
 

@@ -34,7 +34,7 @@ from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.models.base import PoseEstimator
+from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 H, W, IMAGES = 48, 64, 8
@@ -69,6 +69,7 @@ def scenes() -> list[Batch]:
     return out
 
 
+@with_lightning
 class Told(PoseEstimator):
     """Knows the truth, but believes the object of image i to be i cm to the right."""
 

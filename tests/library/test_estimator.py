@@ -222,6 +222,21 @@ def test_import_takes_neither_torch_nor_hydra_and_every_public_name_is_there() -
     subprocess.run([sys.executable, "-c", program], check=True, env=own)
 
 
+def test_an_answer_needs_no_training_framework() -> None:
+    """They take seconds to import, and a first answer should not wait for them."""
+    code = (
+        "import sys, numpy as np, posefilter; "
+        "estimator = posefilter.load('003_cracker_box', overrides=['filter.particles=4']); "
+        "depth = np.full((60, 80), 0.8, np.float32); "
+        "K = np.array([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]]); "
+        "estimator.predict(np.zeros((60, 80, 3), np.uint8), depth, K); "
+        "heavy = {'lightning', 'torchmetrics', 'matplotlib', 'tensorboard', 'sympy'}; "
+        "sys.exit(' '.join(heavy & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_every_public_name_is_documented() -> None:
     for name in posefilter.__all__:
         thing = getattr(posefilter, name)

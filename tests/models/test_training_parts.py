@@ -22,6 +22,7 @@ from toy import scenes
 
 from posefilter.filters.propagate import Identity
 from posefilter.filters.resample import Systematic
+from posefilter.models.base import with_lightning
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace, relevance_loss
 from posefilter.models.loss_schedule import Stage
@@ -104,7 +105,7 @@ def test_the_relevances_loss_and_gradient_stay_finite_however_sure_it_is() -> No
 
 def tiny(kind: type[ImageSpace], **changes: Any) -> ImageSpace:
     """Return a tiny method whose lessons are called as in conf/."""
-    method = working(kind, 3, **changes)
+    method = working(with_lightning(kind), 3, **changes)
     if "pose" in kind.requires:
         method.aux_losses["pose"] = method.aux_losses.pop("own_point")
     return method

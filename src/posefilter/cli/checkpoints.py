@@ -14,7 +14,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.cli.trust import Scope
 from posefilter.errors import UserError
-from posefilter.models.base import PoseEstimator
+from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
 from posefilter.weights import find_weights
@@ -39,13 +39,24 @@ def recipe(job: Job) -> dict[str, Any]:
     }
 
 
-def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> PoseEstimator:
-    """Build the method of a recipe, for an object if it is known."""
+def build_method(
+    recipe: dict[str, Any], model: ObjectModel | None = None, lightning: bool = True
+) -> PoseEstimator:
+    """Build the method of a recipe.
+
+    Args:
+        recipe: Of a checkpoint, or of `recipe`.
+        model: Its object, where it is known.
+        lightning: Whether it is a LightningModule; False for prediction alone, which is seconds
+            sooner there.
+    """
     settings = OmegaConf.create(recipe["settings"])
     assert isinstance(settings, DictConfig)
     check_fit(settings, recipe["choices"], Scope.RECIPE)
     try:
-        method = instantiate_recipe(settings.get("model"), "model")
+        method = instantiate_recipe(
+            settings.get("model"), "model", _with_lightning if lightning else None
+        )
     except UserError as error:
         where, found, rest = str(error).partition(":")
         key, equals, value = where.partition("=")
@@ -57,6 +68,10 @@ def build_method(recipe: dict[str, Any], model: ObjectModel | None = None) -> Po
     if model is not None:
         method.set_object(model)
     return method
+
+
+def _with_lightning(kind: Any) -> Any:
+    return with_lightning(kind) if issubclass(kind, PoseEstimator) else kind
 
 
 def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
@@ -81,16 +96,18 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
     return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
 
 
-def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> PoseEstimator:
+def method_of(
+    checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None, lightning: bool = True
+) -> PoseEstimator:
     """Build the method that a checkpoint holds, with some of its pieces changed, and load its
-    weights.
+    weights; `lightning` as in `build_method`.
     """
     recipe = checkpoint["recipe"]
     recipe = {**recipe, "settings": without_pretrained(changed(recipe["settings"], wanted or {}))}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
     with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
-        method = build_method(recipe, ObjectModel(**checkpoint["object_model"]))
+        method = build_method(recipe, ObjectModel(**checkpoint["object_model"]), lightning)
     try:
         missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes
@@ -98,10 +115,9 @@ def method_of(checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) 
             "checkpoint: its weights do not fit the method; they were trained by another version "
             "of this code"
         ) from error
-    lost = [key for key in missing if not key.startswith("scores.")]
-    if lost or foreign:
+    if missing or foreign:
         raise UserError(
-            f"checkpoint: its weights do not fit the method ({len(lost)} missing, "
+            f"checkpoint: its weights do not fit the method ({len(missing)} missing, "
             f"{len(foreign)} unknown)"
         )
     return method.eval()

@@ -45,7 +45,7 @@ def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:
     Raises:
         UserError: It cannot be used, or is larger than `max_mb`.
     """
-    method_of(stripped)
+    method_of(stripped, lightning=False)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{out.name}.part")
     torch.save(stripped, partial)

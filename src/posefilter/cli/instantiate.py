@@ -35,6 +35,7 @@ __all__ = [
     "trust",
 ]
 
+Variant = Callable[[Any], Callable[..., Any]]
 _PLAIN = (bool, int, float, str)
 
 
@@ -57,14 +58,21 @@ def instantiate(node: Any, where: str, **given: Any) -> Any:
     return _build(node, where, Scope.CONFIG, given)
 
 
-def instantiate_recipe(node: Any, where: str) -> Any:
+def instantiate_recipe(node: Any, where: str, variant: Variant | None = None) -> Any:
     """Build what a node of a checkpoint's recipe describes: as `instantiate`, but components
     alone.
+
+    Args:
+        node: The settings.
+        where: The node's place in the configuration, for messages.
+        variant: Given the node's own class; returns the class that is built in its place.
     """
-    return _build(node, where, Scope.RECIPE, {})
+    return _build(node, where, Scope.RECIPE, {}, variant)
 
 
-def _build(node: Any, where: str, scope: Scope, given: Mapping[str, Any]) -> Any:
+def _build(
+    node: Any, where: str, scope: Scope, given: Mapping[str, Any], variant: Variant | None = None
+) -> Any:
     if isinstance(node, DictConfig | ListConfig):
         node = OmegaConf.to_container(node, resolve=True)
     if isinstance(node, list):
@@ -80,6 +88,7 @@ def _build(node: Any, where: str, scope: Scope, given: Mapping[str, Any]) -> Any
         return arguments
     partial = bool(node.get("_partial_", False))
     check_arguments(target, arguments, given, where, partial)
+    target = variant(target) if variant is not None else target
     made = functools.partial(target, **arguments, **given)
     return made if partial else made()
 

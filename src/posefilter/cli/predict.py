@@ -47,7 +47,7 @@ def predict(job: Job) -> None:
 def predict_one(job: Job) -> None:
     """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
     cfg, folder = job.cfg, job.folder
-    method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg))
+    method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
@@ -88,7 +88,9 @@ def predict_several(job: Job) -> None:
     cfg, folder = job.cfg, job.folder
     checkpoints = expand_weights(cfg.checkpoint)
     wanted = changes(cfg)
-    estimator = Estimator([method_of(read_checkpoint(one), wanted) for one in checkpoints])
+    estimator = Estimator(
+        [method_of(read_checkpoint(one), wanted, lightning=False) for one in checkpoints]
+    )
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None

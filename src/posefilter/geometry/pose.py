@@ -11,7 +11,8 @@ from posefilter.geometry.rotation import exp_so3, project_to_so3
 
 def make_pose(rotation: Tensor, translation: Tensor) -> Tensor:
     """Assemble a pose.  (*, 3, 3), (*, 3) [m] -> (*, 4, 4); leading shapes broadcast."""
-    lead = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    # not torch.broadcast_shapes, which imports sympy
+    lead = torch.broadcast_tensors(rotation[..., 0], translation)[0].shape[:-1]
     top = torch.cat([rotation.expand(*lead, 3, 3), translation.expand(*lead, 3)[..., None]], dim=-1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(
         *lead, 1, 4

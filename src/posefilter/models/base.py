@@ -1,13 +1,16 @@
-"""The base class of all methods: every Lightning hook, so that a method's own file is short."""
+"""The base class of all methods: every Lightning hook, so that a method's own file is short.
+
+A method predicts by itself. Lightning and torchmetrics, which train and test it, take seconds to
+import, so that a method becomes a LightningModule only where that is needed: see `with_lightning`.
+"""
 
 import logging
 import time
 from collections.abc import Callable, Iterable
-from functools import cached_property
-from typing import Any, ClassVar
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
-from lightning import LightningModule
 from torch import Generator, Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -19,21 +22,25 @@ from posefilter.geometry.boxes import box_of_pose
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.bop import BopErrors
-from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
 from posefilter.metrics.results import compute_checkpoint_score, flatten
-from posefilter.metrics.visibility import ErrorsByVisibility
 from posefilter.models.clipping import clip_submodules
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
+
+if TYPE_CHECKING:
+    from lightning import LightningModule as Module
+else:
+    Module = nn.Module  # `with_lightning` adds Lightning's
 
 log = logging.getLogger(__name__)
 _PATIENCE = 20  # steps
 _STAGES = {"train": 0, "validate": 1, "test": 2, "predict": 3}
 
 
-class PoseEstimator(LightningModule):
-    """A method with its particle filter, loss and optimizer, as a LightningModule.
+class PoseEstimator(Module):
+    """A method with its particle filter, loss and optimizer.
+
+    By itself it predicts; `with_lightning` makes the LightningModule that a trainer runs.
 
     `set_object` must be called before any batch: metrics and heads depend on the object.
 
@@ -48,6 +55,7 @@ class PoseEstimator(LightningModule):
 
     provides: ClassVar[Capabilities] = ("rollout",)
     requires: ClassVar[Capabilities] = ()
+    _trainer: Any = None  # of the LightningModule
     test_only_settings: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 
     def __init__(
@@ -63,7 +71,7 @@ class PoseEstimator(LightningModule):
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
         self._object_model: ObjectModel | None = None
-        self.scores: Any = nn.ModuleDict()  # of metrics, which torch cannot tell from other modules
+        self._scores: Any = None  # made when they are first asked for
         self.seconds_per_image: list[float] = []
         self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
         self.recipe: dict[str, Any] = {}  # how it was built: plain data, carried in its checkpoints
@@ -120,24 +128,48 @@ class PoseEstimator(LightningModule):
             )
         return self._object_model
 
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next((weight.device for weight in self.parameters()), torch.device("cpu"))
+
+    @property
+    def scores(self) -> Any:
+        """The metrics of the object by name, a ModuleDict; created at the first use."""
+        if self._scores is None:
+            self._scores = nn.ModuleDict(self.make_metrics()).to(self.device)
+        return self._scores
+
+    def make_metrics(self) -> dict[str, nn.Module]:
+        """Create the metrics of the object, by name."""
+        from posefilter.metrics.bop import BopErrors  # torchmetrics: prediction needs none
+        from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+        from posefilter.metrics.visibility import ErrorsByVisibility
+
+        metrics: dict[str, nn.Module] = {
+            "iou": BoxIoU(),
+            "particles_on_object": ParticlesOnObject(),
+        }
+        if "pose" in self.capabilities:
+            metrics["poses"] = PoseErrors([self.model])
+            metrics["bop"] = BopErrors([self.model])
+            metrics["by_visibility"] = ErrorsByVisibility([self.model])
+            metrics["belief"] = BeliefQuality([self.model])
+        return metrics
+
     def set_object(self, model: ObjectModel) -> None:
-        """Set the object, and create its metrics.
+        """Set the object, and forget the metrics of another.
 
         Raises:
             UserError: The method's components do not fit each other; see capabilities.py.
         """
         check_parts(self)
         self._object_model = model
-        self.scores = nn.ModuleDict({"iou": BoxIoU(), "particles_on_object": ParticlesOnObject()})
-        if "pose" in self.capabilities:
-            self.scores["poses"] = PoseErrors([model])
-            self.scores["bop"] = BopErrors([model])
-            self.scores["by_visibility"] = ErrorsByVisibility([model])
-            self.scores["belief"] = BeliefQuality([model])
+        self._scores = None
 
     def generator(self, stage: str, batch_number: int) -> Generator:
         """Return the random generator of a batch: a function of seed, stage, epoch and number."""
-        epoch = self.current_epoch if stage == "train" else 0
+        epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
         return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
 
@@ -208,7 +240,7 @@ class PoseEstimator(LightningModule):
         if skipped and self.skipped_steps in (1, 10, 100, 1000, 10_000):
             log.warning(
                 "step %d does not update %s, whose gradient is not finite (%d such steps so far)",
-                self.global_step,
+                getattr(self, "global_step", 0),
                 ", ".join(skipped),
                 self.skipped_steps,
             )
@@ -326,9 +358,23 @@ class PoseEstimator(LightningModule):
         checkpoint["recipe"] = self.recipe
         checkpoint["object_model"] = dict(self.model._asdict())
         checkpoint["state_dict"] = {
-            k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("scores.")
+            k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("_scores.")
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set the object that the checkpoint holds."""
         self.set_object(ObjectModel(**checkpoint["object_model"]))
+
+
+@cache
+def with_lightning(kind: type[PoseEstimator]) -> type[PoseEstimator]:
+    """Return a method's class as a LightningModule, for `Trainer.fit` and `Trainer.test`.
+
+    It has the same name, the same settings and the same keys of weights.
+    """
+    from lightning import LightningModule  # takes seconds: prediction needs none
+
+    if issubclass(kind, LightningModule):
+        return kind
+    same = {name: getattr(kind, name) for name in ("__module__", "__qualname__", "__doc__")}
+    return type(kind.__name__, (kind, LightningModule), same)

@@ -4,7 +4,7 @@ it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +16,6 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.spaces import PixelSpace
-from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
 from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, factors_at
@@ -241,21 +240,24 @@ class ImageSpace(PoseEstimator):
         return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
 
     def set_object(self, model: ObjectModel) -> None:
-        """Set the object of the pose head too, and add the filter diagnostics to the metrics."""
+        """Set the object of the pose head too."""
         super().set_object(model)
         self.pose_head.set_object(model)
-        self.scores["diagnostics"] = FilterDiagnostics()
+
+    def make_metrics(self) -> dict[str, nn.Module]:
+        """Create the metrics, with the filter diagnostics."""
+        from posefilter.metrics.diagnostics import FilterDiagnostics  # prediction needs none
+
+        return super().make_metrics() | {"diagnostics": FilterDiagnostics()}
 
     def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors and diagnostics."""
         super().update_metrics(trace, batch)
-        cast(FilterDiagnostics, self.scores["diagnostics"]).update(trace, batch)
+        self.scores["diagnostics"].update(trace, batch)
 
     def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics, with the filter diagnostics."""
-        return super().compute_metrics() | {
-            "diagnostics": cast(FilterDiagnostics, self.scores["diagnostics"]).compute()
-        }
+        return super().compute_metrics() | {"diagnostics": self.scores["diagnostics"].compute()}
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box that the box head computes, (B, 4) [px]."""

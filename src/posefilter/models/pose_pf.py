@@ -4,13 +4,11 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
-from torchmetrics import MeanMetric
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.axes import box_axes
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -184,15 +182,18 @@ class PosePF(PoseEstimator):
         return losses
 
     def set_object(self, model: ObjectModel) -> None:
-        """Set the object of the proposal network too, and count how often the truth is
-        outscored.
-        """
+        """Set the object of the proposal network too."""
         super().set_object(model)
         self._axes = tuple(tuple(axis) for axis in box_axes(model.points).T.tolist())
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
-        self.scores["truth_outscored"] = MeanMetric()
-        self.scores["truth_outscored_by_wrong"] = MeanMetric()
+
+    def make_metrics(self) -> dict[str, nn.Module]:
+        """Create the metrics, with a count of how often the truth is outscored."""
+        from torchmetrics import MeanMetric  # prediction needs none
+
+        counts = {name: MeanMetric() for name in ("truth_outscored", "truth_outscored_by_wrong")}
+        return super().make_metrics() | counts
 
     def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
@@ -200,6 +201,8 @@ class PosePF(PoseEstimator):
         A refined estimate outscores the truth by a little even where it is right. The likelihood is
         at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more).
         """
+        from posefilter.metrics.errors import add  # trees of scipy: prediction needs none
+
         super().update_metrics(trace, batch)
         scene = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
