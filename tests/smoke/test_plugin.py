@@ -3,12 +3,16 @@ tested.
 """
 
 import json
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import posefilter.cli.trust
 from posefilter.cli import run_command
+from posefilter.cli.trust import ENTRY_POINTS, installed
 from posefilter.data.readers.registry import open_reader
 
 HOME = Path(__file__).parents[2]
@@ -74,11 +78,57 @@ def test_method_reader_and_loss_of_ones_own(
     assert "loss=add does not fit model=color_walk" in capfd.readouterr().err
 
 
+@pytest.fixture
+def entry_point(tmp_path: Path) -> Path:
+    """Return a folder that says, as pip does, that the example is installed."""
+    about = tmp_path / "site" / "posefilter_example-0.1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: posefilter-example\nVersion: 0.1.0\n"
+    )
+    points = tomllib.loads((PLUGIN / "pyproject.toml").read_text())["project"]["entry-points"]
+    ((name, package),) = points[ENTRY_POINTS].items()
+    (about / "entry_points.txt").write_text(f"[{ENTRY_POINTS}]\n{name} = {package}\n")
+    return about.parent
+
+
+@pytest.fixture
+def forget_trust(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Trust nothing that another test has, and forget what this one does."""
+    monkeypatch.setattr("posefilter.cli.trust._trusted", set())
+    installed.cache_clear()
+    yield
+    installed.cache_clear()
+
+
 def test_likelihood_of_ones_own(
-    tiny_scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_scenes: Path,
+    tmp_path: Path,
+    entry_point: Path,
+    forget_trust: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    """Trained where it is named; its checkpoint predicts where it is trusted, and only there."""
     monkeypatch.syspath_prepend(str(PLUGIN))
     run = tmp_path / "run"
     plain = ["model/proposals=none", "filter/initialize=from_depth", "filter/refine=none"]
     assert train(tiny_scenes, run, "model=pose_pf", "model/likelihood=linear", *plain) == 0
     assert json.loads((run / "metrics.json").read_text())["add"]["auc"] >= 0
+
+    rgb = next(tiny_scenes.rglob("*.left.jpg"))
+    depth = rgb.with_name(rgb.name.replace(".jpg", ".depth.png"))
+    typed = [f"checkpoint={run}/checkpoints/best.ckpt", f"rgb={rgb}", f"depth={depth}"]
+    typed += ["intrinsics=150,150,80,60", "console=json", "threads=1", f"out={tmp_path / 'found'}"]
+    posefilter.cli.trust._trusted.clear()
+    assert run_command("predict", None, typed) == 2
+    assert "packages that you trust: plugins=[...]" in capfd.readouterr().err
+    assert run_command("predict", None, [*typed, "plugins=[posefilter_example]"]) == 0
+    pose = json.loads((tmp_path / "found" / "pose.json").read_text())
+    assert pose["object"] == "carton"
+
+    posefilter.cli.trust._trusted.clear()
+    installed.cache_clear()
+    monkeypatch.syspath_prepend(str(entry_point))
+    assert run_command("predict", None, typed) == 0
+    assert json.loads((tmp_path / "found" / "pose.json").read_text())["score"] == pose["score"]

@@ -11,7 +11,7 @@ from tests.smoke.conftest import HOME, TINY
 
 from posefilter.cli import run_command
 from posefilter.cli.comparing import leaves
-from posefilter.models.base import compute_checkpoint_score
+from posefilter.metrics.results import compute_checkpoint_score
 
 SMOKE = yaml.safe_load((HOME / "conf" / "debug" / "smoke.yaml").read_text())
 TOY = [f"{key}={value}" for key, value in leaves({k: SMOKE[k] for k in ("data", "trainer")})]

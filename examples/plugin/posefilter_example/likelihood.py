@@ -3,7 +3,7 @@
 import torch
 from torch import Generator, Tensor, nn
 
-from posefilter.nets.likelihood import Pixels, look
+from posefilter.nets.likelihood import Pixels, sample_points
 
 
 class LinearLikelihood(nn.Module):
@@ -19,6 +19,6 @@ class LinearLikelihood(nn.Module):
     ) -> Tensor:  # fmt: skip
         """Score poses (B, N, 4, 4) from so many image points each -> (B, N)."""
         noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
-        points = look(image, poses, center, radius, noise)
+        points = sample_points(image, poses, center, radius, noise)
         judged: Tensor = self.net(torch.cat([points.position / radius, points.color], dim=-1))
         return judged[..., 0].mean(-1)
