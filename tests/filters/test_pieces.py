@@ -111,7 +111,8 @@ def test_half_turns_turn_a_share_about_the_center() -> None:
 
 def test_axis_turns_are_about_the_axes_of_the_box() -> None:
     askew = torch.tensor([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])  # axes in rows
-    space = PoseSpace(tuple(CENTER.tolist()), POSES.radius, axes=tuple(map(tuple, askew.tolist())))
+    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3) * torch.tensor([0.1, 0.2, 0.3])
+    space = PoseSpace(POSES.center, POSES.radius, points=corners @ askew)
     poses = some_poses(2, 4000)
     still = torch.zeros(2, 4000, 6)
 

@@ -120,7 +120,7 @@ class AxisTurns:
         free = torch.rand(size, generator=generator, device=device) < self.any_angle
         angle = 2 * math.pi * torch.rand(size, generator=generator, device=device)
         angle = torch.where(free, angle, torch.full_like(angle, math.pi)) * moves
-        turn = state.new_tensor(space.axes)[axis] * angle[..., None]
+        turn = space.axes.to(state)[axis] * angle[..., None]
         return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 

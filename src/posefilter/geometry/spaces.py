@@ -3,7 +3,8 @@
 A space perturbs, averages and compares states.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -46,14 +47,26 @@ class PoseSpace:
         radius: Radius of its bounding sphere [m].
         dimensions: Width of a tangent vector.
         max_turn: Largest standard deviation of a rotation [rad].
-        axes: The object's axes in its own frame, one a row (of `box_axes`, one a column).
+        points: (P, 3) surface points of the object [m], for `axes`.
     """
 
     center: tuple[float, float, float]
     radius: float
     dimensions: int = 6
     max_turn: float = 1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
-    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    points: Tensor | None = field(default=None, compare=False, repr=False)
+
+    @cached_property
+    def axes(self) -> Tensor:
+        """The axes of the object's smallest box, or without points of its frame; one a row, (3, 3).
+
+        Found when they are first asked for: few filters turn poses about them.
+        """
+        if self.points is None:
+            return torch.eye(3)
+        from posefilter.geometry.axes import box_axes  # a hull in 3-D, slow to import
+
+        return box_axes(self.points).T
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
         """Move poses about the object's center.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""

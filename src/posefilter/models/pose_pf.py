@@ -7,7 +7,6 @@ from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.geometry.axes import box_axes
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.candidate_samplers import CandidateSampler
@@ -88,12 +87,15 @@ class PosePF(PoseEstimator):
             likelihood_batch_size,
         )
         self.proposal_weight = proposal_weight
+        self._space: PoseSpace | None = None
 
     @property
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
-        x, y, z = self.model.center.tolist()
-        return PoseSpace((x, y, z), self.model.radius, axes=self._axes)
+        if self._space is None:
+            x, y, z = self.model.center.tolist()
+            self._space = PoseSpace((x, y, z), self.model.radius, points=self.model.points)
+        return self._space
 
     @property
     def latent_width(self) -> int:
@@ -184,7 +186,7 @@ class PosePF(PoseEstimator):
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the proposal network too."""
         super().set_object(model)
-        self._axes = tuple(tuple(axis) for axis in box_axes(model.points).T.tolist())
+        self._space = None
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
 
