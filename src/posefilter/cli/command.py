@@ -25,7 +25,7 @@ from posefilter.cli.arguments import bracketed, check_choices, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.fit import check_fit
-from posefilter.cli.folders import FAILED, note_failure, remove_if_empty
+from posefilter.cli.folders import forget_failure, note_failure, remove_if_empty
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
@@ -105,8 +105,7 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
         console = job.cfg.get("console", JSON)
         settle_logging(console)
         try:
-            if name == "train" or job.swept:  # others may work in a folder that is not theirs
-                (job.folder / FAILED).unlink(missing_ok=True)
+            forget_failure(job)
             check_settings(cfg)
             use_plugins(cfg)
             check_files(name, cfg)

@@ -80,3 +80,9 @@ def note_failure(job: Job, cause: str) -> None:
     """Write down why a sweep's job has no result, until it has one."""
     content = {"overrides": job.overrides, "error": cause}
     (job.folder / FAILED).write_text(json.dumps(content, indent=2) + "\n")
+
+
+def forget_failure(job: Job) -> None:
+    """Remove the note of an earlier failure, but never from the working folder, where none is ours."""
+    if job.folder.is_dir() and not job.folder.samefile("."):
+        (job.folder / FAILED).unlink(missing_ok=True)
