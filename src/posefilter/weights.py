@@ -84,10 +84,10 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
         path = Path(weights)
         found = [*sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))]
         found += [file for name, file in list_shipped().items() if fnmatch(name, str(weights))]
-    if not isinstance(weights, str | Path) and not found:
-        raise UserError("checkpoint=[]: name the weights of one object at least")
     if not found:
-        raise UserError(f"checkpoint={weights}: no weights there")
+        raise UserError(
+            f"checkpoint={weights}: no weights there; name those of one object at least"
+        )
     return list(dict.fromkeys(found))
 
 

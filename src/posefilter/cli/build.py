@@ -71,7 +71,7 @@ def build_trainer(job: Job) -> Trainer:
         made for made in (instantiate(cfg.logger, "logger") or {}).values() if made
     ]
     for logger in loggers:
-        if not isinstance(logger, TensorBoardLogger):  # which TensorBoardLayout tells
+        if not isinstance(logger, TensorBoardLogger):  # whose settings TensorBoardLayout logs
             logger.log_hyperparams(comparable(job))
     return make_trainer(cfg.trainer, callbacks, loggers)
 

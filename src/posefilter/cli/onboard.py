@@ -206,11 +206,11 @@ def store_meshes(work: Onboarding) -> None:
 
 def use_symmetries(work: Onboarding) -> None:
     """Find the object's symmetries, or take those given; draw them."""
-    told = find_and_draw(work.mesh, str(work.cfg.symmetries), work.cfg.mesh_scale, work.out)
-    work.stages.keep(symmetries=told)
+    found = find_and_draw(work.mesh, str(work.cfg.symmetries), work.cfg.mesh_scale, work.out)
+    work.stages.keep(symmetries=found)
     picture = work.out / "symmetries.png"
-    sentence = f"{told}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
-    say(work.cfg.console, "symmetries", sentence, found=told, picture=str(picture))
+    sentence = f"{found}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
+    say(work.cfg.console, "symmetries", sentence, found=found, picture=str(picture))
 
 
 def render(work: Onboarding) -> None:
@@ -281,14 +281,14 @@ def tell(work: Onboarding) -> None:
     shown = ", ".join(f"{name} {m:.1f}" for name, m in minutes.items())
     say(work.cfg.console, "minutes", f"minutes: {shown}", minutes=minutes)
     following = typed("predict", checkpoint=work.weights)
-    told = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
+    scores = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
     ended(
         work.cfg.console,
         "onboarded",
         files,
         [f"{following} rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"],
         object=work.mesh.name,
-        **told,
+        **scores,
     )
 
 

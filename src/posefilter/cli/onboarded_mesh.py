@@ -102,15 +102,15 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         used = select(turns, texture=wanted == "found")
         entry = describe_symmetries(used, size)
         group = make_group(used, size, _STEPS)
-        told = ", ".join(map(describe_turn, used)) or "no symmetries"
+        found = ", ".join(map(describe_turn, used)) or "no symmetries"
     elif wanted == "none":
-        entry, group, told = {"symmetries_discrete": []}, np.eye(4)[None], "no symmetries"
+        entry, group, found = {"symmetries_discrete": []}, np.eye(4)[None], "no symmetries"
     else:
         if not Path(wanted).is_file():
             raise UserError(f"symmetries={wanted}: no such file; or choose found, geometry or none")
         group = read_symmetries(Path(wanted), mesh.name, scale or 1.0, _STEPS)
         entry = {"symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in group[1:]]}
-        told = f"{len(group)} symmetries of {wanted}"
+        found = f"{len(group)} symmetries of {wanted}"
     file = out / "meshes" / mesh.name / "symmetries.json"
     file.write_text(json.dumps(entry, indent=1) + "\n")
     source = {
@@ -119,4 +119,4 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         "none": "left out by symmetries=none",
     }.get(wanted, f"of {Path(wanted).name}")
     save_image(draw_symmetries(mesh, turns, group, source), out / "symmetries.png")
-    return told
+    return found

@@ -82,6 +82,15 @@ def _describe_errors(name: str, label: str) -> tuple[MetricInfo, ...]:
     )
 
 
+def _describe_bop(name: str, unit: str, thresholds: str) -> tuple[MetricInfo, ...]:
+    label, meaning = name.upper(), f"over thresholds of {thresholds}"
+    recall = f"{label} average recall"
+    return (
+        MetricInfo(f"{name}/ar", recall, "%", ".1f", HIGHER, limits=PERCENT, meaning=meaning),
+        MetricInfo(f"{name}/median_{unit}", f"median {label}", unit, ".1f", LOWER),
+    )
+
+
 _METRICS = (
     MetricInfo("instances", "images", form=".0f"),
     MetricInfo(
@@ -89,26 +98,8 @@ _METRICS = (
     ),
     *_describe_errors("add", "ADD"),
     *_describe_errors("add_s", "ADD-S"),
-    MetricInfo(
-        "mssd/ar",
-        "MSSD average recall",
-        "%",
-        ".1f",
-        HIGHER,
-        limits=PERCENT,
-        meaning="over thresholds of 0.05 to 0.5 diameters, as in the BOP challenge",
-    ),
-    MetricInfo("mssd/median_mm", "median MSSD", "mm", ".1f", LOWER),
-    MetricInfo(
-        "mspd/ar",
-        "MSPD average recall",
-        "%",
-        ".1f",
-        HIGHER,
-        limits=PERCENT,
-        meaning="over thresholds of 5 to 50 pixels in an image 640 wide",
-    ),
-    MetricInfo("mspd/median_px", "median MSPD", "px", ".1f", LOWER),
+    *_describe_bop("mssd", "mm", "0.05 to 0.5 diameters, as in the BOP challenge"),
+    *_describe_bop("mspd", "px", "5 to 50 pixels in an image 640 wide"),
     MetricInfo("iou", "box IoU", form=".3f", direction=HIGHER, limits=(-0.03, 1.03)),
     MetricInfo(
         "particles_on_object",
