@@ -83,6 +83,6 @@ def note_failure(job: Job, cause: str) -> None:
 
 
 def forget_failure(job: Job) -> None:
-    """Remove the note of an earlier failure, but never from the working folder, where none is ours."""
+    """Remove the note of an earlier failure. In the working folder there is none of ours."""
     if job.folder.is_dir() and not job.folder.samefile("."):
         (job.folder / FAILED).unlink(missing_ok=True)
