@@ -12,6 +12,7 @@ from posefilter.data.photometric import (
     Highlights,
     Jpeg,
     MotionBlur,
+    Sticker,
     Vignette,
     hue_rotation,
     mixing_matrix,
@@ -31,6 +32,7 @@ OFF = [
     MotionBlur(0, probability=1),
     MotionBlur(probability=0),
     Jpeg(probability=0),
+    Sticker(probability=0),
 ]
 ON = [
     ColorResponse(),
@@ -39,6 +41,7 @@ ON = [
     Highlights(probability=1),
     MotionBlur(0.2, probability=1),
     Jpeg(probability=1),
+    Sticker(probability=1),
 ]
 
 
@@ -197,6 +200,34 @@ def test_a_jpeg_of_high_quality_is_closer_than_one_of_low() -> None:
         out = apply(Jpeg((quality, quality), probability=1), smooth).rgb.astype(int)
         error.append(np.abs(out - smooth.rgb).mean())
     assert error[0] < error[1] < 20
+
+
+def test_a_sticker_stays_on_the_object_and_within_its_size() -> None:
+    before = sample()
+    area = before.mask.sum()
+    for seed in range(20):
+        changed = (apply(Sticker(1.0, (0.2, 0.4)), before, seed).rgb != before.rgb).any(-1)
+        assert changed.any()
+        assert not (changed & ~before.mask).any()
+        assert changed.sum() <= 0.4**2 * area * 1.3  # a rectangle of whole pixels
+
+
+def test_a_white_sticker_without_print_is_of_one_light_color() -> None:
+    step = Sticker(1.0, (0.3, 0.4), white=1.0, printed=0.0)
+    after = apply(step, sample(), 4).rgb
+    label = after[(after != sample().rgb).any(-1)]
+    assert (label == label[0]).all()
+    assert label.min() > 140
+
+
+def test_exposure_changes_brightness_and_no_hue() -> None:
+    gray = dataclasses.replace(sample(), rgb=np.full((48, 64, 3), 100, np.uint8))
+    step = ColorResponse(hue_deg=0, mixing=0, tint=0, gamma=0, exposure=0.3)
+    values = [apply(step, gray, seed).rgb for seed in range(200)]
+    assert all(np.ptp(x) == 0 for x in values)
+    logs = np.log([x[0, 0, 0] / 100 for x in values])
+    assert logs.std() == pytest.approx(0.3, rel=0.2)
+    assert logs.mean() == pytest.approx(0, abs=0.06)
 
 
 def test_an_unknown_target_is_refused() -> None:

@@ -33,6 +33,7 @@ class ColorResponse:
         mixing: standard deviation of the off-diagonal entries of the mixing matrix.
         tint: standard deviation of the logarithm of each channel's gain.
         gamma: standard deviation of the logarithm of the exponent.
+        exposure: standard deviation of the logarithm of the gain that all channels share.
         target: "image", or "object" for the pixels of the mask alone, as faded or retouched print
             has it.
         probability: share of samples that are changed.
@@ -42,6 +43,7 @@ class ColorResponse:
     mixing: float = 0.12
     tint: float = 0.12
     gamma: float = 0.2
+    exposure: float = 0.0
     target: str = "image"
     probability: float = 1.0
 
@@ -56,9 +58,10 @@ class ColorResponse:
         mixing = mixing_matrix(rng.normal(size=6) * self.mixing)
         tint = np.diag(tint_gains(rng.normal(size=3) * self.tint))
         exponent = float(np.exp(rng.normal() * self.gamma))
+        gain = np.exp(rng.normal() * self.exposure)
         if not chosen:
             return sample
-        matrix = tint @ mixing @ hue_rotation(hue)
+        matrix = gain * tint @ mixing @ hue_rotation(hue)
         if self.target == "image":
             return dataclasses.replace(sample, rgb=respond(sample.rgb, matrix, exponent))
         if not sample.mask.any():
@@ -142,6 +145,53 @@ class Jpeg:
         _, data = cv2.imencode(".jpg", sample.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         decoded = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
         return dataclasses.replace(sample, rgb=np.ascontiguousarray(decoded[..., ::-1]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sticker:
+    """Stick a printed label on the object: real objects carry labels that their meshes lack.
+
+    The label is a rotated rectangle, cut off where the object ends; it still belongs to the object.
+
+    Attributes:
+        probability: share of samples with a label.
+        size: range of its sides, as a share of the square root of the object's visible area.
+        white: share of labels that are nearly white; the others have any color.
+        printed: share of labels with dark bars.
+    """
+
+    probability: float = 0.4
+    size: tuple[float, float] = (0.15, 0.5)
+    white: float = 0.7
+    printed: float = 0.5
+
+    def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
+        """Return the sample with or without a label."""
+        if rng.random() >= self.probability or not sample.mask.any():
+            return sample
+        rows, cols = np.nonzero(sample.mask)
+        at, scale = rng.integers(len(rows)), np.sqrt(len(rows))
+        half_w, half_h = rng.uniform(*self.size, 2) * scale / 2
+        angle = rng.uniform(0, np.pi)
+        reach = int(np.hypot(half_w, half_h)) + 1
+        cut = np.s_[
+            max(rows[at] - reach, 0) : rows[at] + reach + 1,
+            max(cols[at] - reach, 0) : cols[at] + reach + 1,
+        ]
+        mask = sample.mask[cut]
+        down, right = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float32)
+        down, right = down + cut[0].start - rows[at], right + cut[1].start - cols[at]
+        a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
+        b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
+        label = (np.maximum(np.abs(a), np.abs(b)) < 1) & mask
+        paper = rng.uniform(190, 255) + rng.normal(size=3) * 8
+        paper = paper if rng.random() < self.white else rng.uniform(0, 255, 3)
+        bars = np.sin(a * rng.uniform(6, 20) + rng.uniform(0, 6)) > rng.uniform(-0.5, 0.8)
+        bars &= (np.maximum(np.abs(a), np.abs(b)) < 0.8) & (rng.random() < self.printed)
+        color = np.where(bars[..., None], rng.uniform(0, 0.5), 1.0) * paper
+        rgb = sample.rgb.copy()
+        rgb[cut][label] = _to_bytes(color[label])
+        return dataclasses.replace(sample, rgb=rgb)
 
 
 def hue_rotation(angle: float) -> np.ndarray:
