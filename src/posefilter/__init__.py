@@ -24,12 +24,18 @@ if TYPE_CHECKING:
     from posefilter.cli.trust import trust
     from posefilter.errors import UserError
     from posefilter.estimator import Estimator, Result
+    from posefilter.tracking.settings import TrackerSettings
+    from posefilter.tracking.track import TrackResult
+    from posefilter.tracking.tracker import Tracker
 
 __all__ = [
     "Belief",
     "Estimator",
     "Mode",
     "Result",
+    "TrackResult",
+    "Tracker",
+    "TrackerSettings",
     "UserError",
     "__version__",
     "build",
@@ -45,6 +51,9 @@ _HOMES = {
     "Estimator": "estimator",
     "Mode": "belief",
     "Result": "estimator",
+    "TrackResult": "tracking.track",
+    "Tracker": "tracking.tracker",
+    "TrackerSettings": "tracking.settings",
     "UserError": "errors",
     "build": "api",
     "build_data": "api",

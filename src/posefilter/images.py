@@ -23,13 +23,14 @@ class Images(NamedTuple):
     intrinsics: np.ndarray  # (B, 3, 3) float64 [px]
 
 
-def check_images(rgb: Any, depth: Any, intrinsics: Any) -> tuple[Images, bool]:
+def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> tuple[Images, bool]:
     """Return a user's images in one form, and whether they came as a batch.
 
     Args:
         rgb: Color (H, W, 3) or (3, H, W), or a batch of them, RGB: uint8, or float in [0, 1].
         depth: z-depth (H, W), or (B, H, W), in meters, as float; 0, NaN or infinity where unknown.
         intrinsics: Camera matrix (3, 3), or (B, 3, 3), [px] of these images.
+        empty: Whether an image may have no depth at all.
 
     Returns:
         The images, and True where `rgb` has a batch's leading dimension.
@@ -50,7 +51,8 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any) -> tuple[Images, bool]:
         raise UserError(f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[:3]}")
     if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
         raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
-    return Images(_check_color(color), _check_depth(z), _check_intrinsics(K, len(z))), batched
+    K = check_intrinsics(K, len(z))
+    return Images(_check_color(color), _check_depth(z, empty), K), batched
 
 
 def make_batch(images: Images, image_width: int | None, image_height: int | None) -> Batch:
@@ -101,7 +103,7 @@ def _check_color(color: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(color, dtype=np.float32)
 
 
-def _check_depth(depth: np.ndarray) -> np.ndarray:
+def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
     if depth.dtype.kind != "f":
         raise UserError(
             f"depth: is {depth.dtype}; meters are due, as float: divide by the depth image's units "
@@ -111,6 +113,8 @@ def _check_depth(depth: np.ndarray) -> np.ndarray:
     for number, one in enumerate(z):
         which = f" of image {number}" if len(z) > 1 else ""
         if not one.any():
+            if empty:
+                continue
             raise UserError(f"depth{which}: no pixel has depth")
         median = float(np.median(one[one > 0]))
         if not _NEAREST < median < _FARTHEST:
@@ -118,7 +122,11 @@ def _check_depth(depth: np.ndarray) -> np.ndarray:
     return z
 
 
-def _check_intrinsics(K: np.ndarray, count: int) -> np.ndarray:
+def check_intrinsics(K: np.ndarray, count: int) -> np.ndarray:
+    """Return camera matrices as float64 (count, 3, 3) [px].
+
+    Raises UserError where they are none.
+    """
     if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
         raise UserError(f"intrinsics: has shape {K.shape}; a camera matrix (3, 3) [px] is due")
     K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)

@@ -1,0 +1,1 @@
+"""Tracking: a belief that is carried from frame to frame."""

@@ -1,0 +1,63 @@
+"""The estimate of a tracked pose: a mean over the mode, and its smoothing over time."""
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.geometry.pose_statistics import twist_between
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.protocols import Method, Scene
+from posefilter.types import Belief, ParticleOutput, Particles
+
+
+class ModeMean:
+    """The weighted mean of the particles near the one of highest likelihood: an `Estimate`.
+
+    It varies less from frame to frame than the best particle does, and unlike the mean over all
+    particles it does not lie between modes. The score is the weighted mean of their
+    log-likelihoods.
+
+    Args:
+        reach: Distance within which particles belong to the mode [m].
+    """
+
+    def __init__(self, reach: float) -> None:
+        self.reach = reach
+
+    def __call__(
+        self,
+        particles: Particles,
+        output: ParticleOutput,
+        scene: Scene,
+        method: Method,
+        generator: Generator,
+    ) -> Belief:
+        """Return the belief."""
+        space, poses = method.space, output.pose
+        assert isinstance(space, PoseSpace)
+        rows = torch.arange(len(poses), device=poses.device)
+        top = poses[rows, particles.log_weights.argmax(1)]
+        near = space.distance(poses, top[:, None]) < self.reach
+        weights = torch.where(near, particles.log_weights, -torch.inf).softmax(1)
+        score = (weights * output.log_likelihood).sum(1)
+        return Belief(poses, particles.log_weights, space.mean(poses, weights), score)
+
+
+def smooth(predicted: Tensor, measured: Tensor, space: PoseSpace, noise: float) -> Tensor:
+    """Return a pose between what was predicted and what was measured.
+
+    The share of the measured is d^2 / (d^2 + noise^2), where d is the distance of the two: what
+    measurement noise explains is damped, and a motion is followed.
+
+    Args:
+        predicted: (B, 4, 4) camera_from_object [m].
+        measured: (B, 4, 4) likewise.
+        space: Measures the distance.
+        noise: Standard deviation of the estimate of a single frame [m]; 0 for no smoothing.
+
+    Returns:
+        Poses (B, 4, 4).
+    """
+    square = space.distance(predicted, measured).square()[:, None]
+    share = square / (square + noise**2).clamp_min(1e-20)
+    twist = twist_between(predicted, measured, predicted.new_tensor(space.center))
+    return space.move(predicted, share * twist)

@@ -1,0 +1,72 @@
+"""A method as tracking uses it: its own network and likelihood, with fewer image points a pose."""
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.base import PoseEstimator
+from posefilter.nets.layers import fast_bfloat16
+from posefilter.protocols import Scene
+from posefilter.types import Batch, ParticleOutput, Particles, Step
+
+_NEEDED = ("pose_space", "score_poses", "propose_poses")
+
+
+def check_method(method: PoseEstimator) -> None:
+    """Raise UserError where a method cannot be tracked with."""
+    missing = [name for name in _NEEDED if name not in method.capabilities]
+    if missing:
+        raise UserError(
+            f"tracking: {type(method).__name__} provides no {missing[0]}; track with a checkpoint "
+            f"of model=pose_pf model/proposals=dense"
+        )
+
+
+class Glance:
+    """An encoded frame whose poses are scored by few image points: a `Method` for the filter.
+
+    Args:
+        method: Scores and proposes poses.
+        scene: The frame, as the method has encoded it.
+        points: Image points that a pose is scored from.
+    """
+
+    latent_width = 0
+
+    def __init__(self, method: PoseEstimator, scene: Scene, points: int) -> None:
+        self.method, self.scene, self.points = method, scene, points
+
+    @property
+    def space(self) -> PoseSpace:
+        """SE(3) about the object's center."""
+        space = self.method.space
+        assert isinstance(space, PoseSpace)
+        return space
+
+    def encode(self, batch: Batch) -> Scene:
+        """Return the frame, which is encoded already."""
+        return self.scene
+
+    def measure(
+        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        """Score every particle at the step's noise level."""
+        state = particles.state
+        score = self.score_poses(scene, state, float(step.sigma), generator, self.points)
+        no_move = state.new_zeros(*state.shape[:2], self.space.dimensions)
+        return ParticleOutput(score, no_move, state, particles.latent)
+
+    def score_poses(
+        self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
+        """Score any poses at a noise level; see `ScoresPoses`."""
+        device = self.method.device
+        with torch.autocast(device.type, torch.bfloat16, enabled=fast_bfloat16(device)):
+            score: Tensor = self.method.score_poses(scene, poses, sigma, generator, pixels)  # type: ignore[operator]
+        return score.float()
+
+    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+        """Draw poses from the method's proposals; see `ProposesPoses`."""
+        poses: Tensor = self.method.propose_poses(scene, particles, generator)  # type: ignore[operator]
+        return poses

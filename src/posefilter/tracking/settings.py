@@ -1,0 +1,106 @@
+"""What a tracker is set to."""
+
+from dataclasses import dataclass, field
+
+from posefilter.errors import UserError
+from posefilter.tracking.motion import RandomWalk
+
+
+def check_whole(settings: object, **least: int) -> None:
+    """Raise UserError where a setting is no whole number, or below its least value."""
+    for name, bound in least.items():
+        value = getattr(settings, name)
+        if not isinstance(value, int) or isinstance(value, bool) or value < bound:
+            raise UserError(f"tracker: {name}={value} must be a whole number, {bound} or more")
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a frame may cost.
+
+    Attributes:
+        least: Particles of the belief at least.
+        most: Particles at most; KLD sampling chooses between.
+        proposals: Particles that the network proposes, beside them.
+        steps: Likelihood steps.
+        start: Noise level of the first step [m].
+        stop: Noise level of the last [m].
+        points: Image points that a pose is scored from.
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    least: int
+    most: int
+    proposals: int
+    steps: int
+    start: float
+    stop: float
+    points: int
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole(self, least=1, most=1, proposals=0, steps=1, points=1)
+        if self.most < self.least:
+            raise UserError(
+                f"tracker: most={self.most} particles are fewer than least={self.least}"
+            )
+        if not 0 < self.stop <= self.start:
+            raise UserError(
+                f"tracker: start={self.start}, stop={self.stop}: noise levels fall, and are above 0"
+            )
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Settings of a tracker.
+
+    Attributes:
+        motion: How an object may move between two frames.
+        follow: What a frame costs while the object is tracked.
+        search: What it costs while the object is lost.
+        walk: Standard deviation of the move between two steps, over the noise level.
+        rounds: Rounds of mean shift that end a frame; 0: the mean of the mode as it is.
+        epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
+        quantile: Probability that it stays below.
+        cell: Side of the cells that it counts [m].
+        look_around: Every so many frames the network sees the whole image, so that proposals come
+            from everywhere; 0: never.
+        side: Largest side of the window about the object that it sees otherwise [px].
+        reach: Half the window's side, in projected radii of the object.
+        noise: Standard deviation of the estimate of a single frame, for smoothing [m]; 0: none.
+        lost_below: A frame counts against the object where its log odds are below [nat].
+        found_above: What a search finds is taken up where its log odds are above [nat].
+        patience: Frames in a row that count against an object that is lost.
+        full_every: While it is lost, every so many frames the estimator's own filter searches;
+            0: never.
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    motion: RandomWalk = field(default_factory=RandomWalk)
+    follow: Effort = Effort(48, 300, 8, 3, 0.012, 0.004, 64)
+    search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
+    walk: float = 0.4
+    rounds: int = 0
+    epsilon: float = 0.15
+    quantile: float = 0.95
+    cell: float = 0.03
+    look_around: int = 10
+    side: int = 160
+    reach: float = 1.6
+    noise: float = 0.002
+    lost_below: float = 3.0
+    found_above: float = 5.0
+    patience: int = 2
+    full_every: int = 5
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_whole(self, rounds=0, look_around=0, side=64, patience=1, full_every=0)
+        if not (self.walk >= 0 and self.noise >= 0 and self.reach >= 1):
+            raise UserError("tracker: walk and noise must be 0 or more, reach 1 or more")
+        if not (self.epsilon > 0 and self.cell > 0 and 0 < self.quantile < 1):
+            raise UserError("tracker: epsilon and cell must be above 0, quantile between 0 and 1")

@@ -1,0 +1,261 @@
+"""One object, followed from frame to frame."""
+
+import math
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from posefilter.data.resize import network_size
+from posefilter.estimator import Result, Run, make_result
+from posefilter.filters.loop import ParticleFilter, make_particles
+from posefilter.filters.propagate import Gaussian
+from posefilter.filters.refine import MeanShift, NoRefine
+from posefilter.filters.resample import Systematic
+from posefilter.filters.reweight import Annealed
+from posefilter.filters.schedule import Geometric
+from posefilter.geometry.pose_statistics import twist_between
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.images import Images, make_batch
+from posefilter.models.base import PoseEstimator
+from posefilter.tracking.clutter import measure_odds
+from posefilter.tracking.estimate import ModeMean, smooth
+from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
+from posefilter.tracking.scoring import Glance, check_method
+from posefilter.tracking.settings import Effort, TrackerSettings
+from posefilter.tracking.window import clean_depth, cut_window, place_window
+from posefilter.types import Batch, Belief, Particles, Trace
+
+STARTED, TRACKED, FOUND, LOST = "started", "tracked", "found", "lost"
+_MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult(Result):
+    """Where a tracked object is in a frame.
+
+    Attributes:
+        status: "started" by an estimate on a single image, "tracked" from the frame before,
+            "found" again after a loss, or "lost": then the pose is no more than a guess.
+        odds: Log odds of the pose against poses at random surfaces of the image [nat].
+    """
+
+    status: str
+    odds: float
+
+    @property
+    def found(self) -> bool:
+        """Whether the pose is one to go by."""
+        return self.status != LOST
+
+
+class State(NamedTuple):
+    """What is carried from one frame to the next."""
+
+    belief: Particles  # of one image
+    best: Tensor  # (1, 4, 4) the estimate, smoothed over time [m]
+    velocity: Tensor  # (1, 6) its motion in the last frame [m, rad]
+
+
+class Sight(NamedTuple):
+    """What one frame shows."""
+
+    batch: Batch  # the image, or the window of it that was looked at
+    belief: Belief | None  # None where nothing has depth
+    odds: float  # of the estimate against clutter [nat]
+
+
+class Track:
+    """Follow one object.
+
+    Args:
+        method: The object's trained filter.
+        size: Width and height of the images that it was trained on [px]; None where they follow
+            the image's.
+        settings: Of the tracker.
+        seed: Decides every random draw.
+
+    Raises:
+        UserError: The method cannot be tracked with.
+    """
+
+    def __init__(
+        self,
+        method: PoseEstimator,
+        size: tuple[int | None, int | None],
+        settings: TrackerSettings,
+        seed: int = 0,
+    ) -> None:
+        check_method(method)
+        assert isinstance(method.space, PoseSpace)
+        self.method, self.space = method, method.space
+        self.size, self.settings, self.seed = size, settings, seed
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the object: the next frame is the first."""
+        self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
+        self.state: State | None = None
+        self.lost, self.ever_found = True, False
+        self.frames = self.doubts = self.lost_for = 0
+
+    @torch.no_grad()
+    def update(self, images: Images) -> TrackResult:
+        """Return where the object is in the next frame.
+
+        Args:
+            images: One photograph.
+        """
+        start = time.perf_counter()
+        predicted = None if self.state is None else self._predict(self.state)
+        if predicted is None or self._is_due():
+            sight = self._estimate(images)
+        else:
+            sight = self._follow(images, predicted)
+        trusted, status = self._judge(sight.odds)
+        belief = sight.belief if trusted or predicted is None else None
+        self.state = self._correct(predicted, belief, status)
+        self.frames += 1
+        result = make_result(self._describe(sight), 0)
+        content = {**vars(result), "seconds": time.perf_counter() - start}
+        return TrackResult(**content, status=status, odds=sight.odds)
+
+    # -- the steps of a frame ---------------------------------------------------------------------
+
+    def _predict(self, state: State) -> State:
+        """Return where the object is expected: draws of the moved belief, of equal weight."""
+        settings, effort = self.settings, self._effort
+        drift = settings.motion.momentum * state.velocity
+        expected = self.space.move(state.best, drift)
+        draws = draw_predicted(
+            state.belief, state.velocity, settings.motion, effort.most, self.space, self.generator
+        )
+        draws = take_enough(
+            draws,
+            expected[0],
+            self.space,
+            settings.cell,
+            settings.epsilon,
+            settings.quantile,
+            effort.least,
+        )
+        return State(make_particles(draws, 0), expected, state.velocity)
+
+    def _estimate(self, images: Images) -> Sight:
+        """Run the estimator's own filter on the whole image."""
+        batch = self._take(make_batch(clean_depth(images), *self.size))
+        if not bool(batch.depth.any()):
+            return Sight(batch, None, -math.inf)
+        self.method.seed = self.seed
+        trace = self.method.predict_step(batch, 0)
+        scene = self.method.encode(batch)
+        return self._weigh(batch, trace.belief, Glance(self.method, scene, 1))
+
+    def _follow(self, images: Images, predicted: State) -> Sight:
+        """Run a filter of few particles from the predicted belief."""
+        batch = self._take(self._look(images, predicted.best[0]))
+        if not bool(batch.depth.any()):
+            return Sight(batch, None, -math.inf)
+        effort, settings = self._effort, self.settings
+        glance = Glance(self.method, self.method.encode(batch), effort.points)
+        refine = MeanShift(settings.rounds, 16) if settings.rounds else NoRefine()
+        filter = ParticleFilter(
+            particles=predicted.belief.state.shape[1],
+            steps=effort.steps,
+            initialize=FromBelief(predicted.belief.state, effort.proposals),
+            schedule=Geometric(effort.start, effort.stop),
+            reweight=Annealed(),
+            resample=Systematic(),
+            propagate=Gaussian(settings.walk),
+            estimate=ModeMean(_MODE),
+            refine=refine,
+        )
+        trace = filter(batch, glance, self.generator)
+        return self._weigh(batch, trace.belief, glance)
+
+    def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State:
+        """Return the state after a frame; `belief` is None where what it shows is not trusted."""
+        if belief is None:
+            assert predicted is not None  # the first frame has depth
+            return predicted._replace(velocity=torch.zeros_like(predicted.velocity))
+        if predicted is None or self.state is None or status != TRACKED:
+            return begin(belief)
+        best = smooth(predicted.best, belief.best, self.space, self.settings.noise)
+        center = best.new_tensor(self.space.center)
+        return begin(belief)._replace(
+            best=best, velocity=twist_between(self.state.best, best, center)
+        )
+
+    # -- what is looked at, and what it says ------------------------------------------------------
+
+    @property
+    def _effort(self) -> Effort:
+        return self.settings.search if self.lost else self.settings.follow
+
+    def _is_due(self) -> bool:
+        """Return whether the estimator's own filter is to search in this frame."""
+        every = self.settings.full_every
+        return self.lost and every > 0 and self.lost_for % every == every - 1
+
+    def _look(self, images: Images, pose: Tensor) -> Batch:
+        """Return the window about the object, or the whole image where it is time for that."""
+        settings, every = self.settings, self.settings.look_around
+        height, width = images.depth.shape[1:]
+        if self.lost or (every and self.frames % every == 0):
+            return make_batch(clean_depth(images), *self.size)
+        window = place_window(
+            pose.double().cpu().numpy(),
+            self.method.model,
+            images.intrinsics[0],
+            (height, width),
+            network_size(height, width, *self.size)[1] / width,
+            settings.side,
+            settings.reach,
+        )
+        if window is None:
+            return make_batch(clean_depth(images), *self.size)
+        return make_batch(
+            clean_depth(cut_window(images, window)), window.seen_width, window.seen_height
+        )
+
+    def _take(self, batch: Batch) -> Batch:
+        return Batch(*(x.to(self.method.device) for x in batch))
+
+    def _weigh(self, batch: Batch, belief: Belief, glance: Glance) -> Sight:
+        """Return what a frame shows, with the odds of its estimate."""
+        odds = measure_odds(glance, glance.scene, batch, belief.best[0], self.space, self.generator)
+        return Sight(batch, belief, odds)
+
+    def _judge(self, odds: float) -> tuple[bool, str]:
+        """Return whether a frame's estimate is to be trusted, and the object's status after it."""
+        settings = self.settings
+        if self.lost:
+            trusted = odds > settings.found_above
+            status = LOST if not trusted else FOUND if self.ever_found else STARTED
+        else:
+            trusted = odds > settings.lost_below
+            self.doubts = 0 if trusted else self.doubts + 1
+            status = LOST if self.doubts >= settings.patience else TRACKED
+        self.lost = status == LOST
+        self.lost_for = self.lost_for + 1 if self.lost else 0
+        self.ever_found |= not self.lost
+        if self.lost:
+            self.doubts = 0
+        return trusted, status
+
+    def _describe(self, sight: Sight) -> Run:
+        """Return the state as an estimator's run on what was looked at."""
+        assert self.state is not None
+        state = self.state
+        score = state.best.new_full((1,), -torch.inf)
+        score = score if sight.belief is None else sight.belief.score
+        belief = Belief(state.belief.state, state.belief.log_weights, state.best, score)
+        return Run(self.method, sight.batch, Trace((), (), (), belief), 0.0)
+
+
+def begin(belief: Belief) -> State:
+    """Return the state of a belief whose motion is not known."""
+    particles = make_particles(belief.poses, 0)._replace(log_weights=belief.log_weights)
+    return State(particles, belief.best, belief.best.new_zeros(1, 6))

@@ -1,0 +1,91 @@
+"""The part of a photograph about the object, at no more pixels than tracking needs.
+
+What a filter costs does not depend on the image's size, but what its network costs does. While the
+object's place is known, the network is given a square window about it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from posefilter.images import Images
+from posefilter.types import ObjectModel
+
+_CELL = 32  # [px] the network's coarsest cell
+
+
+class Window(NamedTuple):
+    """A rectangle of whole pixels of a photograph, and the size at which it is seen."""
+
+    left: int  # [px] of the photograph
+    top: int
+    width: int
+    height: int
+    seen_width: int  # [px] of what the network is given
+    seen_height: int
+
+
+def place_window(
+    pose: np.ndarray,
+    model: ObjectModel,
+    K: np.ndarray,
+    size: tuple[int, int],
+    scale: float,
+    side: int,
+    reach: float,
+) -> Window | None:
+    """Return the window about an object.
+
+    Args:
+        pose: (4, 4) camera_from_object [m], where the object is expected.
+        model: The object.
+        K: (3, 3) camera matrix of the photograph [px].
+        size: Height and width of the photograph [px].
+        scale: Seen pixels for one of the photograph's, at most; that of training.
+        side: Seen pixels of the window's side, at most.
+        reach: Half the window's side, in projected radii of the object.
+
+    Returns:
+        The window, cut at the photograph's edges; None where it would hold the whole photograph or
+        none of it, or where the object is behind the camera.
+    """
+    x, y, z = (pose[:3, :3] @ model.center.double().numpy() + pose[:3, 3]).tolist()
+    if z <= model.radius / 2:
+        return None
+    half = reach * model.radius * float(K[0, 0]) / z
+    scale = min(scale, side / (2 * half))
+    # a whole number of the network's cells, so that no pixel is padding
+    seen = max(2, -(-round(2 * half * scale) // _CELL)) * _CELL
+    half = seen / scale / 2
+    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    height, width = size
+    left, columns = _cut(u - half, u + half, width, scale)
+    top, rows = _cut(v - half, v + half, height, scale)
+    if min(columns, rows) < _CELL:
+        return None
+    return Window(left, top, round(columns / scale), round(rows / scale), columns, rows)
+
+
+def cut_window(images: Images, window: Window) -> Images:
+    """Return the part of photographs that a window shows, with its camera."""
+    rows = slice(window.top, window.top + window.height)
+    columns = slice(window.left, window.left + window.width)
+    K = images.intrinsics.copy()
+    K[:, 0, 2] -= window.left
+    K[:, 1, 2] -= window.top
+    return Images(images.rgb[:, rows, columns], images.depth[:, rows, columns], K)
+
+
+def clean_depth(images: Images) -> Images:
+    """Return photographs whose depth is float32 [m], and 0 where it is unknown."""
+    depth = images.depth
+    known = np.isfinite(depth) & (depth > 0)
+    return images._replace(depth=np.where(known, depth, 0).astype(np.float32))
+
+
+def _cut(low: float, high: float, size: int, scale: float) -> tuple[int, int]:
+    """Return the first pixel, an even one so that halving averages the pixels that it averages in
+    the whole photograph, and the number of seen pixels within the photograph.
+    """
+    first = max(0, 2 * round(low / 2))
+    return first, int((min(size, high) - first) * scale + 1e-6)

@@ -1,0 +1,64 @@
+"""The motion model: its covariance grows with the frames, in the axes that it is stated in."""
+
+import math
+
+import pytest
+import torch
+
+from posefilter.errors import UserError
+from posefilter.geometry.pose import pose_about
+from posefilter.geometry.pose_statistics import covariance_about, twist_between
+from posefilter.geometry.rotation import random_rotation
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.tracking.motion import RandomWalk
+
+CENTER = (0.03, -0.05, 0.02)
+SPACE = PoseSpace(CENTER, 0.1)
+COUNT = 20_000
+
+
+def walk(motion: RandomWalk, frames: int, velocity: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Return a start (4, 4), and where many poses are after so many frames."""
+    g = torch.Generator().manual_seed(0)
+    start = pose_about(
+        random_rotation(generator=g).double(),
+        torch.tensor([0.1, 0.0, 0.8]).double(),
+        torch.tensor(CENTER).double(),
+    )
+    state = start.expand(1, COUNT, 4, 4)
+    for _ in range(frames):
+        state = motion(state, velocity.double(), SPACE, g)
+    return start, state[0]
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_the_covariance_of_a_walk_grows_with_the_frames(frames: int) -> None:
+    """Shifts along the camera's axes, turns about the object's own, neither leaks into the other:
+    the start is turned, and the object's center lies off its origin.
+    """
+    motion = RandomWalk(shift_mm=(2, 4, 8), turn_deg=(0.5, 1.0, 2.0))
+    start, state = walk(motion, frames, torch.zeros(1, 6))
+    found = covariance_about(
+        start, state, torch.full((COUNT,), 1 / COUNT).double(), torch.tensor(CENTER).double()
+    )
+    deviations = torch.tensor([0.002, 0.004, 0.008, *(math.radians(x) for x in (0.5, 1, 2))])
+    stated = frames * deviations.double().square()
+    assert torch.allclose(found.diagonal(), stated, rtol=0.05)
+    correlation = found / stated.sqrt().outer(stated.sqrt())
+    assert (correlation - torch.eye(6)).abs().max() < 0.06
+
+
+@pytest.mark.parametrize("momentum", [0.0, 0.5, 1.0])
+def test_momentum_is_the_share_of_the_last_motion_that_goes_on(momentum: float) -> None:
+    velocity = torch.tensor([[0.01, 0.0, -0.02, 0.0, 0.1, 0.0]])
+    start, state = walk(RandomWalk(1, 0.5, momentum), 1, velocity)
+    mean = twist_between(start, state, torch.tensor(CENTER).double()).mean(0)
+    assert torch.allclose(mean, momentum * velocity[0].double(), atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"shift_mm": -1}, {"turn_deg": (1, 2)}, {"momentum": 1.5}, {"shift_mm": math.nan}]
+)
+def test_what_is_no_motion_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(UserError, match=rf"motion\.{next(iter(wrong))}="):
+        RandomWalk(**wrong)

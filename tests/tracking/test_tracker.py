@@ -1,0 +1,146 @@
+"""The tracker on a likelihood that is made by hand: it follows, notices a loss, and finds again."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
+
+import posefilter
+from posefilter.errors import UserError
+from posefilter.tracking.settings import Effort, TrackerSettings
+
+NONE = np.zeros_like(DEPTH)
+
+
+def off(result: posefilter.TrackResult, truth: torch.Tensor) -> float:
+    """Return how far an estimate is off, turns counted at the radius [m]."""
+    return float(SPACE.distance(torch.from_numpy(result.pose).float(), truth))
+
+
+def test_a_moving_object_is_followed_with_few_particles() -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator)
+    truth = walk_pose(20)
+    for number, pose in enumerate(truth):
+        toy.truth = pose
+        result = tracker.update(RGB, DEPTH, K)
+        assert result.status == ("tracked" if number else "started")
+        assert result.found
+        assert off(result, pose) < 0.008
+        assert result.odds > 5
+        if number:
+            assert len(result.belief.weights) < 150 < toy.filter.particles
+    assert result.object == "toy"
+    assert result.belief.weights.sum() == pytest.approx(1)
+
+
+def test_the_network_sees_a_window_and_now_and_then_the_whole_image() -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, TrackerSettings(look_around=4, side=64))
+    truth = walk_pose(13, shift=0.0, turn=0.0)
+    for pose in truth:
+        toy.truth = pose
+        toy.encoded.clear()
+        tracker.update(RGB, DEPTH, K)
+        whole = (tracker.tracks[0].frames - 1) % 4 == 0
+        assert ((120, 160) in toy.encoded) == whole
+        assert whole or max(toy.encoded[0]) <= 64
+
+
+def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator)
+    truth = walk_pose(12, shift=0.0)
+    statuses = []
+    for number in range(30):
+        away = 8 <= number < 18
+        pose = truth[0] if number < 8 else SPACE.move(truth[0], torch.tensor([0.2, 0, 0, 0, 1, 0]))
+        toy.truth = None if away else pose
+        result = tracker.update(RGB, DEPTH, K)
+        statuses.append(result.status)
+        assert result.found == (result.status != "lost")
+        if result.found and not away:
+            assert off(result, pose) < 0.01
+    assert statuses[8:10] == ["tracked", "lost"]  # two frames without it are a loss
+    assert set(statuses[9:18]) == {"lost"}  # nothing is tracked that is not there
+    again = statuses.index("found")
+    assert 18 <= again < 21
+    assert set(statuses[again + 1 :]) == {"tracked"}
+
+
+def test_one_bad_frame_is_no_loss() -> None:
+    """The belief is moved on without a measurement; a frame without depth is such a frame."""
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator)
+    toy.truth = pose = walk_pose(1)[0]
+    for depth in (DEPTH, DEPTH, NONE, DEPTH):
+        result = tracker.update(RGB, depth, K)
+        assert result.found
+        assert off(result, pose) < 0.01
+        assert (result.odds == -np.inf) == (depth is NONE)
+    assert result.status == "tracked"
+
+
+def test_what_was_never_there_is_never_found() -> None:
+    _, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator)
+    results = [tracker.update(RGB, DEPTH, K) for _ in range(8)]
+    assert {one.status for one in results} == {"lost"}
+    with pytest.raises(UserError, match="no pixel has depth"):
+        posefilter.Tracker(estimator).update(RGB, NONE, K)
+
+
+def test_smoothing_damps_jitter_and_follows_a_jump() -> None:
+    deviations, last = [], []
+    for noise in (0.0, 0.01):
+        toy, estimator = make_toy()
+        tracker = posefilter.Tracker(estimator, TrackerSettings(noise=noise))
+        toy.truth = truth = walk_pose(1)[0]
+        still = [tracker.update(RGB, DEPTH, K).pose[:3, 3] for _ in range(20)]
+        deviations.append(np.std(np.diff(still[5:], axis=0)))
+        toy.truth = SPACE.move(truth, torch.tensor([0.03, 0, 0, 0, 0, 0]))
+        last.append(off([tracker.update(RGB, DEPTH, K) for _ in range(3)][-1], toy.truth))
+    assert deviations[1] < 0.5 * deviations[0]
+    assert max(last) < 0.01
+
+
+def test_several_objects_give_a_list_and_the_seed_decides() -> None:
+    toy, estimator = make_toy()
+    toy.truth = walk_pose(1)[0]
+    both = posefilter.Tracker([estimator, estimator], seed=3)
+    alone = posefilter.Tracker(estimator, seed=3)
+    assert both.objects == ("toy", "toy")
+    for _ in range(3):
+        pair, one = both.update(RGB, DEPTH, K), alone.update(RGB, DEPTH, K)
+        assert np.array_equal(pair[0].pose, one.pose)
+    alone.reset()
+    again = [alone.update(RGB, DEPTH, K) for _ in range(3)][-1]
+    assert np.array_equal(again.pose, one.pose)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"patience": 0}, "patience=0 must be a whole number, 1 or more"),
+        ({"reach": 0.5}, "reach 1 or more"),
+        ({"quantile": 1.0}, "quantile between 0 and 1"),
+    ],
+)
+def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        TrackerSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_impossible_efforts_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    effort = TrackerSettings().follow
+    with pytest.raises(UserError, match="most=5 particles are fewer than least=10"):
+        dataclasses.replace(effort, least=10, most=5)
+    with pytest.raises(UserError, match="noise levels fall"):
+        Effort(10, 20, 0, 2, 0.001, 0.004, 64)
+    toy, estimator = make_toy()
+    monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses"))
+    toy.__dict__.pop("capabilities", None)
+    with pytest.raises(UserError, match=r"Toy provides no propose_poses; .*model/proposals=dense"):
+        posefilter.Tracker(estimator)

@@ -1,0 +1,99 @@
+"""A toy object whose likelihood is made by hand: a function of the distance to the true pose."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.estimator import Estimator
+from posefilter.filters.estimate import Argmax
+from posefilter.filters.initialize import FromProposals
+from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.propagate import Gaussian
+from posefilter.filters.refine import NoRefine
+from posefilter.filters.resample import Systematic
+from posefilter.filters.reweight import Annealed
+from posefilter.filters.schedule import Geometric
+from posefilter.geometry.pose import pose_about
+from posefilter.geometry.rotation import random_rotation
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, ObjectModel
+
+CENTER = (0.02, 0.0, -0.01)
+SPACE = PoseSpace(CENTER, 0.08)
+K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
+RGB, DEPTH = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
+
+
+class Toy(PoseEstimator):
+    """A method that sees the true pose, `truth`, or nothing where that is None."""
+
+    provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses", "propose_poses")
+
+    def __init__(self) -> None:
+        filter = ParticleFilter(
+            200, 8, FromProposals(), Geometric(0.04, 0.004), Annealed(), Systematic(), Gaussian(),
+            Argmax(), NoRefine(),
+        )  # fmt: skip
+        super().__init__(filter, loss=lambda *_: torch.zeros(1), optimizer=lambda _: None)  # type: ignore[arg-type,return-value]
+        self.truth: Tensor | None = None
+        self.encoded: list[tuple[int, ...]] = []  # sizes of the images that were encoded
+        line = torch.linspace(-0.05, 0.05, 3)
+        points = torch.cartesian_prod(line, line, line) + torch.tensor(CENTER)
+        self.set_object(
+            ObjectModel("toy", points, torch.tensor(CENTER), 0.08, 0.17, torch.eye(4)[None], points)
+        )
+
+    @property
+    def space(self) -> PoseSpace:
+        return SPACE
+
+    def encode(self, batch: Batch) -> Any:
+        self.encoded.append(tuple(batch.rgb.shape[-2:]))
+        return self.truth
+
+    def measure(self, scene: Any, particles: Any, step: Any, generator: Generator) -> Any:
+        from posefilter.tracking.scoring import Glance
+
+        return Glance(self, scene, 64).measure(scene, particles, step, generator)
+
+    def score_poses(
+        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
+        noise = 0.2 * torch.randn(poses.shape[:2], generator=generator)
+        if scene is None:
+            return noise - 10
+        distance = SPACE.distance(poses, scene.to(poses)[None, None])
+        return noise - 10 * torch.log1p((distance / (sigma + 0.002)).square() / 5)
+
+    def propose_poses(self, scene: Any, particles: int, generator: Generator) -> Tensor:
+        """Half of them near the object, if there is one; the others anywhere."""
+        place = torch.rand(particles, 3, generator=generator) - 0.5 + torch.tensor([0, 0, 1.0])
+        R = random_rotation(particles, generator=generator)
+        poses = pose_about(R, place, torch.tensor(CENTER))
+        if scene is not None:
+            near = torch.randn(particles // 2, 6, generator=generator) * SPACE.noise_scale(
+                torch.tensor(0.03)
+            )
+            poses[: particles // 2] = SPACE.move(scene.float().expand(len(near), 4, 4), near)
+        return poses[None]
+
+
+def make_toy() -> tuple[Toy, Estimator]:
+    """Return the method, whose truth a test sets, and the estimator of it."""
+    toy = Toy()
+    return toy, Estimator([toy], "cpu")
+
+
+def walk_pose(frames: int, shift: float = 0.004, turn: float = 0.02) -> Tensor:
+    """Return the poses (frames, 4, 4) of an object that moves steadily [m, rad a frame]."""
+    start = pose_about(
+        random_rotation(generator=torch.Generator().manual_seed(3)),
+        torch.tensor([-0.05, 0.02, 0.9]),
+        torch.tensor(CENTER),
+    )
+    twist = torch.tensor([shift, 0.0, 0.0, 0.0, turn, 0.0])
+    return torch.stack([SPACE.move(start, n * twist) for n in range(frames)])
