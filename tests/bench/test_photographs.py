@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from posefilter.cli.command import compose_job
+from posefilter.data.frames import Sample
 
 HOME = Path(__file__).parents[2]
 
@@ -91,8 +92,22 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     assert all(mark in page_in_docs for mark in marks)
 
 
+def _sample(rgb: np.ndarray) -> Sample:
+    mask = np.zeros(rgb.shape[:2], bool)
+    mask[1:7, 1:7] = True
+    eye = np.eye(4, dtype=np.float32)
+    return Sample(rgb, np.ones(rgb.shape[:2], np.float32), mask, eye[:3, :3], eye, 0, 0, 1.0)
+
+
 def test_the_first_shift_changes_nothing_and_all_others_do() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    for name, (matrix, exponent) in color_shift.shifts().items():
-        same = np.array_equal(color_shift.respond(rgb, matrix, exponent), rgb)
-        assert same == (name == "as it is"), name
+    for name, recolor in color_shift.shifts().items():
+        assert np.array_equal(recolor(_sample(rgb)), rgb) == (name == "as it is"), name
+
+
+def test_a_label_on_the_object_takes_the_color_of_the_object() -> None:
+    rgb = np.zeros((8, 8, 3), np.uint8) + np.uint8([140, 40, 30])
+    rgb[2:4, 2:4] = rgb[0, 0] = 240  # a label, and something light that is no part of the object
+    after = color_shift.paint_labels(_sample(rgb))
+    assert (after[1:7, 1:7] == [140, 40, 30]).all()
+    assert (after[0, 0] == 240).all()
