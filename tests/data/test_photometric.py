@@ -220,14 +220,15 @@ def test_a_white_sticker_without_print_is_of_one_light_color() -> None:
     assert label.min() > 140
 
 
-def test_exposure_changes_brightness_and_no_hue() -> None:
+def test_the_gain_is_shared_by_the_channels_and_within_its_range() -> None:
     gray = dataclasses.replace(sample(), rgb=np.full((48, 64, 3), 100, np.uint8))
-    step = ColorResponse(hue_deg=0, mixing=0, tint=0, gamma=0, exposure=0.3)
+    step = ColorResponse(hue_deg=0, mixing=0, tint=0, gamma=0, gain=(0.5, 2.0))
     values = [apply(step, gray, seed).rgb for seed in range(200)]
     assert all(np.ptp(x) == 0 for x in values)
-    logs = np.log([x[0, 0, 0] / 100 for x in values])
-    assert logs.std() == pytest.approx(0.3, rel=0.2)
-    assert logs.mean() == pytest.approx(0, abs=0.06)
+    gains = np.array([x[0, 0, 0] / 100 for x in values])
+    assert gains.min() == pytest.approx(0.5, abs=0.03)
+    assert gains.max() == pytest.approx(2.0, abs=0.06)
+    assert np.log(gains).mean() == pytest.approx(0, abs=0.08)
 
 
 def test_an_unknown_target_is_refused() -> None:

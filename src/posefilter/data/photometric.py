@@ -33,7 +33,7 @@ class ColorResponse:
         mixing: standard deviation of the off-diagonal entries of the mixing matrix.
         tint: standard deviation of the logarithm of each channel's gain.
         gamma: standard deviation of the logarithm of the exponent.
-        exposure: standard deviation of the logarithm of the gain that all channels share.
+        gain: range of the gain that all channels share, uniform in its logarithm.
         target: "image", or "object" for the pixels of the mask alone, as faded or retouched print
             has it.
         probability: share of samples that are changed.
@@ -43,7 +43,7 @@ class ColorResponse:
     mixing: float = 0.12
     tint: float = 0.12
     gamma: float = 0.2
-    exposure: float = 0.0
+    gain: tuple[float, float] = (1.0, 1.0)
     target: str = "image"
     probability: float = 1.0
 
@@ -58,7 +58,7 @@ class ColorResponse:
         mixing = mixing_matrix(rng.normal(size=6) * self.mixing)
         tint = np.diag(tint_gains(rng.normal(size=3) * self.tint))
         exponent = float(np.exp(rng.normal() * self.gamma))
-        gain = np.exp(rng.normal() * self.exposure)
+        gain = float(np.exp(rng.uniform(*np.log(self.gain))))
         if not chosen:
             return sample
         matrix = gain * tint @ mixing @ hue_rotation(hue)
