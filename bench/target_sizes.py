@@ -1,11 +1,11 @@
-"""Measure how large the target is in what a training sees, beside what it is tested on.
+"""Measure how large and bright the target is in what a training sees, and in what it is tested on.
 
     python bench/target_sizes.py [--count 200] TRAINING ... -- TEST ...
 
 TRAINING and TEST are settings of train.py that choose data, such as data=fat data.root=DIR
 data.object=009_gelatin_box data/augment=camera. Printed are percentiles of the target's visible
-pixels and of its distance, at the width that the network is given. A filter that never saw its
-object as large as a photograph shows it must extrapolate.
+pixels and of its distance, at the width that the network is given, and of its brightest channel. A
+filter that never saw its object as large or bright as a photograph shows it must extrapolate.
 """
 
 import argparse
@@ -31,20 +31,26 @@ def measure(loader: DataLoader, count: int) -> dict[str, list[float]]:
         count: Images to look at.
 
     Returns:
-        "pixels" of the images that show the target, "distance" [m] of its frame, and "missing", the
-        percentage of images without one pixel of it.
+        Of the images that show the target "pixels" and "brightness", the mean of its brightest
+        channel in [0, 1]; "distance" [m] of its frame, and "missing", the percentage of images
+        without one pixel of it.
     """
     pixels: list[int] = []
     distance: list[float] = []
+    brightness: list[float] = []
     for batch in loader:
         pixels += batch.mask.flatten(1).sum(1).tolist()
         distance += batch.camera_from_object[:, 2, 3].tolist()
+        shown = (batch.rgb * batch.mask).sum((2, 3)) / batch.mask.sum((2, 3))
+        brightness += shown.amax(1).tolist()
         if len(pixels) >= count:
             break
     seen = np.array(pixels[:count])
+    bright = np.array(brightness[:count])[seen > 0]
     return {
         "images": [len(seen)],
         "pixels": np.percentile(seen[seen > 0], PERCENTILES).round().tolist(),
+        "brightness": np.percentile(bright, PERCENTILES).round(2).tolist(),
         "distance": np.percentile(distance[:count], PERCENTILES).round(2).tolist(),
         "missing": [round(100 * float((seen == 0).mean()), 1)],
     }
