@@ -26,7 +26,6 @@ MARK, END = "<!-- table: {} -->", "<!-- end -->"
 HEAD = ["run", "object", "method", "augment", "warm start", "steps", "CPU min", "images", "ADD AUC"]
 HEAD += ["ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm", "outscored %"]
 CRACKER = "weights/003_cracker_box.ckpt"
-DRILL = "{root}/runs/drill_patch_camera/checkpoints/best.ckpt"
 TARGETS = (
     "002_master_chef_can",
     "003_cracker_box",
@@ -45,7 +44,7 @@ TARGETS = (
 )
 CLUTTER = ("021_bleach_cleanser", "052_extra_large_clamp")
 # camera as it was before it magnified the object
-FAR = "data.augment.steps.1.about=center data.augment.steps.1.zoom=[0.75,1.3]"
+FAR = "data.augment.steps.1.pivot=center data.augment.steps.1.zoom=[0.75,1.3]"
 SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
 
 
@@ -64,7 +63,8 @@ def plan() -> list[Run]:
 
     A first part was trained before `data/augment=camera` magnified the object: FAR puts that back.
     """
-    whole = "data/augment=camera_whole"
+    whole = "data/augment=camera_full_image"
+    after_drill = f"{whole} {_after(_best('drill_patch_camera'))}"
     short = "data/augment=camera data.limit_val=2 data.limit_test=2"
     pair = f"{FAR} data.limit_val=4 data.limit_test=20 {_after(CRACKER)}"
     few = f"{short} {FAR} {_after(CRACKER)}"
@@ -89,8 +89,8 @@ def plan() -> list[Run]:
         Run("foam_pose_camera", foam, "pose_pf", 150, few),
         Run("drill_pose_camera", drill, "pose_pf", 300, few),
         Run("drill_patch_camera", drill, "patch_pf", 4000, whole),
-        Run("mustard_patch_camera", mustard, "patch_pf", 1000, f"{whole} {_after(DRILL)}"),
-        Run("sugar_patch_camera", sugar, "patch_pf", 1000, f"{whole} {_after(DRILL)}"),
+        Run("mustard_patch_camera", mustard, "patch_pf", 1000, after_drill),
+        Run("sugar_patch_camera", sugar, "patch_pf", 1000, after_drill),
         far("gelatin_a", gelatin, 1000, _best("gelatin_pose_camera")),
         near("gelatin_b", gelatin, 600, _best("gelatin_a")),
         near("gelatin_c", gelatin, 500, _best("gelatin_b")),

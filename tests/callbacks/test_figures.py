@@ -221,7 +221,7 @@ def test_drawing_changes_nothing(tmp_path: Path) -> None:
     torch.manual_seed(3)
     np.random.seed(3)  # noqa: NPY002
     before, other = torch.get_rng_state(), np.random.get_state()[1].copy()  # type: ignore[index, union-attr]  # noqa: NPY002
-    method, figures = Told(), Figures(tmp_path, share=None)
+    method, figures = Told(), Figures(tmp_path, max_time_fraction=None)
     state = {name: value.clone() for name, value in method.state_dict().items()}
     torch.set_rng_state(before)
     trainer = Trainer(
@@ -240,7 +240,7 @@ def test_drawing_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    method, figures = Told(), Figures(tmp_path, every_n_validations=2, share=None)
+    method, figures = Told(), Figures(tmp_path, every_n_validations=2, max_time_fraction=None)
     trainer = Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
     )
@@ -260,7 +260,7 @@ def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_drawing_that_costs_too_much_is_put_off_until_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    method, figures = Told(), Figures(tmp_path, share=0.05)
+    method, figures = Told(), Figures(tmp_path, max_time_fraction=0.05)
     trainer = Trainer(
         accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
     )

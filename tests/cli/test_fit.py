@@ -88,7 +88,7 @@ REFUSED = {
     "model=patch_pf model/box_head=votes": ("model/box_head=pose or spread", "or model/net=patch"),
     "model=patch_pf loss/aux/pose=none model/pose_head=fragments": (
         "model/pose_head=fragments",
-        "loss/aux/pose=own_point",
+        "loss/aux/pose=surface_point",
     ),
 }
 

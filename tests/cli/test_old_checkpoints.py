@@ -1,9 +1,21 @@
 """A checkpoint of an earlier version is refused in one line that names what has changed."""
 
+import importlib
+
 import pytest
 
+from posefilter.cli.instantiate import accepted
 from posefilter.cli.recipe import check_recipe
+from posefilter.cli.renamed import ARGUMENTS
 from posefilter.errors import UserError
+
+CHAIN = {
+    "_target_": "posefilter.filters.refine.Chain",
+    "components": [
+        {"_target_": "posefilter.filters.refine.Rescore", "top_k": 20},
+        {"_target_": "posefilter.filters.refine.MeanShift", "rounds": 8},
+    ],
+}
 
 
 @pytest.mark.parametrize(
@@ -13,6 +25,10 @@ from posefilter.errors import UserError
         ({"choices": {}, "settings": {"rung": "c2_glimpse"}}, "rung is now ablation"),
         ({"choices": {"deviation": "pose_pf/ours"}, "settings": {}}, "deviation is now preset"),
         ({"choices": {"place_gradient": "flows"}, "settings": {}}, "is now model.detach_position"),
+        (
+            {"choices": {}, "settings": {"filter": {"refine": CHAIN}}},
+            "(filter.refine.components[1].rounds is now iterations)",
+        ),
     ],
 )
 def test_an_old_recipe_names_what_to_do(recipe: dict, told: str) -> None:
@@ -28,3 +44,11 @@ def test_an_old_recipe_names_what_to_do(recipe: dict, told: str) -> None:
 def test_todays_recipe_is_not_taken_for_an_old_one() -> None:
     recipe = {"choices": {"filter/initialize": "uniform"}, "settings": {"filter": {"steps": 3}}}
     assert check_recipe(recipe, "checkpoint=new.ckpt") == recipe
+
+
+@pytest.mark.parametrize("place", sorted(ARGUMENTS))
+def test_a_class_takes_its_arguments_by_todays_names_alone(place: str) -> None:
+    module, _, name = place.rpartition(".")
+    known, _ = accepted(getattr(importlib.import_module(f"posefilter.{module}"), name))
+    assert set(ARGUMENTS[place].values()) <= set(known)
+    assert not set(ARGUMENTS[place]) & set(known)

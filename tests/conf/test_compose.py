@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices, list_choices
 from posefilter.cli.checkpoints import build_method, recipe
-from posefilter.cli.command import compose_job, explain
+from posefilter.cli.command import compose_config, compose_job, explain
 from posefilter.cli.comparing import leaves
 from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import instantiate
@@ -266,6 +266,22 @@ def test_a_choice_that_is_not_there_names_the_nearest(tmp_path: Path) -> None:
     told = explain(caught.value, "train", CONF, [typed])
     assert told.startswith(f"{typed}: there is no such choice; did you mean 'unet'; there are ")
     assert "\n" not in told
+
+
+@pytest.mark.parametrize(
+    ("typed", "now"),
+    [
+        ("model=pose_pf filter.refine.pieces=[]", "filter.refine.components"),
+        ("model=patch_pf filter.estimate.rounds=3", "filter.estimate.iterations"),
+        ("model=patch_pf loss=chamfer loss.most=null", "loss.max_pixels"),
+        ("data/augment=camera data.augment.steps.1.about=center", "data.augment.steps.1.pivot"),
+    ],
+)
+def test_an_argument_by_its_old_name_is_answered_by_the_new_one(typed: str, now: str) -> None:
+    old = typed.split()[-1].partition("=")[0]
+    with pytest.raises(UserError) as caught:
+        compose_config("train", typed.split())
+    assert str(caught.value) == f"{old}: is now {now}"
 
 
 def test_a_preset_that_is_not_there_is_refused_though_a_method_need_not_have_one(

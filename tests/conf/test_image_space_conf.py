@@ -107,7 +107,7 @@ REMEDIES = [
     "filter/initialize=informed",
     "filter/propagate=learned_and_gaussian",
     "model.glimpse.size=6",
-    "loss=chamfer loss.most=null",
+    "loss=chamfer loss.max_pixels=null",
     "model/displacement=gated",
     "model.detach_position=false",
     "loss/schedule=three_stages_displacement",
@@ -142,7 +142,7 @@ def test_the_margin_of_the_displacement_scales_with_the_image(tmp_path: Path) ->
     "change",
     [
         "model/pose_head=absolute",
-        "model/pose_head=own_point loss/aux/pose=none",
+        "model/pose_head=surface_point loss/aux/pose=none",
         "filter/estimate=densest_pose",
         "filter/estimate=mean",
     ],
@@ -153,7 +153,7 @@ def test_each_pose_modification_is_one_choice(model: str, change: str, tmp_path:
 
 
 def test_fragments_are_not_left_untaught(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="loss/aux/pose=own_point"):
+    with pytest.raises(UserError, match="loss/aux/pose=surface_point"):
         build(tmp_path, "model=patch_pf", "loss/aux/pose=none")
     method = build(tmp_path, "model=patch_pf")
     step(method)
@@ -174,9 +174,9 @@ def test_the_memorization_test_shows_the_images_that_it_learned(tmp_path: Path) 
 SEVERAL = {  # ablations that are more than one change
     "s9_displacement_loss_and_position": 2,
     "m8_truncated": 2,
-    "pose_c11_own_point": 2,
+    "pose_c11_surface_point": 2,
     "pose_c15_noise": 2,
-    "pose_m14_own_point": 3,
+    "pose_m14_surface_point": 3,
     "pose_m18_noise": 2,
 }
 

@@ -62,11 +62,11 @@ def apply(step: Augment, seed: int, x: Sample | None = None) -> Sample:
 @pytest.mark.parametrize(
     "step",
     [
-        RollAndZoom(any_roll=1.0),
+        RollAndZoom(uniform_roll_probability=1.0),
         Window((32, 32)),
         PasteOccluder(1.0),
         Blank(),
-        RollAndZoom(zoom=(0.7, 2.2), about="object"),
+        RollAndZoom(zoom=(0.7, 2.2), pivot="object"),
         Compose([RollAndZoom(), Window((32, 48))]),
     ],
 )
@@ -86,25 +86,25 @@ def test_geometry_stays_true(step: Augment) -> None:
 
 
 def test_the_check_above_can_fail() -> None:
-    out = apply(RollAndZoom(any_roll=1.0), 3)
+    out = apply(RollAndZoom(uniform_roll_probability=1.0), 3)
     assert misfit(dataclasses.replace(out, camera_from_object=sample().camera_from_object))[1] > 0.1
 
 
 def test_a_zoom_about_the_object_leaves_its_middle_where_it_is() -> None:
-    def shift(about: str) -> float:
-        zoomed = apply(RollAndZoom(0.0, 0.0, (0.6, 0.6), about=about), 0, off_center)
+    def shift(pivot: str) -> float:
+        zoomed = apply(RollAndZoom(0.0, 0.0, (0.6, 0.6), pivot=pivot), 0, off_center)
         assert zoomed.mask.sum() < 0.5 * off_center.mask.sum()
         middles = [np.argwhere(x.mask).mean(0) for x in (off_center, zoomed)]
         return float(np.abs(middles[0] - middles[1]).max())
 
-    off_center = apply(Window((48, 48), anywhere=0.0), 2)
+    off_center = apply(Window((48, 48), uniform_probability=0.0), 2)
     assert shift("object") < 0.5 < 1.0 < shift("center")
-    with pytest.raises(UserError, match="about=corner"):
-        RollAndZoom(about="corner")
+    with pytest.raises(UserError, match="pivot=corner"):
+        RollAndZoom(pivot="corner")
 
 
 def test_a_window_shifts_the_principal_point() -> None:
-    out = apply(Window((32, 32), anywhere=0.0), 0)
+    out = apply(Window((32, 32), uniform_probability=0.0), 0)
     assert out.rgb.shape == (32, 32, 3)
     assert out.mask.any()
     left, top = sample().intrinsics[:2, 2] - out.intrinsics[:2, 2]

@@ -112,7 +112,12 @@ def test_a_prior_says_where() -> None:
 def test_without_any_depth_poses_start_a_meter_away() -> None:
     batch = images()
     none = draw_from_depth(
-        batch.depth * 0, batch.intrinsics, SPACE, 500, Generator().manual_seed(0), behind=(0.0, 0.0)
+        batch.depth * 0,
+        batch.intrinsics,
+        SPACE,
+        500,
+        Generator().manual_seed(0),
+        depth_offset=(0.0, 0.0),
     )
     torch.testing.assert_close(origin_of(none, CENTER)[..., 2], torch.ones(2, 500))
 
@@ -121,7 +126,7 @@ def test_relevance_draws_its_cells_and_little_else() -> None:
     weight = torch.zeros(2, 1, 5, 10)
     weight[0, 0, 1, 7] = 3.0
     weight[1, 0, :, 0] = 0.1
-    state = run(FromRelevance(anywhere=0.2), Pixels(), Map(weight))
+    state = run(FromRelevance(uniform_fraction=0.2), Pixels(), Map(weight))
     in_cell = (
         (state[0] >= torch.tensor([20.5, 3.5])) & (state[0] < torch.tensor([23.5, 7.5]))
     ).all(-1)
@@ -129,7 +134,7 @@ def test_relevance_draws_its_cells_and_little_else() -> None:
     assert float((state[1, :, 0] < 2.5).float().mean()) == pytest.approx(0.8 + 0.2 / 10, abs=0.02)
     chosen = state[0][in_cell]
     torch.testing.assert_close(chosen.mean(0), torch.tensor([22.0, 5.5]), atol=0.1, rtol=0)
-    empty = run(FromRelevance(anywhere=0.0), Pixels(), Map(torch.zeros(2, 1, 5, 10)))
+    empty = run(FromRelevance(uniform_fraction=0.0), Pixels(), Map(torch.zeros(2, 1, 5, 10)))
     assert empty.std(1).min() > 4  # no opinion: everywhere
 
 
@@ -140,7 +145,7 @@ def test_proposals_are_the_methods_own() -> None:
 
 
 def test_informed_starts_read_the_mask_in_training_only() -> None:
-    piece = Informed(UniformPixels(), share=0.5, around_px=0.0)
+    piece = Informed(UniformPixels(), object_fraction=0.5, sigma_px=0.0)
     seen, unseen = run(piece.train(), Pixels())
     on = overlaps_mask(images().mask, torch.stack([seen, unseen]))[0]
     assert on[:2000].all()

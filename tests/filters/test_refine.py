@@ -60,7 +60,7 @@ def off(belief: Belief) -> Tensor:
 
 def test_rescoring_bets_on_the_best_of_the_heaviest() -> None:
     method, belief = Peak(), belief_around(0.02)
-    found = Rescore(top=8, pixels=1024, sigma=0.004)(belief, truth(), method, Generator())
+    found = Rescore(top_k=8, pixels=1024, sigma=0.004)(belief, truth(), method, Generator())
     assert method.asked == [(9, 0.004, 1024)]
     for b in range(3):
         heavy = belief.log_weights[b].argsort(descending=True)[:8].tolist()
@@ -69,7 +69,7 @@ def test_rescoring_bets_on_the_best_of_the_heaviest() -> None:
         assert torch.equal(found.best[b], belief.poses[b, best])
     assert torch.equal(found.poses, belief.poses)
     assert not found.score.requires_grad
-    few = Rescore(top=100)(belief, truth(), method, Generator())
+    few = Rescore(top_k=100)(belief, truth(), method, Generator())
     assert (off(few) <= off(found) + 1e-6).all()
 
 
@@ -118,7 +118,7 @@ def test_images_climb_apart_and_alike() -> None:
 
 def test_a_mean_shift_finds_the_top() -> None:
     method, belief = Peak(), belief_around(0.015)
-    found = MeanShift(rounds=12, pairs=200, start=0.02, end=0.01)(
+    found = MeanShift(iterations=12, antithetic_pairs=200, start=0.02, end=0.01)(
         belief, truth(), method, Generator().manual_seed(0)
     )
     assert off(belief).min() > 0.005
@@ -141,7 +141,7 @@ class Bumpy(Peak):
 
 def test_a_mean_shift_walks_over_the_bumps_that_hold_a_climb() -> None:
     belief = belief_around(0.015)
-    shifted = MeanShift(rounds=12, pairs=500, start=0.02, end=0.01)(
+    shifted = MeanShift(iterations=12, antithetic_pairs=500, start=0.02, end=0.01)(
         belief, truth(), Bumpy(), Generator().manual_seed(0)
     )
     climbed = Gradient(steps=60, lr=1e-3, sigma=0.004)(
@@ -164,7 +164,9 @@ def test_a_mean_shift_on_even_ground_stays() -> None:
     assert (found.score == 0).all()
 
 
-@pytest.mark.parametrize("wrong", [{"rounds": 0}, {"pairs": 0}, {"start": 0.005}, {"end": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"iterations": 0}, {"antithetic_pairs": 0}, {"start": 0.005}, {"end": 0.0}]
+)
 def test_a_mean_shift_to_nowhere_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="mean shift needs"):
         MeanShift(**wrong)

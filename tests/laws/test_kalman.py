@@ -87,7 +87,7 @@ def run(
     reweight: Reweight | None = None,
     propagate: Propagate | None = None,
 ) -> Trace:
-    move = propagate or Chain([LearnedDisplacement(), Gaussian(factor=1.0)])
+    move = propagate or Chain([LearnedDisplacement(), Gaussian(noise_scale=1.0)])
     pieces = (
         Start(runs),
         Constant(MOVE),

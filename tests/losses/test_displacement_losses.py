@@ -38,8 +38,8 @@ def test_chamfer_equals_the_naive_double_loop(batch, model, make_trace) -> None:
 
 def test_all_mask_pixels_or_an_even_selection_count(batch, model, make_trace) -> None:
     trace = make_trace(f64([[[12.3, 7.6]]]))
-    everything, few = Chamfer(size=3, most=None), Chamfer(size=3, most=3)
-    assert everything(trace, batch, model) == Chamfer(size=3, most=16)(trace, batch, model)
+    everything, few = Chamfer(size=3, max_pixels=None), Chamfer(size=3, max_pixels=3)
+    assert everything(trace, batch, model) == Chamfer(size=3, max_pixels=16)(trace, batch, model)
     assert few(trace, batch, model) != everything(trace, batch, model)
 
 

@@ -104,7 +104,7 @@ def test_fragments_are_scored_by_the_true_fragment_and_the_position_in_it(
     said = Fragments(share.log(), place, centers, torch.tensor(0.1))
     trace = make_trace(places(ON, OFF), fragments=said)
     want = -math.log(0.2) + 0.3 * 0.4  # |0.03| + |-0.01| radii are 0.4 reaches
-    assert SurfacePointLoss(fragment_weight=0.5, within=0.3)(
+    assert SurfacePointLoss(fragment_weight=0.5, offset_weight=0.3)(
         trace, batch, model
     ).item() == pytest.approx(0.5 * want, abs=1e-6)
 

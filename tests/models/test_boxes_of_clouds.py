@@ -48,8 +48,8 @@ def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
     weights = torch.stack([uneven, torch.full((7,), 1 / 7)])
     trace = made(method, batch, places, weights, torch.zeros(7, 4))
 
-    def box(beyond: float) -> list[list[float]]:
-        found: list[list[float]] = SpreadBox(size=3, beyond=beyond)(
+    def box(quantile: float) -> list[list[float]]:
+        found: list[list[float]] = SpreadBox(size=3, quantile=quantile)(
             trace, batch, method.model
         ).tolist()
         return found

@@ -42,7 +42,7 @@ def one_line(refusal: pytest.ExceptionInfo[UserError], *words: str) -> None:
 @pytest.mark.parametrize(
     "choice", ["model=pose_pf", "model=pose_pf variant=paper", "model=cnn_patch", "model=downsized"]
 )
-def test_agreement_is_refused_where_no_particle_knows_its_own_point_of_the_object(
+def test_agreement_is_refused_where_no_particle_knows_its_surface_point_of_the_object(
     choice: str, tmp_path: Path
 ) -> None:
     with pytest.raises(UserError) as refusal:
@@ -203,7 +203,7 @@ def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(
         "model=patch_pf filter.estimate.options=1",
         "model=patch_pf filter.estimate.hypotheses=1",
         "model=patch_pf filter.estimate.options=100",
-        "model=patch_pf filter.estimate.rounds=0",
+        "model=patch_pf filter.estimate.iterations=0",
         "model=patch_pf model.net.layers=1",
         "model=cnn_patch model.net.hidden=0",
         "model=patch_pf model.glimpse.spacing=2",
@@ -268,7 +268,7 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
         ),
         (
             "model=patch_pf model/pose_head=none loss/aux/pose=none",
-            ("model=patch_pf", "model/pose_head=absolute or own_point"),
+            ("model=patch_pf", "model/pose_head=absolute or surface_point"),
         ),
         (
             "model=cnn_patch loss/aux/likelihood=quality",
@@ -279,8 +279,8 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
             ),
         ),
         (
-            "model=downsized loss/aux/pose=own_point",
-            ("loss/aux/pose=own_point", "model=downsized", "loss/aux/pose=none"),
+            "model=downsized loss/aux/pose=surface_point",
+            ("loss/aux/pose=surface_point", "model=downsized", "loss/aux/pose=none"),
         ),
     ],
 )

@@ -40,7 +40,7 @@ def test_vectors_and_spared_layers_take_adamws_step() -> None:
     }
     ours = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
     theirs = {name: torch.nn.Parameter(value.clone()) for name, value in start.items()}
-    muon = Muon(ours.items(), lr=0.02, adam_lr=0.01, weight_decay=0.1, spared=["out"])
+    muon = Muon(ours.items(), lr=0.02, adam_lr=0.01, weight_decay=0.1, adam_layers=["out"])
     adamw = torch.optim.AdamW(theirs.values(), 0.01, weight_decay=0.1)
     for _ in range(3):
         for name in start:

@@ -46,7 +46,7 @@ def working(initialize: object = None) -> PosePF:
     )
     method = PosePF(
         PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
-        CandidatePoses(each=6, proposed=4, particles=6, sigma=SIGMA),
+        CandidatePoses(candidates_per_kind=6, proposals=4, particles=6, sigma=SIGMA),
         ObjectCoordinateNet((16, 24, 32, 32), fragments=16, features=4),
         filter=ParticleFilter(100, 6, *pieces, first_particles=200),
         loss=Contrast(),

@@ -198,13 +198,13 @@ def test_pixels_are_drawn_about_the_origin_or_the_center() -> None:
         ray = torch.nn.functional.normalize(rays(wanted, K), dim=-1) @ pose()[0, 0, :3, :3]
         torch.testing.assert_close(points.ray[0, 0], ray[0])
     with pytest.raises(UserError, match="choose origin or center"):
-        PaperLikelihood(about="middle")
+        PaperLikelihood(anchor="middle")
 
 
 @pytest.mark.parametrize(("about", "anchor"), [("origin", torch.zeros(3)), ("center", CENTER)])
 def test_the_papers_likelihood_is_a_sum_over_points(about: str, anchor: torch.Tensor) -> None:
     rgb, depth = image()
-    net = PaperLikelihood(about=about)
+    net = PaperLikelihood(anchor=about)
     noise = torch.randn(1, 1, 30, 2, generator=torch.Generator().manual_seed(5))
     points = sample_points(
         flatten_images(rgb, depth, K), pose(), CENTER, RADIUS, noise, anchor=anchor

@@ -50,9 +50,9 @@ def test_diagnostics_are_found(run: Path) -> None:
     assert found["diagnostics/pairwise_cosine"] == (0.95, True)
     assert found["diagnostics/off_frame/last"] == (0.625, True)  # the last step's
     assert found["diagnostics/offset_r2"] == (0.5, False)
-    assert found["missed_share"] == (0.25, True)
+    assert found["missed_fraction"] == (0.25, True)
     assert found["belief/coverage_90"] == (41.0, True)
-    assert found["fallen"] == (20.0, True)
+    assert found["val_score_drop"] == (20.0, True)
     assert found["particles_on_object"] == (0.75, False)
     assert "diagnostics/auroc" not in found
 

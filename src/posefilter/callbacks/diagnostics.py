@@ -42,15 +42,18 @@ class Diagnostics(TraceCallback):
     Args:
         folder: Where figures and animations are written; nowhere if null.
         images: How many images are drawn.
-        share: Part of the validations' time that the curves may take; no limit if null.
+        max_time_fraction: Part of the validations' time that the curves may take; no limit if null.
     """
 
     def __init__(
-        self, folder: str | Path | None = None, images: int = 2, share: float | None = 0.005
+        self,
+        folder: str | Path | None = None,
+        images: int = 2,
+        max_time_fraction: float | None = 0.005,
     ) -> None:
         super().__init__(folder)
         self.images = images
-        self.budget = Budget(share)
+        self.budget = Budget(max_time_fraction)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""

@@ -41,8 +41,9 @@ class Figures(TraceCallback):
         best: The best images that are kept.
         worst: The worst images that are kept.
         exclude: Names of figures that are not drawn.
-        share: Largest fraction of the validations' time that drawing takes; None: no limit. Drawing
-            that would take more is put off to a later validation, or to the end of the training.
+        max_time_fraction: Largest fraction of the validations' time that drawing takes; None: no
+            limit. Drawing that would take more is put off to a later validation, or to the end of
+            the training.
 
     Raises:
         UserError: `exclude` names a figure that does not exist.
@@ -56,7 +57,7 @@ class Figures(TraceCallback):
         best: int = 10,
         worst: int = 10,
         exclude: Sequence[str] = (),
-        share: float | None = 0.04,
+        max_time_fraction: float | None = 0.04,
     ) -> None:
         unknown = sorted(set(exclude) - set(DRAWINGS))
         if unknown:
@@ -70,7 +71,7 @@ class Figures(TraceCallback):
             {"first": first, "best": best, "worst": worst},
         )
         self.drawings = {name: draw for name, draw in DRAWINGS.items() if name not in exclude}
-        self.budget = Budget(share)
+        self.budget = Budget(max_time_fraction)
         self._validations = 0
         self._selection = ImageSelection(**self.counts)
         self._example: tuple[KeptImage, Trace, Batch] | None = None

@@ -21,17 +21,20 @@ class FilterHealth(TraceCallback):
 
     Args:
         folder: Where the figure is written too; None: nowhere.
-        most: Largest number of iterations that are logged as scalars, evenly chosen.
-        share: Largest fraction of the validations' time that the figure takes; None: no limit.
-            Drawing that would take more is put off to a later validation.
+        max_iterations: Largest number of iterations that are logged as scalars, evenly chosen.
+        max_time_fraction: Largest fraction of the validations' time that the figure takes; None: no
+            limit. Drawing that would take more is put off to a later validation.
     """
 
     def __init__(
-        self, folder: str | Path | None = None, most: int = 20, share: float | None = 0.005
+        self,
+        folder: str | Path | None = None,
+        max_iterations: int = 20,
+        max_time_fraction: float | None = 0.005,
     ) -> None:
         super().__init__(folder)
-        self.most = most
-        self.budget = Budget(share)
+        self.max_iterations = max_iterations
+        self.budget = Budget(max_time_fraction)
         self._sums: dict[str, torch.Tensor] = {}
         self._images = 0
 
@@ -56,7 +59,7 @@ class FilterHealth(TraceCallback):
         if not curves or not trainer.is_global_zero:
             return
         for logger in trainer.loggers:
-            logger.log_metrics(name_scalars(curves, self.most), trainer.global_step)
+            logger.log_metrics(name_scalars(curves, self.max_iterations), trainer.global_step)
         if self.budget.allows():
             with self.budget.spend():
                 picture = draw_health(

@@ -84,14 +84,14 @@ def get_writers(trainer: Trainer) -> list[FileWriter]:
 
 
 class Budget:
-    """Lets drawing take at most a share of the time that validations take.
+    """Lets drawing take at most a fraction of the time that validations take.
 
-    share: None for no limit. The first drawing is always allowed, since nobody knows what it will
-    cost.
+    max_fraction: None for no limit. The first drawing is always allowed, since nobody knows what
+    it will cost.
     """
 
-    def __init__(self, share: float | None) -> None:
-        self.share = share
+    def __init__(self, max_fraction: float | None) -> None:
+        self.max_fraction = max_fraction
         self.validated, self.drawn, self.last = 0.0, 0.0, 0.0
         self._start = 0.0
 
@@ -104,11 +104,11 @@ class Budget:
         self.validated += time.perf_counter() - self._start
 
     def allows(self) -> bool:
-        """Tell whether another drawing, as dear as the last one, stays within the share."""
+        """Tell whether another drawing, as dear as the last one, stays within the limit."""
         return (
-            self.share is None
+            self.max_fraction is None
             or self.last == 0
-            or self.drawn + self.last <= self.share * self.validated
+            or self.drawn + self.last <= self.max_fraction * self.validated
         )
 
     @contextmanager

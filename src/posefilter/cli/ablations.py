@@ -118,15 +118,15 @@ ABLATIONS = (
         ("filter/resample=systematic",),
     ),
     Ablation(
-        "pose_c11_own_point",
+        "pose_c11_surface_point",
         "Also a pose head on the particle's own object point, with a loss of its own.",
         "c10_resample",
-        ("model/pose_head=own_point", "loss/aux/pose=own_point"),
+        ("model/pose_head=surface_point", "loss/aux/pose=surface_point"),
     ),
     Ablation(
         "pose_c12_loss",
         "Also a loss on the pose that is weighted by its confidence.",
-        "pose_c11_own_point",
+        "pose_c11_surface_point",
         ("loss=confidence",),
     ),
     Ablation(
@@ -211,7 +211,7 @@ ABLATIONS = (
         "m7_informed",
         "Working, with training particles that start anywhere.",
         "working",
-        ("model.train_filter.initialize.share=0.0",),
+        ("model.train_filter.initialize.object_fraction=0.0",),
     ),
     Ablation(
         "m8_truncated",
@@ -243,7 +243,7 @@ ABLATIONS = (
         "m13_scheduler", "Working, with a constant learning rate.", "working", ("scheduler=none",)
     ),
     Ablation(
-        "pose_m14_own_point",
+        "pose_m14_surface_point",
         "Working, with a pose head without a surface point (so that no agreement is possible).",
         "working",
         ("model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax"),
@@ -259,7 +259,7 @@ ABLATIONS = (
         "pose_m17_fragments",
         "Working, with the own point predicted directly.",
         "working",
-        ("model/pose_head=own_point",),
+        ("model/pose_head=surface_point",),
     ),
     Ablation(
         "pose_m18_noise",

@@ -30,6 +30,7 @@ from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.preflight import check_files
+from posefilter.cli.renamed import rename_argument
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import Scope, installed, trust
@@ -76,7 +77,9 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
-        arguments = loosen(with_resumed(bracketed(arguments)), name) + logging_for(arguments)
+        arguments = with_resumed(bracketed(arguments))
+        check_choices(arguments, conf)  # a resumed run's too
+        arguments = loosen(arguments, name) + logging_for(arguments)
         sys.argv = [sys.argv[0], *arguments]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
             _task(name)
@@ -228,8 +231,13 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         found = re.search(r"Could not override '([^']+)'", text)
         if found:
             key = found[1]
-            nearest = near(key, known_keys(name, conf, arguments, key))
-            return f"{key}: there is no such setting{nearest}"
+            cfg = compose_without(key, name, conf, arguments)
+            section, _, last = key.rpartition(".")
+            target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
+            new = rename_argument(target, last)
+            if new is not None:
+                return f"{key}: is now {section}.{new}"
+            return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: is missing; give {error.full_key}=..."
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
@@ -253,14 +261,20 @@ def near(wrong: str, known: list[str]) -> str:
     return f"; {section} has {', '.join(own)}" if own else f"; {section} has no settings"
 
 
-def known_keys(name: str, conf: Path, arguments: list[str], wrong: str) -> list[str]:
-    """Return every key and group that would have been valid, nearest depth first."""
+def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> DictConfig:
+    """Compose a command's settings without the argument that sets a wrong key; without any where
+    others are wrong too.
+    """
     good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
     with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
         try:
-            cfg = compose(name, good, return_hydra_config=True)
+            return compose(name, good, return_hydra_config=True)
         except HydraException:
-            cfg = compose(name, return_hydra_config=True)
+            return compose(name, return_hydra_config=True)
+
+
+def known_keys(cfg: DictConfig, wrong: str) -> list[str]:
+    """Return every key and group that would have been valid, nearest depth first."""
     groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra/")]
     keys: list[str] = []
 

@@ -169,8 +169,8 @@ def parse_module(module: str) -> dict[str, ast.ClassDef | ast.ImportFrom]:
 
 
 def typed_key(tree: Any, where: str) -> str:
-    """Return a place in the model's tree as one types it: `model.filter.initialize.behind` is
-    `initialize.behind`, if that is what it refers to.
+    """Return a place in the model's tree as one types it: `model.filter.initialize.depth_offset` is
+    `initialize.depth_offset`, if that is what it refers to.
 
     Args:
         tree: The whole configuration, plain and not resolved.

@@ -14,6 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from posefilter.cli.renamed import rename_argument
 from posefilter.cli.trust import (
     Scope,
     check_name,
@@ -179,6 +180,9 @@ def check_arguments(
     for name in arguments:  # before any value: a misspelt name often leaves a wrong value elsewhere
         if name not in known and not others:
             label = getattr(target, "__name__", str(target))
+            new = rename_argument(f"{target.__module__}.{label}", name)
+            if new is not None:
+                raise UserError(f"{where}.{name}: is now {new}")
             raise UserError(f"{where}.{name}: {label} takes no such setting{hint(name, known)}")
     for name, value in arguments.items():
         if name in known and not fits(value, known[name].annotation):

@@ -90,11 +90,6 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
     choices, settings = recipe["choices"], recipe["settings"]
     if not (isinstance(choices, dict) and isinstance(settings, dict)):
         raise UserError(f"{said}: its recipe's choices and settings should be mappings")
-    old = find_renamed(recipe)
-    if old is not None:
-        raise UserError(
-            f"{said}: was written by an earlier version ({old[0]} is now {old[1]}); train it again"
-        )
     foreign = sorted(str(key) for key in settings if key in NOT_KEPT)
     if foreign:
         raise UserError(
@@ -106,6 +101,11 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
         if count > _MOST_NODES:
             raise UserError(f"{said}: its recipe holds more than {_MOST_NODES} settings")
         _check_value(path, value, said)
+    old = find_renamed(recipe)
+    if old is not None:
+        raise UserError(
+            f"{said}: was written by an earlier version ({old[0]} is now {old[1]}); train it again"
+        )
     if not all(isinstance(choice, str) and _KEY.fullmatch(choice) for choice in choices.values()):
         raise UserError(f"{said}: its recipe's choices should be names")
     settings = _without_selects(settings, settings)

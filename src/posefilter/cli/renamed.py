@@ -71,6 +71,9 @@ _CHOICES = {
     "loss/aux/displacement": {
         "center": "towards model.aux_losses.displacement.loss.label.target=center"
     },
+    "loss/aux/pose": {"own_point": "surface_point"},
+    "model/pose_head": {"own_point": "surface_point"},
+    "data/augment": {"whole": "strong_full_image", "camera_whole": "camera_full_image"},
     "loss/schedule": {
         "three": "three_stages",
         "three_motion": "three_stages_displacement",
@@ -94,6 +97,8 @@ _CHOICES = {
         "c5_lesson": "c5_displacement_loss",
         "c6_place": "c6_position",
         "c8_short": "c8_truncated",
+        "pose_c11_own_point": "pose_c11_surface_point",
+        "pose_m14_own_point": "pose_m14_surface_point",
         "pose_c16_held": "pose_c16_gated",
         "box_c12_held": "box_c12_gated",
         "m1_normalisation": "m1_normalization",
@@ -103,6 +108,46 @@ _CHOICES = {
         "m12_held": "m12_gated",
         "m13_rate": "m13_scheduler",
     },
+}
+# arguments of classes, by the class's place below posefilter
+ARGUMENTS = {
+    "filters.propagate.Chain": {"pieces": "components"},
+    "filters.propagate.Gaussian": {"factor": "noise_scale"},
+    "filters.propagate.HalfTurns": {"share": "probability"},
+    "filters.propagate.AxisTurns": {
+        "share": "probability",
+        "any_angle": "uniform_angle_probability",
+    },
+    "filters.refine.Chain": {"pieces": "components"},
+    "filters.refine.Rescore": {"top": "top_k"},
+    "filters.refine.MeanShift": {"rounds": "iterations", "pairs": "antithetic_pairs"},
+    "filters.agreement.Agreement": {"rounds": "iterations"},
+    "filters.initialize.FromDepth": {"behind": "depth_offset"},
+    "filters.initialize.FromRelevance": {"anywhere": "uniform_fraction"},
+    "filters.initialize.Informed": {
+        "otherwise": "initializer",
+        "share": "object_fraction",
+        "around_px": "sigma_px",
+    },
+    "models.candidate_samplers.CandidatePoses": {
+        "each": "candidates_per_kind",
+        "proposed": "proposals",
+        "own_level": "persistent_sigma_probability",
+    },
+    "models.candidate_samplers.LabeledRays": {"past": "margin_behind"},
+    "models.box_heads.SpreadBox": {"beyond": "quantile"},
+    "models.muon.Muon": {"spared": "adam_layers"},
+    "nets.paper_likelihood.PaperLikelihood": {"about": "anchor"},
+    "losses.displacement.Chamfer": {"most": "max_pixels"},
+    "losses.rgbd_chamfer.RgbdChamfer": {"most": "max_pixels"},
+    "losses.pose_loss.SurfacePointLoss": {"within": "offset_weight"},
+    "labels.paper_points.PaperPoints": {"on": "surface_label", "behind": "behind_label"},
+    "data.augmentation.RollAndZoom": {"about": "pivot", "any_roll": "uniform_roll_probability"},
+    "data.augmentation.Window": {"anywhere": "uniform_probability"},
+    "data.augmentation.Blank": {"most": "max_rectangles"},
+    "callbacks.health.FilterHealth": {"most": "max_iterations", "share": "max_time_fraction"},
+    "callbacks.diagnostics.Diagnostics": {"share": "max_time_fraction"},
+    "callbacks.figures.Figures": {"share": "max_time_fraction"},
 }
 _BUDGET = "the preset, with its size apart: preset/size="
 
@@ -156,4 +201,30 @@ def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
     for name in map(str, old):
         if name in GROUPS or name in KEYS:
             return name, _rename_key(name)
-    return None
+    return _find_argument(recipe.get("settings"), "")
+
+
+def rename_argument(target: object, name: str) -> str | None:
+    """Return what an argument of a class is called today; None where its name has not changed.
+
+    Args:
+        target: The class, as `_target_` names it.
+        name: The argument, as it was called before.
+    """
+    return ARGUMENTS.get(str(target).removeprefix("posefilter."), {}).get(name)
+
+
+def _find_argument(node: Any, place: str) -> tuple[str, str] | None:
+    """Return the first argument with a name of before in settings, and today's."""
+    if isinstance(node, list):
+        pairs = [(f"{place}[{i}]", value) for i, value in enumerate(node)]
+    elif isinstance(node, Mapping):
+        for name in map(str, node):
+            new = rename_argument(node.get("_target_"), name)
+            if new is not None:
+                return f"{place}.{name}", new
+        pairs = [(f"{place}.{key}" if place else str(key), value) for key, value in node.items()]
+    else:
+        return None
+    found = (_find_argument(value, at) for at, value in pairs)
+    return next((one for one in found if one is not None), None)

@@ -38,26 +38,29 @@ class RollAndZoom:
     """Turn the camera about its optical axis and change its focal length: both are exact for RGB-D
     images.
 
-    roll: spread of the usual roll [rad]; any_roll: share of samples with a uniform roll; zoom:
-    range of the factor on the focal length; about: the point of the image that stays, `center` (the
-    principal point) or `object` (the middle of its mask, so that it may be magnified and stay in
-    the frame). A draw that would push most of the object out of the frame is given up.
+    roll: spread of the usual roll [rad]; uniform_roll_probability: that it is uniform instead;
+    zoom: range of the factor on the focal length; pivot: the point of the image that stays,
+    `center` (the principal point) or `object` (the middle of its mask, so that it may
+    be magnified and stay in the frame). A draw that would push most of the object out of the frame
+    is given up.
     """
 
     roll: float = 0.15
-    any_roll: float = 0.25
+    uniform_roll_probability: float = 0.25
     zoom: tuple[float, float] = (0.75, 1.3)
     keep: float = 0.7
-    about: str = "center"
+    pivot: str = "center"
 
     def __post_init__(self) -> None:
-        if self.about not in ("center", "object"):
-            raise UserError(f"data.augment: about={self.about}: choose center or object")
+        if self.pivot not in ("center", "object"):
+            raise UserError(f"data.augment: pivot={self.pivot}: choose center or object")
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as the turned and zoomed camera sees it."""
         angle = (
-            rng.uniform(-np.pi, np.pi) if rng.random() < self.any_roll else rng.normal() * self.roll
+            rng.uniform(-np.pi, np.pi)
+            if rng.random() < self.uniform_roll_probability
+            else rng.normal() * self.roll
         )
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
         c, s = np.cos(angle), np.sin(angle)
@@ -65,7 +68,7 @@ class RollAndZoom:
         K_new = np.diag([zoom, zoom, 1.0]) @ K
         K_new[:2, 2] = K[:2, 2]
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        if self.about == "object" and sample.mask.any():
+        if self.pivot == "object" and sample.mask.any():
             middle = np.append(np.argwhere(sample.mask).mean(0)[::-1], 1.0)  # u, v, 1 [px]
             K_new[:2, 2] += middle[:2] - (K_new @ turn @ np.linalg.inv(K) @ middle)[:2]
         warp = (K_new @ turn @ np.linalg.inv(K))[:2]
@@ -92,11 +95,12 @@ class Window:
     from anywhere.
 
     A network that reads whole images learns as well from windows, and several times as fast.
-    size: (height, width) [px], multiples of 32; anywhere: share drawn without regard to the object.
+    size: (height, width) [px], multiples of 32; uniform_probability: that a window is drawn
+    without regard to the object.
     """
 
     size: tuple[int, int] = (160, 192)
-    anywhere: float = 0.1
+    uniform_probability: float = 0.1
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as a camera with a smaller chip sees it."""
@@ -104,7 +108,7 @@ class Window:
         h, w = min(self.size[0], height), min(self.size[1], width)
         top, left = rng.integers(height - h + 1), rng.integers(width - w + 1)
         rows, cols = np.nonzero(sample.mask)
-        if len(rows) and rng.random() >= self.anywhere:
+        if len(rows) and rng.random() >= self.uniform_probability:
             at = rng.integers(len(rows))
             top = int(np.clip(rows[at] - rng.integers(h // 8, h - h // 8), 0, height - h))
             left = int(np.clip(cols[at] - rng.integers(w // 8, w - w // 8), 0, width - w))
@@ -170,14 +174,14 @@ class PasteOccluder:
 class Blank:
     """Lose rectangles of depth (holes) or paint rectangles of color (stickers, glare)."""
 
-    most: int = 5
+    max_rectangles: int = 5
     size: tuple[float, float] = (0.02, 0.18)
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
-        """Return the sample with up to `most` rectangles blanked."""
+        """Return the sample with up to `max_rectangles` rectangles blanked."""
         rgb, depth = sample.rgb.copy(), sample.depth.copy()
         height, width = depth.shape
-        for _ in range(rng.integers(0, self.most + 1)):
+        for _ in range(rng.integers(0, self.max_rectangles + 1)):
             h, w = (rng.uniform(*self.size, 2) * width).astype(int) + 1
             top, left = rng.integers(height), rng.integers(width)
             if rng.random() < 0.5:

@@ -44,7 +44,7 @@ class Agreement:
     Args:
         scale_m: Scale of the residuals of inliers [m].
         hypotheses: Number of hypotheses of each kind.
-        rounds: Iterations of the refit.
+        iterations: Iterations of the refit.
         options: Fragments considered for each particle.
         counts: How many particles count as independent observations.
     """
@@ -55,7 +55,7 @@ class Agreement:
         self,
         scale_m: float = 0.015,
         hypotheses: int = 64,
-        rounds: int = 8,
+        iterations: int = 8,
         options: int = 3,
         counts: float = 8.0,
     ) -> None:
@@ -66,7 +66,7 @@ class Agreement:
             )
         self.scale_m = scale_m
         self.hypotheses = hypotheses
-        self.rounds = rounds
+        self.iterations = iterations
         self.options = options
         self.counts = counts
 
@@ -98,8 +98,8 @@ class Agreement:
         fit = self._inliers(hypotheses, object_point[:, None], point[:, None], 2 * self.scale_m)
         support = (weight[:, None] * (share[:, None] * fit).sum(-1)).sum(-1)
         best = hypotheses[torch.arange(len(support), device=support.device), support.argmax(1)]
-        for i in range(self.rounds):
-            scale = self.scale_m * 2 ** (2 - 2 * i / max(self.rounds - 1, 1))
+        for i in range(self.iterations):
+            scale = self.scale_m * 2 ** (2 - 2 * i / max(self.iterations - 1, 1))
             fit, option = (share * self._inliers(best, object_point, point, scale)).max(-1)
             chosen = object_point.gather(2, option[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
             best = fit_rigid(chosen, point, weight * fit)

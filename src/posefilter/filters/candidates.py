@@ -54,47 +54,50 @@ def sample_around_truth(
     batch: Batch,
     model: ObjectModel,
     space: PoseSpace,
-    each: int,
+    per_kind: int,
     sigma: Sequence[float],
     generator: Generator,
     turns: Propagate,
 ) -> Tensor:
     """Draw the candidates that need the truth.
 
-    The truth itself comes first. Then follow, `each` of them unless stated otherwise: perturbations
-    of the truth at every scale; poses from depth on the object; poses from depth anywhere; random
-    rotations near the true center (`each // 2`); turns of the truth, slightly perturbed.
+    The truth itself comes first. Then follow, `per_kind` of them unless stated otherwise:
+    perturbations of the truth at every scale; poses from depth on the object; poses from depth
+    anywhere; random rotations near the true center (`per_kind // 2`); turns of the truth, slightly
+    perturbed.
 
     Args:
         batch: Images with their true poses.
         model: The object.
         space: The space of the poses.
-        each: Candidates of a kind.
+        per_kind: Candidates of a kind.
         sigma: Lowest and highest noise level [m]; levels are drawn log-uniformly.
         generator: Source of randomness.
         turns: The kernel that turns the truth, such as half turns of every particle.
 
     Returns:
-        Poses (B, 1 + 4 each + each // 2, 4, 4), camera_from_object.
+        Poses (B, 1 + 4 per_kind + per_kind // 2, 4, 4), camera_from_object.
     """
     B = len(batch.rgb)
     device = batch.rgb.device
     truth = batch.camera_from_object[:, None]
     center = model.center.to(device)
     low, high = math.log(sigma[0]), math.log(sigma[1])
-    size = torch.exp(torch.empty(B, each, device=device).uniform_(low, high, generator=generator))
-    copies = truth.expand(B, each, 4, 4)
+    size = torch.exp(
+        torch.empty(B, per_kind, device=device).uniform_(low, high, generator=generator)
+    )
+    copies = truth.expand(B, per_kind, 4, 4)
     nearby = perturb(copies, size * 0.6, space, generator)
-    on_object = sample_from_depth(batch, space, each, generator, batch.mask.float() + 0.02)
-    anywhere = sample_from_depth(batch, space, each, generator)
-    half = each // 2
+    on_object = sample_from_depth(batch, space, per_kind, generator, batch.mask.float() + 0.02)
+    anywhere = sample_from_depth(batch, space, per_kind, generator)
+    half = per_kind // 2
     shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator, turn=0.0)
     rotated = pose_about(
         random_rotation(B, half, generator=generator, device=device),
         origin_of(shifted, center),
         center,
     )
-    still = copies.new_zeros(B, each, space.dimensions)
+    still = copies.new_zeros(B, per_kind, space.dimensions)
     turned = turns(copies, still, Step(0, 1, size[:, 0]), space, generator)
     flipped = perturb(turned, size * 0.3, space, generator)
     return torch.cat([truth, nearby, on_object, anywhere, rotated, flipped], dim=1)

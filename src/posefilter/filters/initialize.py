@@ -31,7 +31,7 @@ def draw_from_depth(
     count: int,
     generator: Generator,
     prior: Tensor | None = None,
-    behind: tuple[float, float] = (0.1, 0.9),
+    depth_offset: tuple[float, float] = (0.1, 0.9),
 ) -> Tensor:
     """Draw poses at measured points: uniform rotations, centers on the ray behind the surface.
 
@@ -45,7 +45,7 @@ def draw_from_depth(
         count: Poses of an image.
         generator: Source of randomness.
         prior: (B, 1, H, W) >= 0, weight of each pixel; uniform if None.
-        behind: Range of the center's distance behind the surface, in radii; drawn uniformly.
+        depth_offset: Range of the center's distance behind the surface, in radii; drawn uniformly.
 
     Returns:
         Poses (B, count, 4, 4), camera_from_object [m].
@@ -60,7 +60,7 @@ def draw_from_depth(
     )
     depth_at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
     ray = rays(cell.to(depth.dtype), K)
-    push = torch.empty_like(depth_at).uniform_(*behind, generator=generator) * space.radius
+    push = torch.empty_like(depth_at).uniform_(*depth_offset, generator=generator) * space.radius
     center = ray * depth_at + ray / ray.norm(dim=-1, keepdim=True) * push
     R = random_rotation(*center.shape[:2], generator=generator, device=depth.device)
     return pose_about(R, center, depth.new_tensor(space.center))
@@ -108,13 +108,13 @@ class FromDepth:
     """Poses at measured points of the image, with uniform rotations.
 
     Args:
-        behind: Range of the center's distance behind the surface, in radii; drawn uniformly.
+        depth_offset: Range of the center's distance behind the surface, in radii; drawn uniformly.
     """
 
     requires: ClassVar[Capabilities] = ("pose_space",)
 
-    def __init__(self, behind: tuple[float, float] = (0.1, 0.9)) -> None:
-        self.behind = (float(behind[0]), float(behind[1]))
+    def __init__(self, depth_offset: tuple[float, float] = (0.1, 0.9)) -> None:
+        self.depth_offset = (float(depth_offset[0]), float(depth_offset[1]))
 
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
@@ -122,7 +122,12 @@ class FromDepth:
         """Return (B, N, 4, 4) [m]."""
         space = require_pose_space(method, "from_depth")
         return draw_from_depth(
-            batch.depth, batch.intrinsics, space, particles, generator, behind=self.behind
+            batch.depth,
+            batch.intrinsics,
+            space,
+            particles,
+            generator,
+            depth_offset=self.depth_offset,
         )
 
 
@@ -130,13 +135,14 @@ class FromRelevance:
     """Pixels drawn from the scene's relevance map (the paper, section 6, idea 4).
 
     Args:
-        anywhere: Share of the uniform distribution mixed in, so that every pixel can be drawn.
+        uniform_fraction: Weight of the uniform distribution that is mixed in, so that every
+            pixel can be drawn.
     """
 
     requires: ClassVar[Capabilities] = ("pixel_space", "relevance")
 
-    def __init__(self, anywhere: float = 0.1) -> None:
-        self.anywhere = anywhere
+    def __init__(self, uniform_fraction: float = 0.1) -> None:
+        self.uniform_fraction = uniform_fraction
 
     def __call__(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
@@ -150,7 +156,9 @@ class FromRelevance:
             )
         weight = scene.relevance[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
-        weight = (1 - self.anywhere) * weight + max(self.anywhere, 1e-6) / weight[0].numel()
+        weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
+            0
+        ].numel()
         cell = draw_cells(weight, particles, generator)
         H, W = batch.rgb.shape[-2:]
         size = weight.new_tensor([W / weight.shape[2], H / weight.shape[1]])
@@ -177,29 +185,32 @@ class FromProposals:
 
 
 class Informed(nn.Module):
-    """In training, draw a share of the pixels around the object (the paper, section 4.3).
+    """In training, draw a fraction of the pixels around the object (the paper, section 4.3).
 
     The mask is ground truth, so it is used in training mode only. In evaluation mode all particles
-    come from `otherwise`.
+    come from `initializer`.
 
     Args:
-        otherwise: Draws all other particles.
-        share: Share of the particles drawn around the object.
-        around_px: Standard deviation of their distance from the mask's pixels [px].
+        initializer: Draws all other particles.
+        object_fraction: Fraction of the particles that are drawn around the object.
+        sigma_px: Standard deviation of their distance from the mask's pixels [px].
     """
 
     requires: ClassVar[Capabilities] = ("pixel_space",)
 
-    def __init__(self, otherwise: Initialize, share: float = 0.5, around_px: float = 10.0) -> None:
+    def __init__(
+        self, initializer: Initialize, object_fraction: float = 0.5, sigma_px: float = 10.0
+    ) -> None:
         super().__init__()
-        self.otherwise, self.share, self.around_px = otherwise, share, around_px
+        self.initializer = initializer
+        self.object_fraction, self.sigma_px = object_fraction, sigma_px
 
     def forward(
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px]."""
-        state = self.otherwise(batch, scene, method, particles, generator)
-        count = round(self.share * particles)
+        state = self.initializer(batch, scene, method, particles, generator)
+        count = round(self.object_fraction * particles)
         if not self.training or count == 0:
             return state
         require_pixel_space(method, "informed")
@@ -208,7 +219,7 @@ class Informed(nn.Module):
         near = draw_cells(torch.where(visible, mask, torch.ones_like(mask)), count, generator).to(
             state.dtype
         )
-        near = near + self.around_px * torch.randn(
+        near = near + self.sigma_px * torch.randn(
             near.shape, generator=generator, device=state.device
         )
         return torch.cat([torch.where(visible, near, state[:, :count]), state[:, count:]], dim=1)

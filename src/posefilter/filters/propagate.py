@@ -28,23 +28,23 @@ class Identity:
 
 
 class Gaussian:
-    """Gaussian random walk with standard deviation `factor` x the step's noise level.
+    """Gaussian random walk with standard deviation `noise_scale` x the step's noise level.
 
     The space defines the standard deviation along each tangent axis.
 
     Args:
-        factor: Standard deviation over the noise level.
+        noise_scale: Standard deviation over the noise level.
     """
 
-    def __init__(self, factor: float = 0.4) -> None:
-        self.factor = factor
+    def __init__(self, noise_scale: float = 0.4) -> None:
+        self.noise_scale = noise_scale
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
         """Return perturbed states."""
         B, N = state.shape[:2]
-        scale = space.noise_scale((step.sigma * self.factor).expand(B))[:, None]
+        scale = space.noise_scale((step.sigma * self.noise_scale).expand(B))[:, None]
         noise = torch.randn(
             B, N, space.dimensions, generator=generator, device=state.device, dtype=state.dtype
         )
@@ -69,19 +69,19 @@ class HalfTurns:
     A move between the modes of nearly symmetric objects.
 
     Args:
-        share: Probability that a particle is rotated.
+        probability: Probability that a particle is rotated.
     """
 
     requires: ClassVar[Capabilities] = ("pose_space",)
 
-    def __init__(self, share: float = 0.1) -> None:
-        self.share = share
+    def __init__(self, probability: float = 0.1) -> None:
+        self.probability = probability
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
         """Return the states, some rotated."""
-        return half_turns(state, space, generator, self.share)
+        return half_turns(state, space, generator, self.probability)
 
 
 class AxisTurns:
@@ -91,14 +91,15 @@ class AxisTurns:
     of a carton, or a mug whose handle is hidden.
 
     Args:
-        share: Probability that a particle is rotated.
-        any_angle: Share of the rotations that are by any angle rather than by pi.
+        probability: Probability that a particle is rotated.
+        uniform_angle_probability: Probability that its angle is uniform rather than pi.
     """
 
     requires: ClassVar[Capabilities] = ("pose_space",)
 
-    def __init__(self, share: float = 0.1, any_angle: float = 0.5) -> None:
-        self.share, self.any_angle = share, any_angle
+    def __init__(self, probability: float = 0.1, uniform_angle_probability: float = 0.5) -> None:
+        self.probability = probability
+        self.uniform_angle_probability = uniform_angle_probability
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
@@ -116,16 +117,18 @@ class AxisTurns:
             )
         size, device = state.shape[:2], state.device
         axis = torch.randint(3, size, generator=generator, device=device)
-        moves = torch.rand(size, generator=generator, device=device) < self.share
-        free = torch.rand(size, generator=generator, device=device) < self.any_angle
+        moves = torch.rand(size, generator=generator, device=device) < self.probability
+        free = torch.rand(size, generator=generator, device=device) < self.uniform_angle_probability
         angle = 2 * math.pi * torch.rand(size, generator=generator, device=device)
         angle = torch.where(free, angle, torch.full_like(angle, math.pi)) * moves
         turn = space.axes.to(state)[axis] * angle[..., None]
         return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
-def half_turns(poses: Tensor, space: Space, generator: Generator, share: float = 1.0) -> Tensor:
-    """Rotate a share of poses by pi about a random object axis through the object's center.
+def half_turns(
+    poses: Tensor, space: Space, generator: Generator, probability: float = 1.0
+) -> Tensor:
+    """Rotate poses, each with a probability, by pi about a random object axis through the center.
 
     (B, N, 4, 4) -> (B, N, 4, 4).
 
@@ -139,7 +142,7 @@ def half_turns(poses: Tensor, space: Space, generator: Generator, share: float =
         )
     B, N = poses.shape[:2]
     axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
-    flip = torch.rand(B, N, generator=generator, device=poses.device) < share
+    flip = torch.rand(B, N, generator=generator, device=poses.device) < probability
     turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * flip[..., None]
     return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
@@ -147,13 +150,13 @@ def half_turns(poses: Tensor, space: Space, generator: Generator, share: float =
 class Chain:
     """Apply several kernels one after the other."""
 
-    def __init__(self, pieces: Iterable[Propagate]) -> None:
-        self.pieces = list(pieces)
+    def __init__(self, components: Iterable[Propagate]) -> None:
+        self.components = list(components)
 
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
         """Return the states that the last kernel leaves."""
-        for piece in self.pieces:
-            state = piece(state, displacement, step, space, generator)
+        for component in self.components:
+            state = component(state, displacement, step, space, generator)
         return state

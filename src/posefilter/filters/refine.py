@@ -25,15 +25,15 @@ class NoRefine:
 class Chain:
     """Apply several refinements one after the other."""
 
-    def __init__(self, pieces: Iterable[Refine]) -> None:
-        self.pieces = list(pieces)
+    def __init__(self, components: Iterable[Refine]) -> None:
+        self.components = list(components)
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
         """Return the belief after the last refinement."""
-        for piece in self.pieces:
-            belief = piece(belief, scene, method, generator)
+        for component in self.components:
+            belief = component(belief, scene, method, generator)
         return belief
 
 
@@ -66,21 +66,21 @@ class Rescore:
     """Score the estimate and the heaviest particles again with more pixels, and select the best.
 
     Args:
-        top: Particles to score.
+        top_k: Particles to score.
         pixels: Image points for each score.
         sigma: Noise level of the likelihood [m].
     """
 
     requires: ClassVar[Capabilities] = ("score_poses",)
 
-    def __init__(self, top: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
-        self.top, self.pixels, self.sigma = top, pixels, sigma
+    def __init__(self, top_k: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
+        self.top_k, self.pixels, self.sigma = top_k, pixels, sigma
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
         """Return the belief with the pose of highest score as its estimate."""
-        scorer, poses = require_scorer(method), top_poses(belief, self.top)
+        scorer, poses = require_scorer(method), top_poses(belief, self.top_k)
         with torch.no_grad():
             scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
         return select_best(belief, poses, scores)
@@ -94,12 +94,12 @@ class MeanShift:
     Perturbations come in antithetic pairs, so a constant likelihood leaves the estimate in place.
 
     Args:
-        rounds: Number of shifts.
-        pairs: Antithetic pairs of perturbations in a round.
-        start: Standard deviation in the first round [m on the object's surface].
-        end: Standard deviation in the last round; geometric between.
+        iterations: Number of shifts.
+        antithetic_pairs: Pairs of opposite perturbations in an iteration.
+        start: Standard deviation in the first iteration [m on the object's surface].
+        end: Standard deviation in the last iteration; geometric between.
         sigma: Noise level of the likelihood [m].
-        pixels: Image points for each score, drawn anew in each round.
+        pixels: Image points for each score, drawn anew in each iteration.
 
     Raises:
         UserError: A number is out of range.
@@ -109,19 +109,20 @@ class MeanShift:
 
     def __init__(
         self,
-        rounds: int = 8,
-        pairs: int = 32,
+        iterations: int = 8,
+        antithetic_pairs: int = 32,
         start: float = 0.012,
         end: float = 0.007,
         sigma: float = 0.004,
         pixels: int = 256,
     ) -> None:
-        if rounds < 1 or pairs < 1 or not 0 < end <= start:
+        if iterations < 1 or antithetic_pairs < 1 or not 0 < end <= start:
             raise UserError(
-                f"refine: a mean shift needs rounds and pairs >= 1 and 0 < end <= "
-                f"start, got {end} and {start}"
+                f"refine: a mean shift needs iterations and antithetic_pairs >= 1 and "
+                f"0 < end <= start, got {end} and {start}"
             )
-        self.rounds, self.pairs, self.start, self.end = rounds, pairs, start, end
+        self.iterations, self.antithetic_pairs = iterations, antithetic_pairs
+        self.start, self.end = start, end
         self.sigma, self.pixels = sigma, pixels
 
     @torch.no_grad()
@@ -130,13 +131,15 @@ class MeanShift:
     ) -> Belief:
         """Return the belief with the estimate shifted; without gradient."""
         scorer, best = require_scorer(method), belief.best
-        for index in range(self.rounds):
-            spread = self.start * (self.end / self.start) ** (index / max(self.rounds - 1, 1))
+        for index in range(self.iterations):
+            spread = self.start * (self.end / self.start) ** (index / max(self.iterations - 1, 1))
             scale = method.space.noise_scale(best.new_tensor(spread))
-            shape = (len(best), self.pairs, method.space.dimensions)
+            shape = (len(best), self.antithetic_pairs, method.space.dimensions)
             noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)
             moves = torch.cat([noise, -noise], dim=1) * scale
-            poses = method.space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
+            poses = method.space.move(
+                best[:, None].expand(-1, 2 * self.antithetic_pairs, -1, -1), moves
+            )
             scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
             best = method.space.move(best, (scores.softmax(1)[..., None] * moves).sum(1))
         score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]

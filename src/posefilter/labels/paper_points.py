@@ -19,14 +19,20 @@ class PaperPoints:
 
     Args:
         tolerance: Offset up to which a sample is on the surface [m].
-        on: Label on the surface.
-        behind: Label behind the surface.
+        surface_label: Label on the surface.
+        behind_label: Label behind the surface.
     """
 
     requires: ClassVar[Capabilities] = ("ray_samples",)
 
-    def __init__(self, tolerance: float = 0.01, on: float = 100.0, behind: float = -100.0) -> None:
-        self.tolerance, self.on, self.behind = tolerance, on, behind
+    def __init__(
+        self,
+        tolerance: float = 0.01,
+        surface_label: float = 100.0,
+        behind_label: float = -100.0,
+    ) -> None:
+        self.tolerance = tolerance
+        self.surface_label, self.behind_label = surface_label, behind_label
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return labels (1, B, N).
@@ -43,5 +49,7 @@ class PaperPoints:
             trace.particles[-1].state[..., 2],
             trace.particles[-1].state[..., 3] > 0.5,
         )
-        label = torch.where(offset > self.tolerance, self.behind, 0.0)
-        return torch.where((offset.abs() <= self.tolerance) & own_color, self.on, label)[None]
+        label = torch.where(offset > self.tolerance, self.behind_label, 0.0)
+        return torch.where((offset.abs() <= self.tolerance) & own_color, self.surface_label, label)[
+            None
+        ]

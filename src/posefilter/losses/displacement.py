@@ -53,14 +53,14 @@ class Chamfer:
 
     Args:
         size: Side of the patch [px].
-        most: Maximum number of mask pixels, an even selection; None for all.
+        max_pixels: Maximum number of mask pixels, an even selection; None for all.
     """
 
     requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
-    def __init__(self, size: int = 9, most: int | None = 256) -> None:
+    def __init__(self, size: int = 9, max_pixels: int | None = 256) -> None:
         self.size = size
-        self.most = most
+        self.max_pixels = max_pixels
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
@@ -84,7 +84,7 @@ class Chamfer:
 
         (B, P, 2) [px], (B, 1, H, W) -> (B,) [px^2].
         """
-        targets, valid = mask_pixels(mask, self.most)
+        targets, valid = mask_pixels(mask, self.max_pixels)
         offset = targets[:, None] - positions[:, :, None]  # (B, P, M, 2)
         partner = offset.detach().round().clamp(-((self.size - 1) // 2), self.size // 2)
         distance = (offset - partner).square().sum(-1) * valid[:, None]

@@ -99,14 +99,14 @@ class SurfacePointLoss:
 
     Args:
         fragment_weight: Weight of the loss of fragments.
-        within: Weight of the position in the fragment.
+        offset_weight: Weight of the position in the fragment.
     """
 
     provides: ClassVar[Capabilities] = ("surface_point_loss",)
     requires: ClassVar[Capabilities] = ("pixel_space", "pose", "rollout")
 
-    def __init__(self, fragment_weight: float = 0.25, within: float = 0.3) -> None:
-        self.fragment_weight, self.within = fragment_weight, within
+    def __init__(self, fragment_weight: float = 0.25, offset_weight: float = 0.3) -> None:
+        self.fragment_weight, self.offset_weight = fragment_weight, offset_weight
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
@@ -129,7 +129,7 @@ class SurfacePointLoss:
         surprise, error = fragment_errors(
             fragments.log_share, fragments.position, fragments.centers, fragments.reach, true
         )
-        return self.fragment_weight * (surprise + self.within * error)
+        return self.fragment_weight * (surprise + self.offset_weight * error)
 
 
 def measured_points(

@@ -27,19 +27,19 @@ class RgbdChamfer:
 
     Args:
         size: Side of the patch [px].
-        most: Maximum number of mask pixels, an even selection; None for all.
+        max_pixels: Maximum number of mask pixels, an even selection; None for all.
         chunk: Distances held at once.
     """
 
     requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
-    def __init__(self, size: int = 9, most: int | None = 256, chunk: int = 1 << 23) -> None:
-        self.size, self.most, self.chunk = size, most, chunk
+    def __init__(self, size: int = 9, max_pixels: int | None = 256, chunk: int = 1 << 23) -> None:
+        self.size, self.max_pixels, self.chunk = size, max_pixels, chunk
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,); 0 where the object is not visible."""
         image = torch.cat([batch.rgb, batch.depth], dim=1)
-        pixels, valid = mask_pixels(batch.mask, self.most)
+        pixels, valid = mask_pixels(batch.mask, self.max_pixels)
         target = gather_pixels(image, nearest_pixel(pixels))  # (B, M, 4)
         positions = displaced_positions(trace).transpose(0, 1).flatten(1, 2)
         offsets = patch_offsets(self.size, positions.device)

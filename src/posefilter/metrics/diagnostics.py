@@ -124,7 +124,7 @@ class FilterDiagnostics(Metric):
     others in the frame as negatives. The last three are over all steps.
 
     Args:
-        most: Maximum number of particles of an image and step for the last three.
+        max_particles: Maximum number of particles of an image and step for the last three.
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
@@ -135,9 +135,9 @@ class FilterDiagnostics(Metric):
     offsets: list[Tensor]
     scored: list[Tensor]
 
-    def __init__(self, most: int = 256, **kwargs: Any) -> None:
+    def __init__(self, max_particles: int = 256, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.most = most
+        self.max_particles = max_particles
         for name in ("shares", "lines", "cosine", "offsets", "scored"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
@@ -152,12 +152,14 @@ class FilterDiagnostics(Metric):
             steps.append(torch.stack([on, off, edge, corner, distinct(particles.state)]))
             lines.append(line_share(particles.state))
             self.cosine.append(pairwise_cosine(output.displacement))
-            state = particles.state[:, : self.most]
-            displacement = output.displacement[:, : self.most]
+            state = particles.state[:, : self.max_particles]
+            displacement = output.displacement[:, : self.max_particles]
             true = nearest_mask_pixel(batch.mask, state) - state
             self.offsets.append(torch.cat([displacement, true], dim=-1).flatten(0, 1).float())
             positive = overlaps_mask(batch.mask, state).float()
-            scored = torch.stack([output.log_likelihood[:, : self.most].float(), positive], dim=-1)
+            scored = torch.stack(
+                [output.log_likelihood[:, : self.max_particles].float(), positive], dim=-1
+            )
             self.scored.append(scored[~is_off_frame(state, width, height)])
         self.shares.append(torch.stack(steps).permute(2, 0, 1))  # (B, T, 5)
         self.lines.append(torch.stack(lines).T)  # (B, T)

@@ -311,8 +311,10 @@ _METRICS = (
     MetricInfo("filter/sigma_px", "noise level", "px", ".1f"),
     MetricInfo("filter/best_log_likelihood", "best log-likelihood", "nat", ".1f", HIGHER),
     # of a run, derived from several of the above
-    MetricInfo("missed_share", "images without an estimate", "%", ".1f", LOWER, 100.0, PERCENT),
-    MetricInfo("fallen", "validation score lost since its best", form=".1f", direction=LOWER),
+    MetricInfo("missed_fraction", "images without an estimate", "%", ".1f", LOWER, 100.0, PERCENT),
+    MetricInfo(
+        "val_score_drop", "validation score lost since its best", form=".1f", direction=LOWER
+    ),
     MetricInfo("not_finite", "training scalars that are no numbers", form=".0f", direction=LOWER),
 )
 METRICS = {info.key: info for info in _METRICS}

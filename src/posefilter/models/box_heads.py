@@ -18,20 +18,20 @@ class BoxHead(Protocol):
         ...
 
 
-def weighted_quantile(values: Tensor, weights: Tensor, share: float) -> Tensor:
+def weighted_quantile(values: Tensor, weights: Tensor, quantile: float) -> Tensor:
     """Return the weighted quantile of each column.
 
     Args:
         values: (B, N, D).
         weights: (B, N), summing to 1.
-        share: Fraction of the weight that lies below the quantile.
+        quantile: Fraction of the weight that lies below the quantile.
 
     Returns:
         (B, D), each one of the values.
     """
     order = values.argsort(dim=1)
     mass = weights[..., None].expand_as(values).gather(1, order).cumsum(1)
-    rank = (mass < share - 1e-6).sum(1, keepdim=True).clamp(max=values.shape[1] - 1)
+    rank = (mass < quantile - 1e-6).sum(1, keepdim=True).clamp(max=values.shape[1] - 1)
     return values.gather(1, order).gather(1, rank)[:, 0]
 
 
@@ -42,18 +42,18 @@ class SpreadBox:
 
     Args:
         size: Side of the patch [px]; the box is enlarged by half of it.
-        beyond: Fraction of the weight that is left out at each side.
+        quantile: Fraction of the weight that is left out at each side.
     """
 
-    def __init__(self, size: int = 1, beyond: float = 0.05) -> None:
+    def __init__(self, size: int = 1, quantile: float = 0.05) -> None:
         self.size = size
-        self.beyond = beyond
+        self.quantile = quantile
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
         state, weights = trace.particles[-1].state, trace.particles[-1].log_weights.exp()
-        low = weighted_quantile(state, weights, self.beyond) - self.size / 2
-        high = weighted_quantile(state, weights, 1 - self.beyond) + self.size / 2
+        low = weighted_quantile(state, weights, self.quantile) - self.size / 2
+        high = weighted_quantile(state, weights, 1 - self.quantile) + self.size / 2
         return torch.cat([low, high], dim=-1)
 
 

@@ -114,14 +114,15 @@ class CandidatePoses:
     """Draw candidates of several kinds, all of an image at one noise level.
 
     Args:
-        each: Candidates of each kind around the truth.
-        proposed: Poses from the proposal network, where there is one.
+        candidates_per_kind: Candidates of each kind around the truth.
+        proposals: Poses from the proposal network, where there is one.
         particles: Persistent particles of the filter's own, which are hard negatives; 0 for none.
         sigma: Lowest and highest noise level [m].
         start: Noise level at which persistent particles start from proposals, as they do at test
             time [m]. Without proposals they start from depth, at the highest level.
         levels: Steps of the persistent particles from there to the lowest level.
-        own_level: Fraction of images that are scored at the level of their persistent particles.
+        persistent_sigma_probability: Probability that an image is scored at the noise level of its
+            persistent particles, rather than at one drawn from `sigma`.
         turns: Kernel that turns the truth, for hard negatives. By default half turns about the
             axes of the mesh's frame.
     """
@@ -130,21 +131,18 @@ class CandidatePoses:
 
     def __init__(
         self,
-        each: int = 8,
-        proposed: int = 8,
+        candidates_per_kind: int = 8,
+        proposals: int = 8,
         particles: int = 16,
         sigma: tuple[float, float] = (0.004, 0.25),
         start: float = 0.05,
         levels: int = 12,
-        own_level: float = 0.5,
+        persistent_sigma_probability: float = 0.5,
         turns: Propagate | None = None,
     ) -> None:
-        self.each, self.proposed, self.sigma, self.own_level = (
-            each,
-            proposed,
-            (float(sigma[0]), float(sigma[1])),
-            own_level,
-        )
+        self.candidates_per_kind, self.proposals = candidates_per_kind, proposals
+        self.sigma = (float(sigma[0]), float(sigma[1]))
+        self.persistent_sigma_probability = persistent_sigma_probability
         self.start = float(start)
         self.turns = turns or HalfTurns(1.0)
         self.persistent = (
@@ -161,24 +159,33 @@ class CandidatePoses:
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
         groups = [
             sample_around_truth(
-                batch, model, method.space, self.each, self.sigma, generator, self.turns
+                batch,
+                model,
+                method.space,
+                self.candidates_per_kind,
+                self.sigma,
+                generator,
+                self.turns,
             )
         ]
-        proposals = "propose_poses" in method.capabilities
-        if self.proposed and proposals:
-            groups.append(method.propose_poses(scene, self.proposed, generator))
+        proposes = "propose_poses" in method.capabilities
+        if self.proposals and proposes:
+            groups.append(method.propose_poses(scene, self.proposals, generator))
         own = torch.zeros(B, dtype=torch.bool, device=device)
         if self.persistent is not None:
             count, space = self.persistent.particles, method.space
             fresh = (
                 method.propose_poses(scene, count, generator)
-                if proposals
+                if proposes
                 else sample_from_depth(batch, space, count, generator)
             )
             states, level = self.persistent.recall(
-                batch, fresh, self.start if proposals else self.sigma[1]
+                batch, fresh, self.start if proposes else self.sigma[1]
             )
-            own = torch.rand(B, device=device, generator=generator) < self.own_level
+            own = (
+                torch.rand(B, device=device, generator=generator)
+                < self.persistent_sigma_probability
+            )
             sigma = torch.where(own, level, sigma)
             groups.append(states)
         particles = make_uniform_particles(torch.cat(groups, dim=1))
@@ -227,7 +234,7 @@ class LabeledRays:
             paper.
         samples: Points on a ray, evenly spaced.
         start: Depth of the first [m].
-        past: How far the last lies behind the observed point [m].
+        margin_behind: How far the last lies behind the observed point [m].
         tolerance: Half width of the surface [m]; on it a second sample has the observed color.
             Other colors are random.
     """
@@ -240,16 +247,11 @@ class LabeledRays:
         rays: int | None = 64,
         samples: int = 30,
         start: float = 0.10,
-        past: float = 0.05,
+        margin_behind: float = 0.05,
         tolerance: float = 0.01,
     ) -> None:
-        self.rays, self.samples, self.start, self.past, self.tolerance = (
-            rays,
-            samples,
-            start,
-            past,
-            tolerance,
-        )
+        self.rays, self.samples, self.start = rays, samples, start
+        self.margin_behind, self.tolerance = margin_behind, tolerance
 
     def __call__(
         self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
@@ -273,8 +275,10 @@ class LabeledRays:
         pick, drawn = pick_pixels(usable, self.rays, generator)
         pixel = torch.stack([pick % W, pick // W], dim=-1).float()
         z = depth.gather(1, pick)[..., None]
-        share = torch.linspace(0, 1, self.samples, device=device)
-        at = self.start + (z + self.past - self.start) * share  # (B, rays, samples) z-depth [m]
+        fraction = torch.linspace(0, 1, self.samples, device=device)
+        at = (
+            self.start + (z + self.margin_behind - self.start) * fraction
+        )  # (B, rays, samples) z-depth [m]
         length = rays(pixel, batch.intrinsics).norm(dim=-1, keepdim=True)
         offset = ((at - z) * length).flatten(1)
         pixel = pixel[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)

@@ -29,7 +29,8 @@ class Muon(Optimizer):
         betas: Decay rates of AdamW.
         eps: Of AdamW.
         weight_decay: Of all parameters, decoupled.
-        spared: Names of layers that AdamW trains, such as the first and the last of each network.
+        adam_layers: Names of layers that AdamW trains, such as the first and the last of each
+            network.
     """
 
     def __init__(
@@ -41,12 +42,12 @@ class Muon(Optimizer):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
         weight_decay: float = 1e-3,
-        spared: Sequence[str] = (),
+        adam_layers: Sequence[str] = (),
     ) -> None:
         matrices: list[Tensor] = []
         rest: list[Tensor] = []
         for name, parameter in parameters:
-            plain = parameter.dim() < 2 or bool(set(name.split(".")) & set(spared))
+            plain = parameter.dim() < 2 or bool(set(name.split(".")) & set(adam_layers))
             (rest if plain else matrices).append(parameter)
         common = {
             "weight_decay": weight_decay,

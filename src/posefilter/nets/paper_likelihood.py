@@ -25,19 +25,21 @@ class PaperLikelihood(nn.Module):
         width: Width of M.
         blocks: Its number of residual blocks.
         spread: Standard deviation of the pixels, in projected radii.
-        about: Where the pixels are drawn about: "origin" of the hypothesis's frame, which is that
+        anchor: Where the pixels are drawn about: "origin" of the hypothesis's frame, which is that
             of the mesh file, or "center" of the mesh.
     """
 
     provides: ClassVar[Capabilities] = ("score_points", "score_samples")
 
     def __init__(
-        self, width: int = 128, blocks: int = 5, spread: float = 0.6, about: str = "center"
+        self, width: int = 128, blocks: int = 5, spread: float = 0.6, anchor: str = "center"
     ) -> None:
         super().__init__()
-        if about not in ("origin", "center"):
-            raise UserError(f"model.likelihood.about={about!r} is unknown: choose origin or center")
-        self.about = about
+        if anchor not in ("origin", "center"):
+            raise UserError(
+                f"model.likelihood.anchor={anchor!r} is unknown: choose origin or center"
+            )
+        self.anchor = anchor
         self.spread = spread
         self.net = nn.Sequential(
             Linear(6, width), *[ResnetFC(width) for _ in range(blocks)], nn.Linear(width, 1)
@@ -73,7 +75,7 @@ class PaperLikelihood(nn.Module):
     ) -> Tensor:
         """Score poses.  poses (B, N, 4, 4) -> (B, N); `sigma` is not used."""
         noise = torch.randn(*poses.shape[:2], pixels, 2, generator=generator, device=poses.device)
-        anchor = torch.zeros_like(center) if self.about == "origin" else None
+        anchor = torch.zeros_like(center) if self.anchor == "origin" else None
         with torch.autocast(poses.device.type, enabled=False):
             points = sample_points(image, poses, center, radius, noise, self.spread, anchor)
             scores = self.score_samples(points.position + center, points.color)

@@ -35,7 +35,7 @@ class Finding(NamedTuple):
 
 
 DIAGNOSTICS = (
-    Diagnostic("missed_share", 0.0, "The filter gave no finite pose."),
+    Diagnostic("missed_fraction", 0.0, "The filter gave no finite pose."),
     Diagnostic(
         "belief/truth_outscored_by_wrong",
         0.02,
@@ -50,7 +50,7 @@ DIAGNOSTICS = (
     Diagnostic("diagnostics/near_edge/last", 0.4, "Particles gather at the image's edges."),
     Diagnostic("diagnostics/near_corner/last", 0.2, "Particles gather in the image's corners."),
     Diagnostic("particles_on_object", 0.2, "Few particles find the object."),
-    Diagnostic("fallen", 5.0, "Training went past its best: see the curves."),
+    Diagnostic("val_score_drop", 5.0, "Training went past its best: see the curves."),
     Diagnostic("not_finite", 0.0, "The training diverged."),
 )
 
@@ -75,10 +75,10 @@ def collect_numbers(run: Run) -> dict[str, float]:
         if isinstance(values, list) and values:
             out[f"diagnostics/{name}/last"] = float(values[-1])
     if out.get("instances"):
-        out["missed_share"] = out.get("missed", 0.0) / out["instances"]
+        out["missed_fraction"] = out.get("missed", 0.0) / out["instances"]
     score = run.curves.get("val/score")
     if score and len(score.values) > 1:
-        out["fallen"] = max(score.values) - score.values[-1]
+        out["val_score_drop"] = max(score.values) - score.values[-1]
     training = [curve for tag, curve in run.curves.items() if tag.startswith("train/")]
     if training:
         out["not_finite"] = float(
