@@ -6,6 +6,8 @@ from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
 from posefilter.cli.renamed import rename
 from posefilter.errors import UserError
 
@@ -67,6 +69,31 @@ def config_folders(arguments: Sequence[str]) -> list[Path]:
     """Return the folders of settings that were typed by --config-dir (or -cd)."""
     words = [part for a in arguments for part in a.split("=", 1)]
     return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")]
+
+
+def defer_settings(arguments: Sequence[str], conf: Path) -> list[str]:
+    """Return a command line whose settings Hydra looks for in each job of a sweep over choices.
+
+    Hydra composes a sweep's defaults first, without the choices that are swept, and refuses a
+    setting that only these have: `model=patch_pf,cnn_patch model.net.width=16`. A setting that is
+    swept over its one value is left to the jobs.
+
+    Args:
+        arguments: The command line.
+        conf: The folder of settings.
+    """
+    if not any(a in ("-m", "--multirun") or a.startswith("sweep=") for a in arguments):
+        return list(arguments)
+    typed = [a for a in arguments if "=" in a and not a.startswith("-")]
+    parsed = dict(zip(typed, OverridesParser.create().parse_overrides(typed), strict=True))
+    if not any(o.is_sweep_override() and (conf / o.key_or_group).is_dir() for o in parsed.values()):
+        return list(arguments)
+    deferred = {
+        argument: f"{own.key_or_group}=choice({own.get_value_element_as_str()})"
+        for argument, own in parsed.items()
+        if re.match(r"(?!hydra\b)\w+\.", argument) and not own.is_sweep_override()
+    }
+    return [deferred.get(argument, argument) for argument in arguments]
 
 
 def list_choices(group: Path) -> list[str]:

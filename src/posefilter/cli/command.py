@@ -21,7 +21,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.cli.ablation_configs import register_ablations
-from posefilter.cli.arguments import bracketed, check_choices, spelled
+from posefilter.cli.arguments import bracketed, check_choices, defer_settings, spelled
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.fit import check_fit
@@ -80,7 +80,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         arguments = with_resumed(bracketed(arguments))
         check_choices(arguments, conf)  # a resumed run's too
         arguments = loosen(arguments, name) + logging_for(arguments)
-        sys.argv = [sys.argv[0], *arguments]
+        sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
             _task(name)
         )()

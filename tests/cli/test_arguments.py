@@ -1,0 +1,42 @@
+"""What is typed reaches each job of a sweep over choices."""
+
+from pathlib import Path
+
+import pytest
+
+from posefilter.cli import run_command
+from posefilter.cli.arguments import defer_settings
+from posefilter.cli.job import Job
+
+HOME = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("more", [[], ["sweep=ablation_detect", "ablation=paper,working"]])
+def test_a_setting_that_only_the_swept_choices_have_reaches_each_job(
+    more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths = []
+
+    def record(job: Job) -> float:
+        widths.append((job.choices["model"], job.cfg.model.net.width))
+        return 0.0
+
+    monkeypatch.setattr("posefilter.cli.train.train", record)
+    typed = ["-m", "model=cnn_patch,downsized", "model.net.width=16", f"out={tmp_path}"]
+    assert run_command("train", HOME, [*typed, "console=json", *more]) == 0
+    assert sorted({*widths}) == [("cnn_patch", 16), ("downsized", 16)]
+    assert len(widths) == (4 if more else 2)
+
+
+def test_a_setting_that_no_job_has_is_refused_with_the_nearest(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["-m", "model=cnn_patch,downsized", "model.net.widht=16", f"out={tmp_path}"]
+    assert run_command("train", HOME, typed) == 2
+    assert "model.net.widht: there is no such setting" in capfd.readouterr().err
+
+
+def test_a_sweep_over_numbers_is_left_as_typed() -> None:
+    typed = ["-m", "filter.particles=50,100", "model.net.width=16", "model=patch_pf"]
+    assert defer_settings(typed, HOME / "conf") == typed
+    assert defer_settings(typed[3:] + typed[2:3], HOME / "conf") == ["model=patch_pf", typed[2]]
