@@ -1,5 +1,6 @@
 """The paper's fifth method: particles are poses, weighted by a learned likelihood."""
 
+import logging
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -16,6 +17,8 @@ from posefilter.nets.likelihood import Pixels, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
+
+log = logging.getLogger(__name__)
 
 
 class PoseScene(NamedTuple):
@@ -233,8 +236,13 @@ class PosePF(PoseEstimator):
         checkpoint["candidate_sampler"] = self.candidate_sampler.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the candidate sampler's state."""
+        """Restore the candidate sampler's state; a warning says where there is none."""
         super().on_load_checkpoint(checkpoint)
+        if "candidate_sampler" not in checkpoint:
+            log.warning(
+                "resume: the checkpoint is of an earlier version, without the candidate sampler's "
+                "persistent particles: every frame's start anew"
+            )
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 
     def _center(self) -> Tensor:
