@@ -12,8 +12,9 @@ result.pose, result.score, result.covariance, result.modes, result.belief
 Public names are imported when they are first used: `import posefilter` does not import torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from posefilter.lazy import import_lazily
 
 __version__ = "0.1.0"
 
@@ -58,20 +59,11 @@ _HOMES = {
     "build": "api",
     "build_data": "api",
     "compose": "api",
+    "figures": "figures",
     "load": "api",
     "trust": "cli.trust",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used (PEP 562)."""
-    if name == "figures":
-        return importlib.import_module("posefilter.figures")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'posefilter' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f"posefilter.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
+__getattr__ = import_lazily(__name__, _HOMES)
 
 
 def __dir__() -> list[str]:

@@ -1,6 +1,8 @@
 """The only part of the project that knows Hydra: from a command line to files in a folder."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from posefilter.lazy import import_lazily
 
 if TYPE_CHECKING:
     from posefilter.cli.command import run_command
@@ -8,15 +10,5 @@ if TYPE_CHECKING:
 
 __all__ = ["Job", "run_command"]
 
-
-def __getattr__(name: str) -> Any:
-    """Import Hydra only where a command is run: reading a checkpoint needs none of it."""
-    if name == "Job":
-        from posefilter.cli.job import Job
-
-        return Job
-    if name == "run_command":
-        from posefilter.cli.command import run_command
-
-        return run_command
-    raise AttributeError(f"module 'posefilter.cli' has no attribute '{name}'")
+# Hydra is imported only where a command is run: reading a checkpoint needs none of it
+__getattr__ = import_lazily(__name__, {"Job": "job", "run_command": "command"})

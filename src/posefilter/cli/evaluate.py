@@ -94,7 +94,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
-    told = Job(
+    tested = Job(
         job.cfg,
         {**checkpoint["recipe"]["choices"], **chosen(job)},
         job.overrides,
@@ -102,7 +102,9 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         job.name,
         job.swept,
     )
-    return record(method.compute_metrics(), told, data.describe(), Path(job.cfg.checkpoint)), files
+    return record(
+        method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
+    ), files
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
@@ -123,21 +125,20 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
-        told = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
+        estimates = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
         poses = torch.full_like(batch.camera_from_object, torch.nan)
-        for i, found in enumerate(told):
-            if found is not None:
+        for i, estimate in enumerate(estimates):
+            if estimate is not None:
                 used += 1
-                pose = to_mesh(
-                    found.camera_from_native, data.reader.native_from_mesh(own[i].object)
-                )
+                native = data.reader.native_from_mesh(own[i].object)
+                pose = to_mesh(estimate.camera_from_native, native)
                 poses[i] = torch.from_numpy(pose.astype(np.float32))
         errors.update(poses, batch.camera_from_object, batch.object_id)
         height, width = batch.rgb.shape[-2:]
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         pairs = [
             (nan, nan) if row is None else (row.score, row.seconds if row.seconds >= 0 else nan)
-            for row in told
+            for row in estimates
         ]
         scores, times = zip(*pairs, strict=True)
         own_errors = [

@@ -3,8 +3,9 @@
 Nothing here knows Lightning.  The names below are imported when they are first used.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from posefilter.lazy import import_lazily
 
 if TYPE_CHECKING:
     from posefilter.figures.belief import draw_belief
@@ -19,10 +20,4 @@ _HOMES = {
     "draw_poses": "overlay",
     "save_image": "canvas",
 }
-
-
-def __getattr__(name: str) -> Any:
-    """Import a figure when it is first asked for (PEP 562)."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'posefilter.figures' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"posefilter.figures.{_HOMES[name]}"), name)
+__getattr__ = import_lazily(__name__, _HOMES)

@@ -4,8 +4,9 @@ Their modules, such as `posefilter.models.pose_pf`, hold the same classes withou
 takes seconds to import and which a prediction does not need.
 """
 
-import importlib
 from typing import TYPE_CHECKING, Any
+
+from posefilter.lazy import import_lazily
 
 if TYPE_CHECKING:
     from posefilter.models.cnn_patch import CnnPatch
@@ -25,10 +26,10 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> Any:
-    """Make a method's LightningModule when it is first used (PEP 562)."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'posefilter.models' has no attribute '{name}'")
+def _make_lightning_module(kind: Any) -> Any:
     from posefilter.models.base import with_lightning
 
-    return with_lightning(getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name))
+    return with_lightning(kind)
+
+
+__getattr__ = import_lazily(__name__, _HOMES, _make_lightning_module)
