@@ -1,10 +1,10 @@
-"""What methods and their pieces provide, and what pieces require: plain names, matched by one
-check.
+"""What methods and their components provide, and what components require: plain names, matched by
+one check.
 
 A class says so by two class attributes, `provides` and `requires`, tuples of names; a subclass that
-says nothing has its parent's. What is chosen fits together where every requirement of every piece
-is provided by the method or by one of its pieces. A new method is checked, trained and drawn by
-these names alone.
+says nothing has its parent's. What is chosen fits together where every requirement of every
+component is provided by the method or by one of its components. A new method is checked, trained
+and drawn by these names alone.
 """
 
 from collections.abc import Iterable, Mapping
@@ -105,14 +105,16 @@ def check_parts(method: Any) -> None:
         )
 
 
-def find_missing(pieces: Iterable[Declared]) -> list[tuple[int, str]]:
-    """Match what pieces require with what all of them provide.
+def find_missing(components: Iterable[Declared]) -> list[tuple[int, str]]:
+    """Match what components require with what all of them provide.
 
     Returns:
-        (number of the piece, name) of each requirement that is not met, in the pieces' order.
+        (number, name) of each requirement that is not met, in the order of the components.
     """
-    pieces = list(pieces)
-    provided = frozenset().union(*(piece.provides for piece in pieces))
+    components = list(components)
+    provided = frozenset().union(*(component.provides for component in components))
     return [
-        (i, name) for i, piece in enumerate(pieces) for name in sorted(piece.requires - provided)
+        (i, name)
+        for i, component in enumerate(components)
+        for name in sorted(component.requires - provided)
     ]

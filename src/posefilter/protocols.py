@@ -1,5 +1,5 @@
-"""Every protocol on one page.  Each verb of the filter is one injected piece; a Hydra group chooses
-which.
+"""Every protocol on one page.  Each verb of the filter is one injected component; a Hydra group
+chooses which.
 
 DataModule -> Batch -> method.encode -> [measure -> reweight -> resample -> propagate] x
 steps -> estimate -> refine -> Belief

@@ -1,7 +1,7 @@
 """The figures of a validation, one function each: an occasion in, a picture out; None where it does
 not apply.
 
-Pictures are (H, W, 3) uint8; bytes are a animation, a GIF.
+Pictures are (H, W, 3) uint8; bytes are an animation, a GIF.
 """
 
 from collections.abc import Callable
@@ -211,7 +211,7 @@ def animation(o: Occasion) -> Drawn:
 
 
 class AnimatedScene(NamedTuple):
-    """The image that a animation is of."""
+    """The image that an animation is of."""
 
     rgb: np.ndarray  # (H, W, 3) uint8
     intrinsics: np.ndarray  # (3, 3) [px]

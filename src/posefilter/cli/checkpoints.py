@@ -99,7 +99,7 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
 def method_of(
     checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None, lightning: bool = True
 ) -> PoseEstimator:
-    """Build the method that a checkpoint holds, with some of its pieces changed, and load its
+    """Build the method that a checkpoint holds, with some of its components changed, and load its
     weights; `lightning` as in `build_method`.
     """
     recipe = checkpoint["recipe"]

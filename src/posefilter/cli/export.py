@@ -1,5 +1,5 @@
-"""Strip a checkpoint to what predicts: weights, recipe (with pieces of the filter chosen anew, if
-wished) and object.
+"""Strip a checkpoint to what predicts: weights, recipe (with components of the filter chosen anew,
+if wished) and object.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""Whether the chosen pieces fit each other, by what their classes declare (see `capabilities`).
+"""Whether the chosen components fit each other, by what their classes declare (see `capabilities`).
 
-Torch is not imported for it: pieces of posefilter are read from their source, plug-ins (imported by
-then) as they are.
+Torch is not imported for it: components of posefilter are read from their source, plug-ins
+(imported by then) as they are.
 """
 
 import ast
@@ -25,7 +25,7 @@ _LINK = re.compile(r"\$\{([\w.]+)\}")
 _DEEPEST = 32  # of nested settings
 
 
-class Piece(NamedTuple):
+class Component(NamedTuple):
     """A node of the settings that names a class."""
 
     key: str  # as one types it
@@ -34,7 +34,7 @@ class Piece(NamedTuple):
 
 
 def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) -> None:
-    """Match what the pieces of a model require with what all of them provide.
+    """Match what the components of a model require with what all of them provide.
 
     Args:
         settings: The whole configuration; its `model` is what would be built.
@@ -54,19 +54,19 @@ def check_fit(settings: DictConfig, choices: Mapping[str, str], scope: Scope) ->
     except InterpolationResolutionError as error:
         # a choice may refer to what another method has: the pair is the mistake
         node, broken = resolve_known(tree, "model"), error
-    pieces = [
-        Piece(key, target, declared_by(target, key, scope))
+    components = [
+        Component(key, target, declared_by(target, key, scope))
         for place, target in list_targets(node, "model")
         for key in [typed_key(tree, place)]
     ]
-    missing = find_missing(piece.declared for piece in pieces)
+    missing = find_missing(component.declared for component in components)
     if missing:
         number, need = missing[0]
         keys = {typed_key(tree, place) for place, _ in list_places(node, "model")}
         tops = {key.partition(".")[0] for key in keys}
         near = {g: name for g, name in choices.items() if g.partition("/")[0] in tops}
         with open_groups() as groups:
-            told = _explain(pieces[number], need, pieces, keys, near, scope, groups)
+            told = _explain(components[number], need, components, keys, near, scope, groups)
         raise UserError(told)
     if broken is not None:
         raise broken
@@ -186,23 +186,27 @@ def typed_key(tree: Any, where: str) -> str:
 
 
 def list_fitting(
-    group: str, groups: Groups, pieces: Sequence[Piece], scope: Scope, need: str | None = None
+    group: str,
+    groups: Groups,
+    components: Sequence[Component],
+    scope: Scope,
+    need: str | None = None,
 ) -> list[str]:
     """Return the choices of a group that find all they require elsewhere, and take nothing away.
 
     Args:
         group: The group.
         groups: Where its choices are read.
-        pieces: All that is chosen.
+        components: All that is chosen.
         scope: Where the settings come from.
         need: What the choice must provide as well; null for nothing.
     """
     options = groups.list_options(group)
     places = {place for option in options for place in option.targets()}
-    others = [p.declared for p in pieces if not any(_within(p.key, place) for place in places)]
+    others = [p.declared for p in components if not any(_within(p.key, place) for place in places)]
     provided = _union(declared.provides for declared in others)
     required = _union(declared.requires for declared in others)
-    found = {name for _, name in find_missing(piece.declared for piece in pieces)}
+    found = {name for _, name in find_missing(component.declared for component in components)}
     fitting = []
     for option in options:
         own = [declared_by(target, key, scope) for key, target in option.targets().items()]
@@ -241,25 +245,28 @@ def find_choice(
 
 
 def _explain(
-    piece: Piece,
+    component: Component,
     need: str,
-    pieces: Sequence[Piece],
+    components: Sequence[Component],
     keys: set[str],
     choices: Mapping[str, str],
     scope: Scope,
     groups: Groups,
 ) -> str:
-    """Return the line that names the piece that does not fit, what it needs, and what fits."""
-    group, name = find_choice(piece.key, piece.target, choices, groups) or (piece.key, piece.target)
+    """Return the line that names the component that does not fit, what it needs, and what fits."""
+    group, name = find_choice(component.key, component.target, choices, groups) or (
+        component.key,
+        component.target,
+    )
     advice = []
     if group in choices and group != "model":
-        fitting = list_fitting(group, groups, pieces, scope)
+        fitting = list_fitting(group, groups, components, scope)
         advice += [f"{group}={_either(fitting)}"] if fitting else []
     for option in (groups.load(*choice) for choice in choices.items()):
         if option.group not in ("model", group) and keys & {
             place for place, _ in list_places(option.settings, "")
         }:
-            fitting = list_fitting(option.group, groups, pieces, scope, need)
+            fitting = list_fitting(option.group, groups, components, scope, need)
             advice += [f"{option.group}={_either(fitting)}"] if fitting else []
     model = "" if group == "model" else f" does not fit model={choices.get('model')}, as it"
     choose = f"; choose {', or '.join(advice)}" if advice else ""

@@ -60,8 +60,8 @@ def build(job: Job) -> Run:
     """Build a run, and have the filter look at one image.
 
     Raises:
-        UserError: A setting is wrong, or pieces do not fit each other: now, not after the hour that
-            it takes to the first validation.
+        UserError: A setting is wrong, or components do not fit each other: now, not after the hour
+            that it takes to the first validation.
     """
     settle(job.cfg.threads, job.cfg.seed)
     # first, since they are the sooner to complain

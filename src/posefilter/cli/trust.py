@@ -4,7 +4,7 @@ A name is allowed before its module is imported, and must then be defined where 
 nothing is reached through another module's imports (`posefilter.cli.command.os.system`). There are
 two scopes. `CONFIG` is for settings that the user composes: components, data, callbacks, the
 trainer and loggers. `RECIPE` is for settings that a checkpoint carries: components alone, the
-pieces that a method is made of. They are classes that compute; none writes a file or starts a
+components that a method is made of. They are classes that compute; none writes a file or starts a
 process.
 
 A plug-in is trusted by the user alone: `plugins=[my_package]` on the command line,

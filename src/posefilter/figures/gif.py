@@ -15,7 +15,7 @@ from posefilter.figures.canvas import (
 )
 from posefilter.figures.silhouettes import _LINE
 
-# colors that a animation's palette must have, however few of its pixels show them: weights, lines,
+# colors that an animation's palette must have, however few of its pixels show them: weights, lines,
 # writing
 _KEPT = np.concatenate(
     [

@@ -1,1 +1,1 @@
-"""The particle filter and the pieces that are injected into it."""
+"""The particle filter and the components that are injected into it."""

@@ -112,8 +112,8 @@ class ImageSpace(PoseEstimator):
         self.aux_losses = {name: aux for name, aux in (aux_losses or {}).items() if aux is not None}
         self.loss_schedule = tuple(loss_schedule or ())
         check_loss_schedule(self.loss_schedule, ["loss", "relevance", *(aux_losses or {})])
-        for piece in (box_head, *(aux.loss for aux in self.aux_losses.values())):
-            check_latent_width(self.latent_width, getattr(piece, "latent_width", None))
+        for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
+            check_latent_width(self.latent_width, getattr(component, "latent_width", None))
         self.relevance_weight, self.detach_position, self.truncate = (
             relevance,
             detach_position,
