@@ -4,6 +4,7 @@ Rows are then chosen like files of `conf/ablation/`: `ablation=c2_glimpse`, or a
 sweep by `sweep=ablation`.
 """
 
+from functools import cache
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -52,6 +53,7 @@ def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[st
     }
 
 
+@cache
 def register_ablations() -> None:
     """Register the table with Hydra: `ablation=NAME`, `sweep=ablation` and `sweep=ablation_detect`.
 
