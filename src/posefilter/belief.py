@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from posefilter.errors import UserError
+from posefilter.files import open_whole
 from posefilter.filters.modes import find_pose_modes
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.pose_statistics import covariance_about
@@ -132,12 +133,17 @@ class Belief:
 
         Its arrays are `poses` (N, 4, 4) and `weights` (N,) in float32, and `center`, `radius`,
         `diameter` and `object`.
+
+        Raises:
+            UserError: It cannot be written.
         """
+        file = Path(path)
+        file = file if file.suffix == ".npz" else file.with_name(f"{file.name}.npz")
         named = {field.name: getattr(self, field.name) for field in fields(self)}
         poses, weights = named.pop("samples"), named.pop("weights")
-        np.savez_compressed(
-            path, poses=poses.astype(np.float32), weights=weights.astype(np.float32), **named
-        )
+        poses, weights = poses.astype(np.float32), weights.astype(np.float32)
+        with open_whole(file, sync=False) as stream:
+            np.savez_compressed(stream, poses=poses, weights=weights, **named)
 
     @classmethod
     def load(cls, path: str | Path) -> "Belief":

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import torch
 
+from posefilter.data.readers.plausible import find_focal_flaw, find_matrix_flaw
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
@@ -51,7 +52,7 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
         raise UserError(f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[:3]}")
     if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
         raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
-    K = check_intrinsics(K, len(z))
+    K = check_intrinsics(K, len(z), z.shape[2])
     return Images(_check_color(color), _check_depth(z, empty), K), batched
 
 
@@ -96,6 +97,8 @@ def _check_color(color: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(color)
     if color.dtype.kind != "f":
         raise UserError(f"rgb: is {color.dtype}; uint8 is due, or float in [0, 1]")
+    if not np.isfinite(color).all():
+        raise UserError("rgb: holds NaN or infinity")
     if not (color.min() >= 0 and color.max() <= 1):
         raise UserError(
             f"rgb: floats should lie in [0, 1], not in [{color.min():.3g}, {color.max():.3g}]"
@@ -122,16 +125,27 @@ def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
     return z
 
 
-def check_intrinsics(K: np.ndarray, count: int) -> np.ndarray:
+def check_intrinsics(K: np.ndarray, count: int, width: int | None = None) -> np.ndarray:
     """Return camera matrices as float64 (count, 3, 3) [px].
 
-    Raises UserError where they are none.
+    Args:
+        K: Camera matrix (3, 3), or one each (count, 3, 3) [px].
+        count: How many are due.
+        width: Of the images [px], for which focal lengths must be plausible; None: not checked.
+
+    Raises:
+        UserError: They are none.
     """
     if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
         raise UserError(f"intrinsics: has shape {K.shape}; a camera matrix (3, 3) [px] is due")
     K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)
-    if not np.isfinite(K).all() or not (K[:, 2] == (0, 0, 1)).all():
-        raise UserError("intrinsics: its last row should be 0 0 1 (transposed?)")
-    if not (K[:, [0, 1], [0, 1]] > 0).all():
-        raise UserError("intrinsics: focal lengths must be positive [px]")
+    if not np.isfinite(K).all():
+        raise UserError("intrinsics: hold NaN or infinity")
+    for one in K:
+        flaw = find_matrix_flaw(one)
+        if flaw:
+            raise UserError(f"intrinsics: are no camera matrix ({flaw})")
+        flaw = "" if width is None else find_focal_flaw(one, width)
+        if flaw:
+            raise UserError(f"intrinsics: focal lengths are not plausible ({flaw})")
     return K

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from posefilter.cli.best import Last
-from posefilter.cli.files import WholeCheckpoints, open_whole, save_whole
+from posefilter.cli.files import WholeCheckpoints, save_whole
+from posefilter.files import open_whole
 
 
 class Small(LightningModule):

@@ -339,5 +339,5 @@ def test_a_single_bad_frame_is_listed(tmp_path, case):
     ],
 )
 def test_settings_that_make_no_sense_are_named(tmp_path, name, value):
-    with pytest.raises(UserError, match=rf"^data\.{name}={value}: must be a number"):
+    with pytest.raises(UserError, match=rf"^data\.{name}={value}: must be a (whole )?number"):
         PoseDataModule("fat", tmp_path, **{name: value})

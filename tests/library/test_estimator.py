@@ -173,7 +173,7 @@ def test_pictures(small: posefilter.Estimator) -> None:
         ({"rgb": np.ones((240, 320, 3), np.int64)}, "uint8 is due"),
         ({"intrinsics": np.ones(4)}, "camera matrix"),
         ({"intrinsics": np.array([[300.0, 0, 0], [0, 300, 0], [160, 120, 1]])}, "transposed"),
-        ({"intrinsics": np.diag([300.0, 0, 1])}, "focal lengths"),
+        ({"intrinsics": np.diag([300.0, 0, 1])}, "fy 0"),
     ],
 )
 def test_wrong_images_are_refused_in_one_line(change: dict[str, np.ndarray], told: str) -> None:

@@ -13,6 +13,7 @@ from lightning import LightningModule, Trainer
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
+from posefilter.files import open_whole, open_whole_text
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -138,8 +139,7 @@ def write_poses_csv(path: Path, rows: Sequence[PoseRow]) -> None:
     """Write a BOP results file: R row by row, t in millimeters, every digit kept, so that reading
     gives the same numbers.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    with open_whole_text(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(HEADER)
         for row in rows:
@@ -228,17 +228,18 @@ def write_beliefs(
     The ids are scene_id, im_id and obj_id, as in poses.csv. Image i of one array is image i of the
     others.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     own = [records[outcome.frame_id] for outcome in outcomes]
     poses = [
         to_native(o.poses, native_from_mesh(r.object)).astype(np.float32)
         for o, r in zip(outcomes, own, strict=True)
     ]
-    np.savez_compressed(
-        path,
-        poses=np.stack(poses) if poses else np.zeros((0, 0, 4, 4), np.float32),
-        weights=np.stack([o.weights for o in outcomes]) if poses else np.zeros((0, 0), np.float32),
-        scene_id=np.array([r.scene_id for r in own], np.int64),
-        im_id=np.array([r.im_id for r in own], np.int64),
-        obj_id=np.array([r.obj_id for r in own], np.int64),
-    )
+    weights = [o.weights for o in outcomes]
+    with open_whole(path) as file:
+        np.savez_compressed(
+            file,
+            poses=np.stack(poses) if poses else np.zeros((0, 0, 4, 4), np.float32),
+            weights=np.stack(weights) if weights else np.zeros((0, 0), np.float32),
+            scene_id=np.array([r.scene_id for r in own], np.int64),
+            im_id=np.array([r.im_id for r in own], np.int64),
+            obj_id=np.array([r.obj_id for r in own], np.int64),
+        )

@@ -13,6 +13,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import FileWriter
 
 from posefilter.figures.canvas import to_jpeg
+from posefilter.files import write_whole
 
 # The order of the tab Images: what answers "does it work" comes first.
 # What is in no group is only written to the run's folder.
@@ -65,8 +66,7 @@ def post_image(
                 Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step
             )
     if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{stage}_{name}{suffix}").write_bytes(packed)
+        write_whole(folder / f"{stage}_{name}{suffix}", packed)
 
 
 def measure_size(drawn: np.ndarray | bytes) -> tuple[int, int]:

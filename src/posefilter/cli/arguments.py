@@ -26,6 +26,28 @@ def bracketed(arguments: list[str]) -> list[str]:
     ]
 
 
+def quoted(arguments: Sequence[str]) -> list[str]:
+    """Return settings with quotes round values that Hydra's grammar has no place for, such as a
+    folder with an umlaut in its name; each part of a list of values by itself.
+    """
+    out = []
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        odd = re.search(r"[^\x20-\x7e]|[=#&;!^`]", value) is not None
+        if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
+            parts = (part.replace("'", "\\'") for part in value.split(","))
+            argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)
+        out.append(argument)
+    return out
+
+
+def _written(value: str) -> bool:
+    """Tell whether a value is written in Hydra's grammar: quoted, a list, or one that refers to
+    another.
+    """
+    return value.startswith(("'", '"', "[", "{")) or "${" in value or value.rstrip().endswith(")")
+
+
 def check_choices(arguments: list[str], conf: Path) -> None:
     """Raise UserError where a group is given a value instead of the name of one of its files, where
     a choice is typed as a setting, and for names that have changed: Hydra stumbles over them.

@@ -21,11 +21,17 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.cli.ablation_configs import register_ablations
-from posefilter.cli.arguments import bracketed, check_choices, defer_settings, spelled
+from posefilter.cli.arguments import (
+    bracketed,
+    check_choices,
+    defer_settings,
+    quoted,
+    spelled,
+)
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.fit import check_fit
-from posefilter.cli.folders import forget_failure, note_failure, remove_if_empty
+from posefilter.cli.folders import forget_failure, hold_folder, note_failure, remove_if_empty
 from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
@@ -44,13 +50,23 @@ from posefilter.errors import (
     Stopped,
     UserError,
 )
+from posefilter.locks import release, release_all
 from posefilter.paths import find_conf
 
 Work = Callable[[Job], Any]
-EXPECTED = (UserError, HydraException, OmegaConfBaseException, FloatingPointError)
+EXPECTED = (
+    UserError,
+    HydraException,
+    OmegaConfBaseException,
+    FloatingPointError,
+    OSError,  # a full disk, a folder that may not be written
+    MemoryError,
+)
 _FAILED = (FloatingPointError, ProblemsFound)  # nothing is wrong with the command line
-_EXTRA = ("optuna", "submitit_local", "submitit_slurm")  # choices that packages of others bring
+# choices that packages of others bring
+_EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 _MULTIRUN = ("-m", "--multirun")
+_OWN_FOLDER = ("train", "evaluate", "predict", "check_data")  # others write to a folder of another
 
 
 def run_command(name: str, home: Path | None = None, arguments: list[str] | None = None) -> int:
@@ -79,7 +95,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             raise UserError("--cfg shows the settings of one job; leave -m out")
         arguments = with_resumed(bracketed(arguments))
         check_choices(arguments, conf)  # a resumed run's too
-        arguments = loosen(arguments, name) + logging_for(arguments)
+        arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
             _task(name)
@@ -97,6 +113,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return FAILURE if isinstance(error, _FAILED) else MISTAKE
     finally:
         sys.argv = before
+        release_all()
     return 0
 
 
@@ -108,8 +125,10 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
         console = job.cfg.get("console", JSON)
         settle_logging(console)
         try:
+            check_settings(cfg, name)
+            if name in _OWN_FOLDER:
+                hold_folder(job.folder)
             forget_failure(job)
-            check_settings(cfg)
             use_plugins(cfg)
             check_files(name, cfg)
             if name == "train":
@@ -127,8 +146,12 @@ def _task(name: str) -> Callable[[DictConfig], Any]:
                 return math.nan
             if not isinstance(error, EXPECTED):
                 raise
+            release(job.folder)
             remove_if_empty(job.folder, job.name)
             raise Carrier(error) from error
+        finally:
+            if job.swept:
+                release(job.folder)
 
     return task
 
@@ -214,6 +237,11 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
 def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:
     """Return a mistake as one line that names the key and the nearest valid one."""
     text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        place = "a file" if error.filename is None else str(error.filename)
+        return f"{place}: cannot be read or written ({error.strerror})"
+    if isinstance(error, MemoryError):
+        return "out of memory: fewer particles, smaller batches or images take less"
     if (
         isinstance(error, MissingConfigException)
         and error.options is not None

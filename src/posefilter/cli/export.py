@@ -5,14 +5,14 @@ if wished) and object.
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import ended, typed
 from posefilter.cli.evaluate import OF_THE_CHECKPOINT
+from posefilter.cli.files import pack_whole
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
+from posefilter.files import write_whole
 from posefilter.models.quantization import pack, unpack
 
 _KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
@@ -46,14 +46,11 @@ def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:
         UserError: It cannot be used, or is larger than `max_mb`.
     """
     method_of(stripped, lightning=False)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.name}.part")
-    torch.save(stripped, partial)
-    size = partial.stat().st_size / 1e6
+    content = pack_whole(stripped)
+    size = len(content) / 1e6
     if size > max_mb:
-        partial.unlink()
         raise UserError(f"out={out}: {size:.1f} MB, more than max_mb={max_mb}")
-    partial.replace(out)
+    write_whole(out, content, sync=True)
     return size
 
 

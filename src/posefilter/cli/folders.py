@@ -1,6 +1,7 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,13 @@ from omegaconf import DictConfig
 
 from posefilter.cli.job import Job
 from posefilter.errors import Carrier, UserError
+from posefilter.files import remove_parts, write_whole
+from posefilter.locks import hold
 
 FAILED = "failed.json"  # in the folder of a sweep's job
 OUTPUTS = "outputs"  # where commands write unless told otherwise
+_WRITTEN = (".", "checkpoints", "figures", "beliefs")  # folders of ours in a command's folder
+_RANKS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")
 _BY_HYDRA = ("config.yaml", "hydra.yaml", "overrides.yaml")
 
 
@@ -30,17 +35,39 @@ class KeepResults(Callback):
             refuse(
                 folder, f"a run already; choose another folder, or go on with it: resume={folder}"
             )
+        hold_or_refuse(folder)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check a sweep's folder: an earlier start of the sweep is gone on with."""
         folder = Path(config.hydra.sweep.dir)
         if holds_run(folder):
             refuse(folder, "a single run; choose another folder for a sweep")
+        hold_or_refuse(folder)
 
 
 def refuse(folder: Path, what: str) -> None:
     """Raise what passes Hydra."""
     raise Carrier(UserError(f"out={folder}: holds {what}"))
+
+
+def hold_folder(folder: Path) -> None:
+    """Hold a command's folder for this process, and remove what one that was killed has left there.
+
+    Raises:
+        UserError: Another process holds it, or it cannot be written to.
+    """
+    if any(os.environ.get(rank, "0") != "0" for rank in _RANKS):
+        return  # one of several processes of a training: the first of them holds it
+    if hold(folder):
+        remove_parts(folder, _WRITTEN)
+
+
+def hold_or_refuse(folder: Path) -> None:
+    """Hold a folder as `hold_folder`, but raise what passes Hydra."""
+    try:
+        hold_folder(folder)
+    except UserError as error:
+        raise Carrier(error) from error
 
 
 def holds_run(folder: Path) -> bool:
@@ -79,7 +106,7 @@ def remove_if_empty(folder: Path, command: str) -> None:
 def note_failure(job: Job, cause: str) -> None:
     """Write down why a sweep's job has no result, until it has one."""
     content = {"overrides": job.overrides, "error": cause}
-    (job.folder / FAILED).write_text(json.dumps(content, indent=2) + "\n")
+    write_whole(job.folder / FAILED, json.dumps(content, indent=2) + "\n")
 
 
 def forget_failure(job: Job) -> None:

@@ -9,8 +9,19 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
+from posefilter.ranges import check_ranges
 
-_WHOLE = ("seed", "threads")
+_ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
+# settings that a command cannot do without
+_NEEDED = {
+    "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
+    "predict": ("seed", "out"),
+    "generate": ("seed",),
+    "check_data": ("data", "out"),
+    "evaluate": ("trainer",),
+    "onboard": ("seed", "budget_minutes", "test_frames", "workers"),
+    "export": ("points", "max_mb"),
+}
 
 
 @dataclass(frozen=True)
@@ -68,14 +79,28 @@ def run_of(path: Any) -> str:
     )
 
 
-def check_settings(cfg: DictConfig) -> None:
-    """Raise UserError where a setting that every command has is not of its kind."""
-    for key in _WHOLE:
-        value = cfg.get(key)
-        if value is not None and (
-            not isinstance(value, int) or isinstance(value, bool) or value < 0
-        ):
-            raise UserError(f"{key}={value}: must be a whole number, 0 or more")
+def check_settings(cfg: DictConfig, command: str) -> None:
+    """Check what needs nothing but the settings, before torch is imported.
+
+    Args:
+        cfg: The settings.
+        command: The command's name.
+
+    Raises:
+        UserError: A number is outside of its range, or another setting makes no sense.
+    """
+    plain = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(plain, dict)
+    check_ranges({str(key): value for key, value in plain.items()}, command)
+    for key in _NEEDED.get(command, ()):
+        if plain.get(key) is None:
+            raise UserError(f"{key}=null: {command} cannot do without; leave it out")
+    accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
+    if accelerator not in _ACCELERATORS:
+        raise UserError(
+            f"trainer.accelerator={accelerator}: there is none of this name; choose "
+            f"{', '.join(_ACCELERATORS)}"
+        )
     tags = cfg.get("tags") or []
     if not (isinstance(tags, ListConfig | list) and all(isinstance(tag, str) for tag in tags)):
         raise UserError(f"tags={tags}: must be a list of words, such as tags=[first]")

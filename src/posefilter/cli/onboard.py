@@ -2,7 +2,6 @@
 on.
 """
 
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.cli.command import compose_job
 from posefilter.cli.console import ended, say, typed
 from posefilter.cli.export import strip, write_weights
+from posefilter.cli.folders import hold_folder
 from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
@@ -29,6 +29,7 @@ from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
 from posefilter.cli.train import build, finish, fit, test
 from posefilter.errors import UserError
+from posefilter.files import write_whole
 from posefilter.meshes.inspect_mesh import list_concerns
 from posefilter.meshes.mesh import Mesh
 from posefilter.paths import find_conf
@@ -165,9 +166,9 @@ def onboard(job: Job) -> None:
     """Write weights, symmetries, renders, the training's run and a report."""
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
-    check(cfg)
     mesh = read_onboarded(cfg)
     out = Path(cfg.out) if cfg.out else Path("outputs") / "onboard" / mesh.name
+    hold_folder(out)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD))
     for number, stage in enumerate(STAGES, 1):
         settings = work.settings_of(stage)
@@ -180,18 +181,6 @@ def onboard(job: Job) -> None:
         say(cfg.console, "stage", head + tail, stage=stage.name, done=False, seconds_left=left)
         work.stages.run(stage.name, settings, partial(stage.do, work), stage.costly)
     tell(work)
-
-
-def check(cfg: DictConfig) -> None:
-    """Raise UserError where a number cannot be meant."""
-    for key in ("budget_minutes", "steps", "frames", "test_frames", "workers", "mesh_scale"):
-        value = cfg[key]
-        whole = key not in ("budget_minutes", "mesh_scale")
-        if value is None and key not in ("budget_minutes", "test_frames", "workers"):
-            continue
-        good = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-        if not good or not 0 < value < math.inf:
-            raise UserError(f"{key}={value}: must be a positive {'whole ' if whole else ''}number")
 
 
 def store_meshes(work: Onboarding) -> None:
@@ -262,10 +251,9 @@ def report(work: Onboarding) -> None:
         work.out / "symmetries.png",
     )
     folder = work.out / "report"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(page.render())
+    write_whole(folder / "report.html", page.render())
     for name, png in page.files().items():
-        (folder / name).write_bytes(png)
+        write_whole(folder / name, png)
 
 
 def tell(work: Onboarding) -> None:

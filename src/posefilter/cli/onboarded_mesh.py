@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
 from posefilter.figures.symmetries import describe_turn, draw_symmetries
+from posefilter.files import write_whole
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.find_symmetries import (
@@ -112,7 +113,7 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         entry = {"symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in group[1:]]}
         found = f"{len(group)} symmetries of {wanted}"
     file = out / "meshes" / mesh.name / "symmetries.json"
-    file.write_text(json.dumps(entry, indent=1) + "\n")
+    write_whole(file, json.dumps(entry, indent=1) + "\n")
     source = {
         "found": "found on shape and texture",
         "geometry": "found on the shape alone",

@@ -195,6 +195,8 @@ def read_intrinsics(numbers: Any) -> np.ndarray:
         fx, fy, cx, cy = (float(part) for part in parts)
     except ValueError as error:
         raise UserError(f"intrinsics={numbers}: four numbers are due, fx,fy,cx,cy [px]") from error
+    if not np.isfinite([fx, fy, cx, cy]).all():
+        raise UserError(f"intrinsics={numbers}: hold NaN or infinity")
     if fx <= 0 or fy <= 0:
         raise UserError(f"intrinsics={numbers}: focal lengths must be positive [px]")
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

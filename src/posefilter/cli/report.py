@@ -12,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from posefilter.cli.console import ended
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
+from posefilter.files import write_whole
 from posefilter.paths import check_links
 from posefilter.report.comparison_page import make_comparison_page, read_two_runs
 from posefilter.report.gather import Run, read_run
@@ -60,11 +61,10 @@ def report(job: Job) -> None:
         if job.cfg.out
         else folder / ("comparison" if kind == "runs" else "report")
     )
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "report.html").write_text(page.render())
+    write_whole(out / "report.html", page.render())
     files = page.files()
     for name, png in files.items():
-        (out / name).write_bytes(png)
+        write_whole(out / name, png)
     ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})
 
 

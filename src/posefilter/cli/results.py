@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from posefilter.cli.console import JSON, Files, ended, finite, show_table
-from posefilter.cli.files import open_whole
 from posefilter.cli.job import Job
 from posefilter.cli.machine import device_name, git_state, versions
+from posefilter.files import open_whole
 from posefilter.metrics.registry import find_metric, read_number
 
 _ROWS = (

@@ -91,7 +91,6 @@ class Stages:
             self._write()
 
     def _write(self) -> None:
-        self.file.parent.mkdir(parents=True, exist_ok=True)
         write_json(self.file, self.content)
 
 

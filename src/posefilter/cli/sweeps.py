@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from posefilter.cli.console import JSON, ended, typed
 from posefilter.cli.folders import FAILED
 from posefilter.errors import Carrier, UserError
+from posefilter.files import open_whole, open_whole_text, write_whole
 
 Row = dict[str, Any]
 
@@ -55,16 +56,17 @@ def summarize(folder: Path) -> list[Row]:
     rows, axes = read_rows(folder)
     found = [name for name in COLUMNS if any(row.get(name) is not None for row in rows)]
     names = [*axes, *found, *(["error"] if any("error" in row for row in rows) else []), "folder"]
-    with (folder / "summary.csv").open("w", newline="") as file:
+    with open_whole_text(folder / "summary.csv") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     lines = ["| " + " | ".join(names[:-1]) + " |", "|---" * (len(names) - 1) + "|"]
     lines += ["| " + " | ".join(_cell(row.get(name)) for name in names[:-1]) + " |" for row in rows]
-    (folder / "summary.md").write_text("\n".join(lines) + "\n")
+    write_whole(folder / "summary.md", "\n".join(lines) + "\n")
     ended = [row for row in rows if "error" not in row]
     if ended:
-        draw_summary(ended, axes).savefig(folder / "summary.png", dpi=120)
+        with open_whole(folder / "summary.png", sync=False) as image:
+            draw_summary(ended, axes).savefig(image, format="png", dpi=120)
     return rows
 
 

@@ -6,7 +6,7 @@ become bits.
 """
 
 import hashlib
-import os
+import io
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ import numpy as np
 
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
+from posefilter.files import open_whole, remove_parts, write_whole
 from posefilter.paths import check_inside
 
 CACHES = ("memory", "disk", "none")
@@ -25,6 +26,7 @@ _UNITS = 10_000.0  # a meter
 # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
 # read
 _LAYOUT = 2
+_STALE = 3600.0  # [s] after which a file that is not whole has no writer any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +104,7 @@ class DiskCache:
             (self.folder / "README").write_text(
                 f"decoded frames; may be deleted at any time\n{version}\n"
             )
+            remove_parts(self.folder, ["*"], _STALE)
         except OSError as error:
             raise UserError(
                 f"{folder}: the cache cannot be written ({error.strerror}); set data.cache_dir or "
@@ -128,7 +131,9 @@ class DiskCache:
         one = prepare(sample)
         image = self._image_path(record)
         if not image.is_file():
-            _write(image, lambda path: np.save(path, pack_image(sample)))
+            packed = io.BytesIO()  # into a file, NumPy tells a full disk without its number
+            np.save(packed, pack_image(sample))
+            write_whole(image, packed.getbuffer())
         parts = {
             "mask_bits": one.mask_bits,
             "numbers": np.array([*one.shape, one.object_id]),
@@ -136,10 +141,8 @@ class DiskCache:
             "pose": one.camera_from_object,
             "visibility": np.array(one.visibility),
         }
-        _write(
-            self._path(record.key, _stamp(record), ".npz"),
-            lambda path: np.savez(path, allow_pickle=False, **parts),
-        )
+        with open_whole(self._path(record.key, _stamp(record), ".npz"), sync=False) as file:
+            np.savez(file, allow_pickle=False, **parts)
         self._records[record.key] = one
         return one
 
@@ -258,11 +261,3 @@ def _stamp(record: FrameRecord, files: int | None = None) -> str:
     """Return what changes when a source file does: any of them, or the first two (color, depth)."""
     states = [path.stat() for path in record.files[:files] if path.exists()]
     return " ".join(f"{state.st_size}:{state.st_mtime_ns}" for state in states)
-
-
-def _write(path: Path, save: Callable[[Path], None]) -> None:
-    """Save beside the path, then rename."""
-    path.parent.mkdir(exist_ok=True)
-    partial = path.with_name(f".{os.getpid()}.{path.name}")
-    save(partial)
-    partial.replace(path)

@@ -19,11 +19,11 @@ from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.points import model_points
 from posefilter.data.prepare import Criteria, usable
-from posefilter.data.ranges import check_ranges
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore, object_model
+from posefilter.ranges import check_ranges
 from posefilter.types import Batch, ObjectModel
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class PoseDataModule(LightningDataModule):
             UserError: A value is impossible.
         """
         super().__init__()
-        check_ranges(locals())
+        check_ranges(locals(), "data")
         if cache not in CACHES:
             raise UserError(f"data.cache={cache}: choose {', '.join(CACHES)}")
         if root is None:

@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from posefilter.files import write_whole
+
 Color = tuple[int, int, int]
 # neither is a color that photographs of cartons and tables are full of
 ESTIMATE: Color = (255, 80, 200)
@@ -252,5 +254,4 @@ def to_jpeg(picture: np.ndarray, quality: int = 85) -> bytes:
 
 def save_image(picture: np.ndarray, path: Path) -> None:
     """Write a picture as PNG, its folder made where it is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(to_png(picture))
+    write_whole(path, to_png(picture))

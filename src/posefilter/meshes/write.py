@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from posefilter.files import write_whole
 from posefilter.meshes.mesh import Mesh
 
 
@@ -18,7 +19,6 @@ def write_obj(mesh: Mesh, folder: Path) -> Path:
     Returns:
         The OBJ file.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     vertices, faces = mesh.vertices, mesh.faces
     if mesh.corner_colors is not None:  # OBJ keeps colors with vertices: each corner gets its own
         vertices = mesh.vertices[mesh.faces].reshape(-1, 3)
@@ -40,10 +40,12 @@ def write_obj(mesh: Mesh, folder: Path) -> Path:
         corners = [f"{v}/{t}/{n}" for v, t, n in zip(faces.ravel() + 1, place, normal, strict=True)]
     lines += [f"f {a} {b} {c}" for a, b, c in np.array(corners).reshape(-1, 3).tolist()]
     file = folder / "textured.obj"
-    file.write_text("\n".join(lines) + "\n")
+    done, texture = cv2.imencode(".png", cv2.cvtColor(mesh.texture, cv2.COLOR_RGB2BGR))
+    assert done
+    write_whole(folder / "texture.png", texture.tobytes())
     material = "newmtl material\nKd 1 1 1\nmap_Kd texture.png\n"
-    (folder / "textured.mtl").write_text(material)
-    cv2.imwrite(str(folder / "texture.png"), cv2.cvtColor(mesh.texture, cv2.COLOR_RGB2BGR))
+    write_whole(folder / "textured.mtl", material)
+    write_whole(file, "\n".join(lines) + "\n")
     return file
 
 

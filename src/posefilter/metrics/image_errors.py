@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import torch
 
+from posefilter.files import open_whole_text
 from posefilter.metrics.scores import summarize
 
 FILE = "errors.csv"
@@ -31,8 +32,7 @@ class ImageError(NamedTuple):
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
     """Write errors.csv with all digits, so that metrics.json can be recomputed from it exactly."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    with open_whole_text(path) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(ImageError._fields)
         writer.writerows(rows)

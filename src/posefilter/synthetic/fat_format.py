@@ -8,7 +8,6 @@ p_aligned_cm = [x y z 1] @ F.
 """
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 import torch
 
+from posefilter.files import write_whole
 from posefilter.geometry.rotation import quat_xyzw_from_matrix
 from posefilter.meshes.mesh import Mesh
 
@@ -164,14 +164,13 @@ def write_image(path: Path, image: np.ndarray) -> None:
     """Write a JPEG (from RGB) or a PNG, by the path's suffix; all of the file or nothing.
 
     Raises:
-        OSError: It cannot be written.
+        UserError: It cannot be written.
     """
     if path.suffix == ".jpg":
         ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
     else:
         ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])
-    if not ok:
-        raise OSError(f"{path}: the image could not be encoded")
+    assert ok
     write_bytes(path, data.tobytes())
 
 
@@ -182,9 +181,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file, all of it or nothing: to a temporary file that is then renamed."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
-    partial.write_bytes(data)
-    partial.replace(path)
+    write_whole(path, data)
 
 
 def depth_units(depth: np.ndarray) -> np.ndarray:

@@ -16,7 +16,10 @@ from typing import Any
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.files import remove_parts
+from posefilter.locks import LOCK, hold, release
 from posefilter.meshes.store import BUILTIN, MeshStore
+from posefilter.ranges import check_ranges
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.frame_renderer import Job, make_renderer
 from posefilter.synthetic.scenes import SceneSettings, choose_distractors
@@ -130,11 +133,18 @@ def generate(
     store = MeshStore(meshes, scale=job.mesh_scale)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
     check_meshes(job, store, todo)
-    _open_dataset(out, job, frames)
-    if todo:
-        log.info("rendering %d frames of %s into %s", len(todo), object, out)
-    began = time.perf_counter()
-    render_frames(job, out, todo, workers, progress, store)
+    held = hold(out, wait=True)
+    try:
+        if held:  # another process may have rendered meanwhile
+            todo = [i for i in todo if not all(path.is_file() for path in job.files(out, i))]
+        _open_dataset(out, job, frames)
+        if todo:
+            log.info("rendering %d frames of %s into %s", len(todo), object, out)
+        began = time.perf_counter()
+        render_frames(job, out, todo, workers, progress, store)
+    finally:
+        if held:
+            release(out)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
 
@@ -177,28 +187,21 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
 def _check(job: Job, frames: int, workers: int) -> None:
     """Raise UserError for impossible values."""
     low, high = job.scenes.distractors
-    rules = [
-        (frames < 1, f"frames={frames}: must be at least 1"),
-        (workers < 1, f"workers={workers}: must be at least 1"),
-        (job.frames_per_scene < 1, f"frames_per_scene={job.frames_per_scene}: must be at least 1"),
-        (
-            min(job.width, job.height) < 32,
-            f"size={job.width},{job.height}: at least 32 pixels a side",
-        ),
-        (low < 0 or high < low, f"distractors={low},{high}: needs 0 <= least <= most"),
-        (not 0 <= job.scenes.occlusion < 1, f"occlusion={job.scenes.occlusion}: a share in [0, 1)"),
-        (
-            not 0 <= job.scenes.occluded_share <= 1,
-            f"occluded_share={job.scenes.occluded_share}: a share in [0, 1]",
-        ),
-        (
-            not 0 <= job.scenes.tabletop_share <= 1,
-            f"tabletop_share={job.scenes.tabletop_share}: a share in [0, 1]",
-        ),
-    ]
-    for wrong, message in rules:
-        if wrong:
-            raise UserError(message)
+    numbers = {
+        "frames": frames,
+        "workers": workers,
+        "seed": job.seed,
+        "frames_per_scene": job.frames_per_scene,
+        "size": [job.width, job.height],
+        "distractors": [low, high],
+        "occlusion": job.scenes.occlusion,
+        "occluded_share": job.scenes.occluded_share,
+        "tabletop_share": job.scenes.tabletop_share,
+        "mesh_scale": job.mesh_scale,
+    }
+    check_ranges(numbers, "generate")
+    if high < low:
+        raise UserError(f"distractors={low},{high}: needs 0 <= least <= most")
     sensor_model(job.sensor)
     make_renderer(job.renderer)
     if job.scenes.settle:
@@ -250,9 +253,8 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
             )
         else:
             frames = max(frames, before)
-        for partial in out.glob("mixed/*/.*.part"):
-            partial.unlink(missing_ok=True)
-    elif out.is_dir() and any(out.iterdir()):
+        remove_parts(out, [".", "mixed/*"])
+    elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
             f"{out}: not empty, and not begun by this generator (no {GENERATOR}); "
             f"choose another out="

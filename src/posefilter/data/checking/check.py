@@ -19,6 +19,7 @@ from posefilter.data.checking.frames import Suspect, describe_suspects, is_suspe
 from posefilter.data.frames import Implausible, NotShown, Reader
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
+from posefilter.files import write_whole
 from posefilter.meshes.store import MeshStore
 from posefilter.progress import watched
 
@@ -71,8 +72,7 @@ def check_dataset(
     report = {"objects": rows, "problems": problems}
     if out is not None:
         folder = Path(out)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "data_report.json").write_text(json.dumps(report, indent=2) + "\n")
+        write_whole(folder / "data_report.json", json.dumps(report, indent=2) + "\n")
         if tiles:
             write_sheet(folder / "contact_sheet.png", tiles)
     return report

@@ -10,6 +10,7 @@ import numpy as np
 
 from posefilter.data.checking.compare import Fit, View
 from posefilter.data.frames import tight_box
+from posefilter.files import write_whole
 
 _SIDE, _TEXT = 256, 20  # [px] of a tile and its line of text
 _RANGE = 0.02  # [m] of depth difference at full color
@@ -50,8 +51,9 @@ def write_sheet(path: Path, tiles: Sequence[np.ndarray], columns: int = 3) -> No
         row.extend([np.zeros_like(tiles[0])] * (min(columns, len(tiles)) - len(row)))
     sheet = np.concatenate([np.concatenate(row, axis=1) for row in rows])
     sheet = np.concatenate([legend(sheet.shape[1]), sheet])
-    if not cv2.imwrite(str(path), sheet[..., ::-1]):
-        raise OSError(f"{path}: the contact sheet could not be written")
+    done, packed = cv2.imencode(".png", sheet[..., ::-1])
+    assert done
+    write_whole(path, packed.tobytes())
 
 
 def legend(width: int) -> np.ndarray:

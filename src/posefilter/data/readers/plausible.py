@@ -28,15 +28,30 @@ def check_camera(K: np.ndarray, path: Path) -> None:
     """
     if not np.isfinite(K).all():
         raise BadData(path, "intrinsics hold NaN or infinity")
+    flaw = find_matrix_flaw(K)
+    if flaw:
+        raise BadData(path, "intrinsics are no camera matrix", flaw)
+
+
+def find_matrix_flaw(K: np.ndarray) -> str:
+    """Return why finite intrinsics (3, 3) [px] are no pinhole camera's, "" where they are."""
     if not np.allclose(K[2], [0, 0, 1], atol=1e-6):
         hint = "transposed?" if np.allclose(K[:, 2], [0, 0, 1], atol=1e-6) else "not [0, 0, 1]"
-        raise BadData(path, "intrinsics are no camera matrix", f"last row {K[2].tolist()}: {hint}")
+        return f"last row {K[2].tolist()}: {hint}"
     if min(K[0, 0], K[1, 1]) <= 0 or abs(K[1, 0]) > 1e-6 * K[1, 1]:
-        raise BadData(
-            path, "intrinsics are no camera matrix", f"fx {K[0, 0]:g}, fy {K[1, 1]:g} [px]"
-        )
-    if abs(K[0, 1]) > _SKEW * K[0, 0]:
-        raise BadData(path, "intrinsics are no camera matrix", f"skew {K[0, 1]:g} px")
+        return f"fx {K[0, 0]:g}, fy {K[1, 1]:g} [px]"
+    return f"skew {K[0, 1]:g} px" if abs(K[0, 1]) > _SKEW * K[0, 0] else ""
+
+
+def find_focal_flaw(K: np.ndarray, width: int) -> str:
+    """Return why focal lengths are not those of a camera with images so wide [px], "" where they
+    may be.
+    """
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    low, high = _FOCAL[0] * width, _FOCAL[1] * width
+    if low <= min(fx, fy) and max(fx, fy) <= high and 1 / _SQUARE <= fx / fy <= _SQUARE:
+        return ""
+    return f"fx {fx:g}, fy {fy:g} px for an image {width} px wide"
 
 
 def check_units(units: float, path: Path, key: str) -> None:
@@ -70,11 +85,10 @@ def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Pa
     if sample.mask.all():
         raise BadData(label, "the label covers the whole image")
     K, (height, width) = sample.intrinsics, sample.mask.shape
-    fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    low, high = _FOCAL[0] * width, _FOCAL[1] * width
-    if not (low <= min(fx, fy) and max(fx, fy) <= high and 1 / _SQUARE <= fx / fy <= _SQUARE):
-        detail = f"fx {fx:g}, fy {fy:g} px for an image {width} px wide"
-        raise Implausible(camera, "focal lengths are not plausible", detail, sample)
+    flaw = find_focal_flaw(K, width)
+    if flaw:
+        raise Implausible(camera, "focal lengths are not plausible", flaw, sample)
+    cx, cy = float(K[0, 2]), float(K[1, 2])
     if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
         detail = f"({cx:g}, {cy:g}) of {width}x{height}; another resolution's, or swapped with fx?"
         raise Implausible(camera, "principal point is far outside of the image", detail, sample)

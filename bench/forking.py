@@ -1,0 +1,113 @@
+"""Run commands in processes that are forked from one that has imported everything: torch's import
+takes seconds, a fork takes a few hundredths.
+"""
+
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import torch
+
+# what the commands import when they are called: before the fork, so that it is paid once
+import posefilter.cli.check_data
+import posefilter.cli.evaluate
+import posefilter.cli.export
+import posefilter.cli.generate
+import posefilter.cli.onboard
+import posefilter.cli.predict
+import posefilter.cli.report
+import posefilter.cli.train  # noqa: F401
+from posefilter.cli.command import run_command
+
+HOME = Path(__file__).parents[1]
+RAW = 70  # exit status of a process whose command ended in a traceback
+
+
+class Ended(NamedTuple):
+    """How a process ended."""
+
+    status: int | None  # its exit status, minus a signal's number, None: killed after `seconds`
+    seconds: float
+    out: str
+    err: str
+
+
+def prepare() -> None:
+    """Have no threads in this process, which a forked one would miss."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def start(
+    command: str, arguments: Sequence[str], log: Path, before: Callable[[], None] | None = None
+) -> int:
+    """Start a command in a forked process.
+
+    Args:
+        command: Its name.
+        arguments: What is typed after it.
+        log: Gets what it prints, in `<log>.out` and `<log>.err`.
+        before: Called first, in the new process.
+
+    Returns:
+        The process's number.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    number = os.fork()
+    if number:
+        return number
+    status = RAW
+    try:
+        os.setsid()
+        for name, stream in (("out", 1), ("err", 2)):
+            file = os.open(f"{log}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(file, stream)
+        if before is not None:
+            before()
+        status = run_command(command, HOME, list(arguments))
+    except SystemExit as asked:
+        status = asked.code if isinstance(asked.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def wait(number: int, log: Path, seconds: float) -> Ended:
+    """Wait for a process, and kill it where it takes longer."""
+    began = time.monotonic()
+    status: int | None = None
+    while True:
+        done, code = os.waitpid(number, os.WNOHANG)
+        spent = time.monotonic() - began
+        if done:
+            status = os.waitstatus_to_exitcode(code)
+            break
+        if spent > seconds:
+            os.kill(number, signal.SIGKILL)
+            os.waitpid(number, 0)
+            break
+        time.sleep(min(0.02, seconds))
+    texts = [Path(f"{log}.{name}") for name in ("out", "err")]
+    out, err = (t.read_text(errors="replace") if t.is_file() else "" for t in texts)
+    return Ended(status, spent, out, err)
+
+
+def run(
+    command: str,
+    arguments: Sequence[str],
+    log: Path,
+    seconds: float = 600,
+    before: Callable[[], None] | None = None,
+) -> Ended:
+    """Run a command in a forked process; see `start` and `wait`."""
+    return wait(start(command, arguments, log, before), log, seconds)

@@ -1,0 +1,84 @@
+"""Files that are whole or not there: written beside their target, synced, then renamed."""
+
+import io
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+from posefilter.errors import UserError
+
+_PARTS = ".*.part"
+
+
+@contextmanager
+def open_whole(path: Path, sync: bool = True) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes its name only when all of it is on the disk.
+
+    Args:
+        path: The file; missing folders are made.
+        sync: Whether to wait until the disk has it, so that it outlives a loss of power as well.
+
+    Raises:
+        UserError: It cannot be written, as on a full disk.  What had the name before still has it.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            yield file
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
+        part.replace(path)
+        if sync:
+            _sync_folder(path.parent)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise UserError(f"{path}: cannot be written ({error.strerror or error})") from error
+        raise
+
+
+@contextmanager
+def open_whole_text(path: Path, sync: bool = True) -> Iterator[TextIO]:
+    """Open a text for writing, in UTF-8, its line ends as they are written; as `open_whole`."""
+    with open_whole(path, sync) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        yield text
+        text.flush()
+        text.detach()
+
+
+def write_whole(path: Path, content: bytes | memoryview | str, sync: bool = False) -> None:
+    """Write a file, all of it or nothing; as `open_whole`."""
+    with open_whole(path, sync) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def remove_parts(folder: Path, places: Sequence[str], seconds: float = 0.0) -> None:
+    """Remove what writers that were killed have left.
+
+    Args:
+        folder: A folder in which nobody writes now; or `seconds` must say what is old.
+        places: Patterns of the folders in it that are looked at, "." for itself.
+        seconds: Only what is older.
+    """
+    for place in places:
+        for part in folder.glob(f"{place}/{_PARTS}"):
+            with suppress(OSError):  # of another user, or gone by now
+                if time.time() - part.lstat().st_mtime >= seconds:
+                    part.unlink()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have the disk keep a folder's list of names, where the system can."""
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)

@@ -1,0 +1,296 @@
+"""Ranges of numeric settings, in one table: a value that makes no sense is refused in one line, by
+its key, before anything is built.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from numbers import Integral, Real
+from typing import Any, NamedTuple
+
+from posefilter.errors import UserError
+from posefilter.limits import MOST_SIDE
+
+_OURS = ("posefilter.", "torch.", "lightning.")
+
+
+class Range(NamedTuple):
+    """What a setting may be, beside null."""
+
+    least: float
+    most: float = math.inf
+    whole: bool = False
+    above: bool = False  # the least value itself is too small
+    share: bool = False  # also a share of all: a number with a point, in [0, 1]
+    words: tuple[Any, ...] = ()  # other values that have a meaning
+
+    def holds(self, value: Any) -> bool:
+        """Tell whether a value lies within; NaN does not."""
+        if any(value == word and type(value) is type(word) for word in self.words):
+            return True
+        if isinstance(value, bool) or not isinstance(value, Real):
+            return False
+        if self.share and isinstance(value, float) and 0 <= value <= 1:
+            return not (self.above and value == 0)
+        if self.whole and not isinstance(value, Integral):
+            return False
+        try:
+            number = float(value)
+        except OverflowError:
+            return False
+        least = self.least < number if self.above else self.least <= number
+        return least and number <= self.most
+
+    def __str__(self) -> str:
+        """Return the range in words."""
+        parts = [f"{'above' if self.above else 'at least'} {self.least:g}"]
+        parts += [f"at most {self.most:.12g}"] if self.most < math.inf else []
+        shares = [f"a share in {'(' if self.above else '['}0, 1]"] if self.share else []
+        options = [f"a {'whole ' if self.whole else ''}number, {', '.join(parts)}", *shares]
+        return ", or ".join([*options, *map(str, self.words)])
+
+
+def _whole(least: float, most: float = math.inf, **more: Any) -> Range:
+    return Range(least, most, whole=True, **more)
+
+
+SHARE, WEIGHT, POSITIVE = Range(0, 1), Range(0, 1e6), Range(0, 1e6, above=True)
+COUNT, COUNT_OR_NONE, WIDTH = _whole(1, 1_000_000), _whole(0, 1_000_000), _whole(1, 65_536)
+SEED, LONG_SEED = _whole(0, 2**32 - 1), _whole(0, 2**63 - 1)
+METERS, PIXELS = Range(0, 100, above=True), Range(0, MOST_SIDE)
+BATCHES = _whole(0, share=True)
+
+# By the end of a setting's place, the command's name before it: of several that fit, the longest
+# counts.  tests/conf/test_ranges.py holds it to have every number of conf/.
+RANGES: dict[str, Range] = {
+    # every command
+    "seed": SEED,
+    "threads": _whole(1, 256),
+    "mesh_scale": Range(0, 1e6, above=True),
+    # data
+    "split_seed": LONG_SEED,
+    "min_visibility": SHARE,
+    "min_visibility_test": SHARE,
+    "batch_size": _whole(1, 100_000),
+    "batch_size_test": _whole(1, 100_000),
+    "data.workers": _whole(0, 256),
+    "limit_train": _whole(1),
+    "limit_val": _whole(1),
+    "limit_test": _whole(1),
+    "data.points": _whole(4, 1_000_000),
+    "image_width": _whole(16, MOST_SIDE),
+    "image_height": _whole(16, MOST_SIDE),
+    # data.augment: the rest is checked by its classes
+    "uniform_roll_probability": SHARE,
+    "probability": SHARE,
+    "augment.steps.strength": Range(0, 10),
+    "zoom": POSITIVE,
+    "augment.steps.size": Range(0, MOST_SIDE, above=True),  # pixels of a crop, or a share
+    "hue_deg": Range(0, 180),
+    "mixing": SHARE,
+    "tint": SHARE,
+    "steps.gamma": Range(0, 10),
+    "gain": Range(0, 10),
+    "length": SHARE,
+    "quality": _whole(1, 100),
+    # generate, and data.generate
+    "generate.frames": _whole(1, 10_000_000),
+    "generate.seed": LONG_SEED,
+    "generate.workers": _whole(1, 256),
+    "generate.size": _whole(32, MOST_SIDE),
+    "generate.camera": Range(-1e6, 1e6, words=("ycb_video", "fat")),
+    "generate.occlusion": Range(0, 0.999_999),
+    "generate.occluded_share": SHARE,
+    "generate.distractors": _whole(0, 1000),
+    "generate.tabletop_share": SHARE,
+    "generate.frames_per_scene": COUNT,
+    # other commands
+    "check_data.limit": _whole(1),
+    "predict.depth_scale": Range(1e-2, 1e7),
+    "export.points": COUNT,
+    "export.max_mb": Range(0, above=True),
+    "onboard.budget_minutes": Range(0, 1e6, above=True),
+    "onboard.steps": _whole(1, 10**9),
+    "onboard.frames": _whole(1, 10_000_000),
+    "onboard.test_frames": COUNT,
+    "onboard.workers": _whole(1, 256),
+    # trainer, callbacks
+    "trainer.max_steps": _whole(1, 10**12, words=(-1,)),
+    "trainer.min_steps": _whole(0, 10**12),
+    "trainer.max_epochs": _whole(1, 10**12, words=(-1,)),
+    "trainer.min_epochs": _whole(0, 10**12),
+    "trainer.val_check_interval": _whole(1, 10**12, above=False, share=True),
+    "trainer.check_val_every_n_epoch": COUNT,
+    "trainer.log_every_n_steps": _whole(0, 10**12),
+    "trainer.num_sanity_val_steps": _whole(-1, 10**12),
+    "trainer.gradient_clip_val": WEIGHT,
+    "trainer.accumulate_grad_batches": COUNT,
+    "trainer.limit_train_batches": BATCHES,
+    "trainer.limit_val_batches": BATCHES,
+    "trainer.limit_test_batches": BATCHES,
+    "trainer.limit_predict_batches": BATCHES,
+    "trainer.overfit_batches": BATCHES,
+    "trainer.num_nodes": COUNT,
+    "trainer.devices": _whole(1, 1024, words=("auto", -1)),
+    "every_n_validations": COUNT,
+    "save_top_k": _whole(-1, 1000),
+    "last.minutes": Range(0, 1e6),
+    # optimizer, scheduler
+    "lr": Range(0, 10),
+    "adam_lr": Range(0, 10),
+    "weight_decay": Range(0, 10),
+    "momentum": SHARE,
+    "optimizer.eps": Range(0, 1, above=True),
+    "betas": Range(0, 0.999_999_999),
+    "scheduler.warm_up": _whole(0, 10**12),
+    "scheduler.floor": SHARE,
+    # filter
+    "particles": _whole(1, 100_000),
+    "first_particles": _whole(1, 100_000),
+    "filter.steps": _whole(1, 10_000),
+    "depth_offset": Range(-10, 10),
+    "uniform_fraction": SHARE,
+    "object_fraction": SHARE,
+    "sigma_px": PIXELS,
+    "schedule.sigma": POSITIVE,
+    "schedule.start": POSITIVE,
+    "schedule.stop": POSITIVE,
+    "propagate.noise_scale": Range(0, 100),
+    "propagate.components.noise_scale": Range(0, 100),
+    "uniform_angle_probability": SHARE,
+    "resample.alpha": SHARE,
+    "resample.epsilon": POSITIVE,
+    "resample.iterations": COUNT,
+    "resample.threshold": SHARE,
+    "resample.floor": Range(0, 1, above=True),
+    "estimate.bandwidth": POSITIVE,
+    "estimate.radius": POSITIVE,
+    "estimate.scale_m": METERS,
+    "estimate.hypotheses": COUNT,
+    "estimate.iterations": COUNT_OR_NONE,
+    "estimate.options": COUNT,
+    "estimate.counts": Range(0, 1e6, above=True),
+    "refine.top_k": COUNT,
+    "refine.pixels": COUNT,
+    "refine.sigma": METERS,
+    "refine.components.top_k": COUNT,
+    "refine.components.pixels": COUNT,
+    "refine.components.sigma": METERS,
+    "refine.components.steps": COUNT_OR_NONE,
+    "refine.components.iterations": COUNT,
+    "refine.components.antithetic_pairs": COUNT,
+    "refine.components.start": METERS,
+    "refine.components.end": METERS,
+    # model
+    "model.pixels": COUNT,
+    "train_pixels": COUNT,
+    "likelihood_batch_size": _whole(1, 100_000),
+    "proposal_weight": WEIGHT,
+    "truncate": COUNT,
+    "relevance": WEIGHT,
+    "width": WIDTH,
+    "widths": WIDTH,
+    "hidden": _whole(0, 65_536),
+    "latent_width": _whole(0, 65_536),
+    "layers": _whole(1, 1000),
+    "blocks": _whole(1, 1000),
+    "levels": _whole(1, 64),
+    "kernel": _whole(1, 1001),
+    "context": _whole(0, 65_536),
+    "most_px": _whole(16, MOST_SIDE),
+    "fragments": WIDTH,
+    "glimpse.size": _whole(1, 1024),
+    "glimpse.spacing": Range(0, 1024, above=True),
+    "likelihood.spread": POSITIVE,
+    "displacement.reach": Range(0, 10, above=True),
+    "candidate_sampler.rays": COUNT,
+    "candidate_sampler.samples": COUNT,
+    "candidate_sampler.start": METERS,
+    "candidate_sampler.margin_behind": Range(0, 100),
+    "candidate_sampler.tolerance": METERS,
+    "candidate_sampler.candidates_per_kind": COUNT,
+    "candidate_sampler.proposals": COUNT_OR_NONE,
+    "candidate_sampler.particles": _whole(0, 100_000),
+    "candidate_sampler.levels": _whole(2, 1000),
+    "candidate_sampler.persistent_sigma_probability": SHARE,
+    "candidate_sampler.sigma": METERS,
+    "box_head.quantile": SHARE,
+    "train_filter.steps": _whole(1, 10_000),
+    # loss
+    "loss.points": COUNT,
+    "loss.max_pixels": COUNT,
+    "loss.scale": POSITIVE,
+    "loss.gamma": Range(0, 100),
+    "loss.alpha": SHARE,
+    "loss.weight": WEIGHT,
+    "aux_losses.displacement.weight": WEIGHT,
+    "aux_losses.likelihood.weight": WEIGHT,
+    "aux_losses.pose.weight": WEIGHT,
+    "fragment_weight": WEIGHT,
+    "offset_weight": WEIGHT,
+    "label.size": _whole(1, 1024),
+    "label.scale": POSITIVE,
+    "label.tolerance": METERS,
+    "label.surface_label": Range(-1e6, 1e6),
+    "label.behind_label": Range(-1e6, 1e6),
+    "label.reach": Range(0, 10, above=True),
+    "margin_px": PIXELS,
+    "loss_schedule.until": SHARE,
+    "loss_schedule.factors.loss": WEIGHT,
+    "loss_schedule.factors.likelihood": WEIGHT,
+    "loss_schedule.factors.displacement": WEIGHT,
+    "loss_schedule.factors.pose": WEIGHT,
+    "loss_schedule.factors.relevance": WEIGHT,
+    "loss_schedule.factors.sides": WEIGHT,
+}
+
+
+def check_ranges(settings: Mapping[str, Any], command: str) -> None:
+    """Check every number of a configuration.
+
+    Args:
+        settings: Plain settings; texts with interpolations are left to where they point.
+        command: The command's name, or `data` for the settings of the data alone.
+
+    Raises:
+        UserError: A setting is outside of its range, or no number where one is due; or any number
+            is not finite.
+    """
+    for key, value, ours in list_values(settings):
+        if value is None or (isinstance(value, str) and "${" in value) or value == "???":
+            continue
+        place = f"{command}.{key}"
+        allowed = find_range(place) if ours else None
+        if allowed is not None and not allowed.holds(value):
+            shown = (place if command == "data" else key).removesuffix("]")
+            shown = re.sub(r"\[\d+$", "", shown)  # of a list that is a setting's value
+            raise UserError(f"{shown}={value}: must be {allowed}")
+        if isinstance(value, float) and not math.isfinite(value):
+            raise UserError(f"{key}={value}: must be a finite number")
+
+
+def find_range(place: str) -> Range | None:
+    """Return the range of a setting, None where the table has none.
+
+    Args:
+        place: Dotted, the command's name first; without indices of lists.
+    """
+    parts = [part.partition("[")[0] for part in place.split(".")]
+    ends = [".".join(parts[i:]) for i in range(len(parts))]
+    return next((RANGES[end] for end in ends if end in RANGES), None)
+
+
+def list_values(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, Any, bool]]:
+    """Yield (key, value, ours) of each value that is no mapping or list; `ours` is False below a
+    class of a plug-in, whose settings may mean anything.
+    """
+    if isinstance(node, Mapping):
+        target = node.get("_target_")
+        ours = ours if target is None else str(target).startswith(_OURS)
+        for name, value in node.items():
+            yield from list_values(value, f"{key}.{name}" if key else str(name), ours)
+    elif isinstance(node, list | tuple):
+        for i, value in enumerate(node):
+            yield from list_values(value, f"{key}[{i}]", ours)
+    else:
+        yield key, node, ours

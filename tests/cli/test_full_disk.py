@@ -1,0 +1,87 @@
+"""On a full disk whatever is written ends in one line, and nothing half is left under its name."""
+
+import ctypes
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter.belief import Belief
+from posefilter.callbacks.records import PoseRow, write_beliefs, write_poses_csv
+from posefilter.cli.files import save_whole
+from posefilter.cli.results import write_json
+from posefilter.data.cache import DiskCache
+from posefilter.data.checking.contact_figure import write_sheet
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.errors import UserError
+from posefilter.figures.canvas import save_image
+from posefilter.metrics.image_errors import ImageError, write_errors
+from posefilter.synthetic.fat_format import write_image
+
+KILOBYTES = 64
+NOISE = np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def full_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return the folder of a file system of 64 kB; skip where none can be mounted."""
+    folder = tmp_path_factory.mktemp("disk")
+    libc = ctypes.CDLL(None, use_errno=True)
+    size = f"size={KILOBYTES}k".encode()
+    if libc.mount(b"tmpfs", os.fsencode(folder), b"tmpfs", 0, size) != 0:
+        pytest.skip("no file system can be mounted here")
+    yield folder
+    libc.umount2(os.fsencode(folder), 2)
+
+
+def belief(path: Path) -> None:
+    samples, random = np.tile(np.eye(4), (20_000, 1, 1)), np.random.default_rng(0)
+    samples[:, :3, 3] = random.random((20_000, 3))
+    weights = random.random(20_000)
+    Belief(samples, weights / weights.sum(), np.zeros(3), 0.1, 0.2, "toy").save(path)
+
+
+def beliefs(path: Path) -> None:
+    outcome: Any = type("", (), {"frame_id": 0, "weights": np.ones(4000, np.float32)})()
+    outcome.poses = np.tile(np.eye(4), (4000, 1, 1)) + NOISE.ravel()[:64_000].reshape(4000, 4, 4)
+    write_beliefs(path, [outcome] * 3, [record()], lambda name: np.eye(4))
+
+
+def record() -> FrameRecord:
+    return FrameRecord("a/0", "a", 0, 0, 1, "toy", 0, ())
+
+
+def cache(path: Path) -> None:
+    sample = Sample(NOISE, NOISE[..., 0] / 100, NOISE[..., 0] > 99, np.eye(3), np.eye(4), 0, 0, 1.0)
+    DiskCache(path, "1").keep(record(), sample)
+
+
+ROW = PoseRow(1, 2, 3, 0.5, np.eye(4), 0.1)
+ERROR = ImageError(*([0.5] * len(ImageError._fields)))  # type: ignore[arg-type]
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "checkpoint": lambda path: save_whole({"w": torch.rand(100_000)}, path),
+    "belief": belief,
+    "beliefs": beliefs,
+    "poses": lambda path: write_poses_csv(path, [ROW] * 2000),
+    "errors": lambda path: write_errors(path, [ERROR] * 5000),
+    "metrics": lambda path: write_json(path, [0.5] * 50_000),
+    "picture": lambda path: save_image(NOISE, path),
+    "contact sheet": lambda path: write_sheet(path, [NOISE]),
+    "render": lambda path: write_image(path, NOISE),
+    "cache": cache,
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_a_full_disk_is_one_line_and_leaves_nothing_half(kind: str, full_disk: Path) -> None:
+    name = {"belief": "a.npz", "render": "a.png"}.get(kind, "a")
+    with pytest.raises(UserError, match=r"cannot be written \(No space left on device\)") as caught:
+        WRITERS[kind](full_disk / name)
+    assert str(caught.value).startswith(str(full_disk))
+    assert "\n" not in str(caught.value)
+    left = [p for p in full_disk.rglob("*") if p.is_file() and p.name != "README"]
+    assert left == []

@@ -1,0 +1,148 @@
+"""Settings that make no sense are refused in one line with their key, before anything is built."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.cli import run_command
+from posefilter.cli.command import compose_job
+from posefilter.cli.job import check_settings
+from posefilter.cli.main import COMMANDS
+from posefilter.cli.options import open_groups
+from posefilter.errors import UserError
+from posefilter.ranges import RANGES, check_ranges, find_range, list_values
+
+HOME = Path(__file__).parents[2]
+CONF = HOME / "conf"
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def find_numbers() -> dict[str, Any]:
+    """Return every number that a file of conf/ sets, by its place, the command's name first."""
+    found = {}
+    for name in COMMANDS:
+        plain = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"), resolve=False)
+        found |= {f"{name}.{key}": (value, ours) for key, value, ours in list_values(plain)}
+    with open_groups() as groups:
+        folders = {file.parent for file in CONF.rglob("*/*.yaml")}
+        for folder in folders:
+            for option in groups.list_options(folder.relative_to(CONF).as_posix()):
+                values = list_values(option.settings)
+                found |= {f"train.{key}": (value, ours) for key, value, ours in values}
+    return {key: value for key, (value, ours) in found.items() if ours and is_number(value)}
+
+
+def test_every_number_has_a_range_and_lies_in_it() -> None:
+    numbers = {
+        key: value
+        for key, value in find_numbers().items()
+        # shares of the scenes are checked together, hydra's own keys by Hydra
+        if ".split." not in key and ".hydra." not in key
+    }
+    assert len(numbers) > 150
+    ranges = {key: find_range(key) for key in numbers}
+    assert [key for key, known in ranges.items() if known is None] == []
+    assert [k for k, known in ranges.items() if known and not known.holds(numbers[k])] == []
+
+
+def test_no_range_holds_what_is_no_number() -> None:
+    for key, allowed in RANGES.items():
+        for value in (math.nan, math.inf, -math.inf, True, "text", -1e30):
+            assert not allowed.holds(value) or value == allowed.most, (key, value)
+
+
+REFUSED = {
+    "train": {
+        "optimizer.lr": (-1, math.nan, math.inf, "fast"),
+        "optimizer.weight_decay": (-1, math.nan),
+        "trainer.gradient_clip_val": (-1,),
+        "trainer.max_steps": (-7, 0, 2.5),
+        "trainer.val_check_interval": (0, -1, 1.5),
+        "trainer.log_every_n_steps": (-1,),
+        "trainer.devices": (0, -2, "many"),
+        "trainer.accelerator": ("warp", 3),
+        "data.min_visibility": (math.nan, -1, 1.5),
+        "data.points": (0,),
+        "data.batch_size": (0, -3, 1.5),
+        "data.batch_size_test": (0,),
+        "data.workers": (-1, 1_000_000),
+        "data.limit_train": (-1, 0),
+        "data.limit_val": (0,),
+        "data.generate.frames": (0,),
+        "filter.particles": (0, 10**9),
+        "filter.first_particles": (0,),
+        "filter.steps": (0,),
+        "filter.schedule.start": (0, -1, math.nan),
+        "model.likelihood.width": (0, 10**9),
+        "threads": (0, 1_000_000, -1),
+        "seed": (-1, 4294967296, 0.5, None),
+        "loss": (None,),
+    },
+    "predict": {"depth_scale": (0, -1, 1e-9, math.nan), "seed": (-1,), "threads": (0,)},
+    "generate": {"frames": (0, -1), "workers": (0,), "occlusion": (1, math.nan), "size": (8,)},
+    "check_data": {"limit": (0, -1)},
+    "export": {"points": (0,), "max_mb": (0, None)},
+    "onboard": {"budget_minutes": (0, None, math.nan), "steps": (0,), "workers": (0,)},
+    "evaluate": {"threads": (0,)},
+}
+CASES = [
+    (command, key, value)
+    for command, settings in REFUSED.items()
+    for key, values in settings.items()
+    for value in values
+]
+
+
+@pytest.fixture(scope="module")
+def composed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, DictConfig]:
+    """Return each command's settings, as they are by default."""
+    folder = tmp_path_factory.mktemp("composed")
+    return {name: compose_job(name, CONF, [], folder).cfg for name in REFUSED}
+
+
+def test_defaults_pass(composed: dict[str, DictConfig]) -> None:
+    for name, cfg in composed.items():
+        check_settings(cfg, name)
+
+
+@pytest.mark.parametrize(("command", "key", "value"), CASES)
+def test_a_value_that_makes_no_sense_is_named(
+    command: str, key: str, value: Any, composed: dict[str, DictConfig]
+) -> None:
+    cfg = composed[command].copy()
+    OmegaConf.set_readonly(cfg, False)
+    OmegaConf.update(cfg, key, value)
+    shown = "null" if value is None else value
+    with pytest.raises(UserError) as caught:
+        check_settings(cfg, command)
+    assert str(caught.value).startswith(f"{key}={shown}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("command", "typed"), [("train", "optimizer.lr=nan"), ("predict", "threads=0")]
+)
+def test_a_command_says_so_in_one_line(
+    command: str, typed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(command, HOME, [typed, f"out={tmp_path / 'run'}"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: {typed}: must be a ")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_settings_of_a_plug_in_may_mean_anything() -> None:
+    own = {"model": {"likelihood": {"_target_": "my_package.Own", "width": -1}}}
+    check_ranges(own, "train")
+    with pytest.raises(UserError, match="width=nan: must be a finite number"):
+        check_ranges(
+            {"model": {"likelihood": {"_target_": "my_package.Own", "width": math.nan}}}, "train"
+        )
+    with pytest.raises(UserError, match="width=-1: must be a whole number"):
+        check_ranges({"model": {"likelihood": {"width": -1}}}, "train")
