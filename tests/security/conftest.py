@@ -4,6 +4,7 @@ ones of.
 
 import sys
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,20 @@ _ALWAYS = (  # that no loading of a file has to do with
 )
 
 _OWN = ("os.remove",)  # allowed in a run's own folder
+_armed: list["Watch"] = []
+
+
+@cache
+def _add_hook() -> None:
+    """Add one audit hook for all watches: Python removes none, and calls each at every `open`,
+    `import` and `id`, so that one a test would slow the rest of the session many times over.
+    """
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        for watch in _armed:
+            watch.see(event, arguments)
+
+    sys.addaudithook(hook)
 
 
 class Watch:
@@ -46,13 +61,12 @@ class Watch:
     """
 
     def __init__(self, secret: Path) -> None:
-        self.armed, self.secret, self.seen = False, secret, list[str]()
+        self.secret, self.seen = secret, list[str]()
         self.own: Path | None = None  # a folder that may be written to
-        sys.addaudithook(self._hook)  # for good: Python removes none
+        _add_hook()
 
-    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if not self.armed:
-            return
+    def see(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Write an event down if it is forbidden."""
         if (
             event in _ALWAYS
             and "__pycache__" not in str(arguments[:1])
@@ -75,11 +89,11 @@ class Watch:
         return self.own is not None and Path(str(path)).resolve().is_relative_to(self.own)
 
     def __enter__(self) -> "Watch":
-        self.armed = True
+        _armed.append(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.armed = False
+        _armed.remove(self)
 
 
 @pytest.fixture
@@ -98,7 +112,6 @@ def watch(secret: Path) -> Iterator[Watch]:
     """
     watching = Watch(secret)
     yield watching
-    watching.armed = False
     assert watching.seen == []
     assert [path.name for path in secret.iterdir()] == ["file.txt"]
     assert (secret / "file.txt").read_text() == "private"
