@@ -11,6 +11,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
+from tests.conf.conftest import compose_once
 
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices, list_choices
@@ -44,19 +45,17 @@ def compose(tmp_path: Path, *overrides: str, name: str = "train") -> Job:
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_every_variant_of_every_model_builds_with_a_legal_loss(
-    model: str, variant: str, tmp_path: Path
-) -> None:
-    job = compose(tmp_path, f"model={model}", f"variant={variant}")
+def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, variant: str) -> None:
+    job = compose_once(f"model={model}", f"variant={variant}")
     method = build_method(recipe(job))
     assert any(p.requires_grad for p in method.parameters())
     assert method.filter.particles == job.cfg.filter.particles
 
 
 @pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
-def test_what_a_preset_sets_holds(model: str, variant: str, tmp_path: Path) -> None:
+def test_what_a_preset_sets_holds(model: str, variant: str) -> None:
     """No choice later in the list of defaults may undo it."""
-    cfg = compose(tmp_path, f"model={model}", f"variant={variant}").cfg
+    cfg = compose_once(f"model={model}", f"variant={variant}").cfg
     body = OmegaConf.load(CONF / "preset" / model / f"{variant}.yaml")
     del body["defaults"]
     settings = dict(leaves(OmegaConf.to_container(body)))
@@ -66,11 +65,11 @@ def test_what_a_preset_sets_holds(model: str, variant: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("model", [m for m in MODELS if m != "pose_pf"])
-def test_a_papers_choices_are_had_at_the_working_size(model: str, tmp_path: Path) -> None:
+def test_a_papers_choices_are_had_at_the_working_size(model: str) -> None:
     """`preset/size` changes numbers alone, and makes them those of the working preset."""
-    paper = compose(tmp_path, f"model={model}", "variant=paper")
-    small = compose(tmp_path, f"model={model}", "variant=paper", f"preset/size={model}")
-    working = compose(tmp_path, f"model={model}")
+    paper = compose_once(f"model={model}", "variant=paper")
+    small = compose_once(f"model={model}", "variant=paper", f"preset/size={model}")
+    working = compose_once(f"model={model}", "variant=working")
     ignored = {"preset/size", "hydra/launcher"}
     assert {k: v for k, v in small.choices.items() if k not in ignored} == {
         k: v for k, v in paper.choices.items() if k not in ignored
@@ -102,7 +101,7 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("sweep", SWEEPS)
-def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None:
+def test_every_point_of_every_sweep_composes(sweep: str) -> None:
     model = "cnn_patch" if "detect" in sweep else "patch_pf"
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         swept = hydra_compose(
@@ -115,7 +114,7 @@ def test_every_point_of_every_sweep_composes(sweep: str, tmp_path: Path) -> None
     ]
     assert points
     for point in points:
-        job = compose(tmp_path, f"model={model}", point)
+        job = compose_once(f"model={model}", point)
         check_fit(job.cfg, job.choices, Scope.CONFIG)
 
 

@@ -8,6 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+from tests.conf.conftest import compose_once
 from toy import scenes, square
 
 from posefilter.cli.ablations import (
@@ -65,8 +66,8 @@ def test_every_legal_loss_takes_a_step(model: str, loss: str, variant: str, tmp_
 
 
 @pytest.mark.parametrize("model", KINDS)
-def test_the_papers_figures(model: str, tmp_path: Path) -> None:
-    job = compose_job("train", CONF, [f"model={model}", "variant=paper"], tmp_path)
+def test_the_papers_figures(model: str) -> None:
+    job = compose_once(f"model={model}", "variant=paper")
     want = {
         "pixel_pf": (1000, 10, 1),
         "patch_pf": (50, 100, 3),
@@ -182,13 +183,12 @@ SEVERAL = {  # ablations that are more than one change
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS, ids=[a.name for a in ABLATIONS])
-def test_each_ablation_changes_what_it_says(ablation: Ablation, tmp_path: Path) -> None:
+def test_each_ablation_changes_what_it_says(ablation: Ablation) -> None:
     """Its choices and settings are its parent's, but for its own overrides."""
     model = "cnn_patch" if ablation.name.startswith("box_") else "patch_pf"
     parent = ablation.parent if "=" in ablation.parent else f"ablation={ablation.parent}"
     before, after = (
-        compose_job("train", CONF, [f"model={model}", typed], tmp_path)
-        for typed in (parent, f"ablation={ablation.name}")
+        compose_once(f"model={model}", typed) for typed in (parent, f"ablation={ablation.name}")
     )
     assert len(ablation.overrides) == SEVERAL.get(ablation.name, "variant" not in ablation.parent)
     ignored = ("ablation", "hydra/launcher")
@@ -215,16 +215,14 @@ def test_each_ablation_changes_what_it_says(ablation: Ablation, tmp_path: Path) 
         ("ablation_detect", "cnn_patch", list_detector_ablations()),
     ],
 )
-def test_a_sweep_of_the_table_is_of_one_size(
-    sweep: str, model: str, names: list[str], tmp_path: Path
-) -> None:
+def test_a_sweep_of_the_table_is_of_one_size(sweep: str, model: str, names: list[str]) -> None:
     """All runs of a method with a pose are as large as the working preset; a detector's start from
     the paper's size, whose long roll-outs are among what fails.
     """
-    working = compose_job("train", CONF, [f"model={model}"], tmp_path).cfg
+    working = compose_once(f"model={model}", "variant=working").cfg
     for name in (names[0], names[-1]):
         typed = [f"model={model}", f"sweep={sweep}", f"ablation={name}"]
-        cfg = compose_job("train", CONF, typed, tmp_path).cfg
+        cfg = compose_once(*typed).cfg
         whole = sweep == "ablation" or name.startswith("box_m")
         assert (cfg.filter.steps == working.filter.steps) == whole
         assert (cfg.model.net.width == working.model.net.width) == whole
