@@ -1,5 +1,5 @@
-"""Strip a checkpoint to what predicts: python export.py checkpoint=RUN/checkpoints/best.ckpt
-out=weights/NAME.ckpt.
+"""Reduce a checkpoint to what prediction needs:
+python export.py checkpoint=RUN/checkpoints/best.ckpt out=weights/NAME.ckpt.
 """
 
 import sys

@@ -12,6 +12,11 @@ from posefilter.synthetic.generate import generate
 
 HOME = Path(__file__).parents[2]
 TINY = ["debug=smoke", "console=json", "threads=1", "logger=none", "data.progress=false"]
+SMALL_POSE_PF = [  # pose_pf with a small proposal network and hardly a refinement
+    "model.proposals.widths=[16,24,32,32]",
+    "filter.refine.components.0.pixels=64",
+    "filter.refine.components.1.iterations=1",
+]
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tests.smoke.conftest import SMALL_POSE_PF
 
 from posefilter.cli import run_command
 from posefilter.cli.evaluate import evaluate
@@ -67,6 +68,7 @@ def trained(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
         "data.progress=false",
         f"data.root={tiny_scenes}",
         f"out={run}",
+        *SMALL_POSE_PF,
     ]
     assert run_command("train", HOME, typed) == 0
     return run
@@ -265,7 +267,11 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
 ) -> None:  # type: ignore[no-untyped-def]
     train(
         tiny_job(
-            tmp_path, "model=cnn_patch", "trainer.max_steps=2", "trainer.val_check_interval=100"
+            tmp_path,
+            "model=cnn_patch",
+            "trainer.max_steps=2",
+            "trainer.val_check_interval=100",
+            "callbacks=none",
         )
     )
     assert read(tmp_path)["training"]["steps"] == 2
@@ -275,7 +281,8 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
 def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     found = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        train(tiny_job(tmp_path / name, "model=cnn_patch", f"seed={seed}", "trainer.max_steps=4"))
+        settings = ("model=cnn_patch", f"seed={seed}", "trainer.max_steps=4", "callbacks=none")
+        train(tiny_job(tmp_path / name, *settings))
         found.append(numbers(read(tmp_path / name)))
     assert found[0] == found[1]
     assert found[0] != found[2]
@@ -346,7 +353,6 @@ def test_components_that_do_not_fit_are_refused_before_any_training(
 def test_particles_are_resampled_by_optimal_transport(
     resample: str, tiny_job, tmp_path: Path
 ) -> None:
-    train(
-        tiny_job(tmp_path, "model=patch_pf", f"filter/resample={resample}", "trainer.max_steps=2")
-    )
+    settings = ("model=patch_pf", "trainer.max_steps=2", "callbacks=none")
+    train(tiny_job(tmp_path, f"filter/resample={resample}", *settings))
     assert 0 <= read(tmp_path)["particles_on_object"] <= 1

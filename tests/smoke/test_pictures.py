@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from PIL import Image, ImageColor
+from tests.smoke.conftest import SMALL_POSE_PF
 
 from posefilter.cli.train import train
 from posefilter.figures.canvas import TRUTH
@@ -36,6 +37,7 @@ def test_a_checkpoint_is_pictured(script: ModuleType, tiny_job, tmp_path: Path) 
             "trainer.max_steps=1",
             "trainer.val_check_interval=1",
             "data.limit_test=1",
+            *SMALL_POSE_PF,
         )
     )
     few = (1, 1)

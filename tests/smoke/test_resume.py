@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning import Callback, Trainer
-from tests.smoke.conftest import HOME, TINY
+from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 
 from posefilter.cli import build, run_command
 from posefilter.cli import train as training
@@ -47,6 +47,8 @@ def test_a_killed_run_goes_on_to_the_same_end(
         f"model={model}",
         f"trainer.val_check_interval={interval}",
         f"trainer.max_steps={3 * interval}",
+        *(SMALL_POSE_PF if model == "pose_pf" else []),
+        f"callbacks={'default' if (model, interval) == ('cnn_patch', 3) else 'none'}",
     ]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     training.train(tiny_job(whole, *settings))
@@ -98,6 +100,18 @@ class Sender(Lines):
             os.kill(os.getpid(), self.number)
 
 
+@pytest.fixture(scope="module")
+def uninterrupted(
+    tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[str], Path]:
+    """Return a run that nothing stopped: what was typed, and its folder."""
+    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=none"]
+    settings += ["trainer.val_check_interval=3", "trainer.max_steps=6", "data.batch_size_test=2"]
+    whole = tmp_path_factory.mktemp("runs") / "whole"
+    assert run_command("train", HOME, [*settings, f"out={whole}"]) == 0
+    return settings, whole
+
+
 @pytest.mark.parametrize(
     ("hook", "step", "number"),
     [
@@ -111,15 +125,14 @@ def test_a_stopped_run_prints_how_to_resume_and_ends_the_same(
     hook: str,
     step: int,
     number: int,
+    uninterrupted: tuple[list[str], Path],
     tiny_scenes: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=none"]
-    settings += ["trainer.val_check_interval=3", "trainer.max_steps=6", "data.batch_size_test=2"]
-    whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert run_command("train", HOME, [*settings, f"out={whole}"]) == 0
+    settings, whole = uninterrupted
+    cut = tmp_path / "cut"
     with monkeypatch.context() as patch:
         patch.setattr(build, "progress", lambda console: Sender(hook, step, number))
         before = signal.getsignal(number)

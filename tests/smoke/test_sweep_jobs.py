@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.smoke.conftest import HOME, TINY
+from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 
 from posefilter.cli import run_command
 
@@ -14,7 +14,7 @@ from posefilter.cli import run_command
 def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    typed = [*TINY, f"data.root={tiny_scenes}", "trainer.max_steps=2"]
+    typed = [*TINY, f"data.root={tiny_scenes}", "trainer.max_steps=2", *SMALL_POSE_PF]
     typed += ["-m", "filter.particles=4,0,8", f"out={tmp_path}"]
     assert run_command("train", HOME, typed) == 2
     out, err = capfd.readouterr()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from docs.run_tour import HOME, PAGE, call, commands, go_on, settings
+from tests.smoke.conftest import SMALL_POSE_PF
 
 from posefilter.data.splits import split_records
 
@@ -26,6 +27,7 @@ TOY = {  # what is added to each command so that all of them together take less 
         "trainer.max_steps=2",
         "trainer.val_check_interval=2",
         "data.limit_test=2",
+        *SMALL_POSE_PF,
     ],
     "predict": ["threads=1"],
 }

@@ -1,4 +1,4 @@
-"""Test a checkpoint, or poses from anywhere, on a dataset."""
+"""Test a checkpoint, or poses of any other method, on a dataset."""
 
 import shutil
 from math import nan

@@ -1,5 +1,5 @@
-"""Strip a checkpoint to what predicts: weights, recipe (with components of the filter chosen anew,
-if wished) and object.
+"""Reduce a checkpoint to what prediction needs: weights, object, and recipe (with components
+of the filter chosen anew, if wished).
 """
 
 from pathlib import Path

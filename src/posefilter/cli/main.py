@@ -9,13 +9,13 @@ from posefilter.errors import MISTAKE
 
 COMMANDS = {
     "train": "train a method and test it",
-    "evaluate": "test a checkpoint, or poses from anywhere, on a dataset",
-    "predict": "find one object or several in a photograph",
+    "evaluate": "test a checkpoint, or poses of any other method, on a dataset",
+    "predict": "estimate the pose of one object or several in an RGB-D image",
     "generate": "render a dataset",
-    "check_data": "check a dataset: its meshes drawn over its images",
-    "report": "explain a run or a sweep on one page",
-    "onboard": "from a mesh to trained weights and a report",
-    "export": "strip a checkpoint to what predicts",
+    "check_data": "check that a dataset and its meshes fit each other",
+    "report": "explain a run or a sweep, or compare two runs, on one HTML page",
+    "onboard": "go from a mesh to trained weights and a report",
+    "export": "reduce a checkpoint to what prediction needs",
 }
 _USAGE = "usage: posefilter COMMAND [setting=value ...]; posefilter COMMAND --help for its settings"
 

@@ -25,19 +25,19 @@ _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
 # the settings that are typed most, of sections that the chosen files fill
 _SECTIONS = {
     "train": {
-        "data.root": "the folder of the dataset; of scenes: where they are rendered",
-        "data.object": "the object, by its name in the dataset",
-        "filter.particles": "of the filter, with filter.steps",
-        "trainer.max_steps": "steps of the training",
+        "data.root": "folder of the dataset; with data=scenes, where scenes are rendered",
+        "data.object": "name of the object in the dataset",
+        "filter.particles": "number of particles; filter.steps: of iterations",
+        "trainer.max_steps": "number of training steps",
         "optimizer.lr": "learning rate",
     },
     "evaluate": {
-        "data.root": "the folder of the dataset",
+        "data.root": "folder of the dataset",
         "data.meshes": "builtin, or a folder of meshes",
-        "filter.particles": "of the filter, with filter.steps",
+        "filter.particles": "number of particles; filter.steps: of iterations",
     },
-    "predict": {"filter.particles": "of the filter, with filter.steps"},
-    "check_data": {"data.root": "the folder of the dataset"},
+    "predict": {"filter.particles": "number of particles; filter.steps: of iterations"},
+    "check_data": {"data.root": "folder of the dataset"},
 }
 
 
