@@ -24,7 +24,7 @@ def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     with (tmp_path / "summary.csv").open() as file:
         first, second, failed = csv.DictReader(file)
     assert [row["filter.particles"] for row in (first, second, failed)] == ["4", "8", "0"]
-    assert "must be 1 or more" in failed["error"]
+    assert "filter.particles=0: must be a whole number, at least 1" in failed["error"]
     assert failed["iou"] == first["error"] == second["error"] == ""
     assert (tmp_path / "summary.png").is_file()
 
