@@ -32,8 +32,9 @@ RAW = 70  # exit status of a process whose command ended in a traceback
 class Ended(NamedTuple):
     """How a process ended."""
 
-    status: int | None  # its exit status, minus a signal's number, None: killed after `seconds`
+    status: int | None  # its exit status, minus a signal's number; None: it took too long
     seconds: float
+    cpu: float  # of its own processor time [s]
     out: str
     err: str
 
@@ -87,19 +88,19 @@ def wait(number: int, log: Path, seconds: float) -> Ended:
     began = time.monotonic()
     status: int | None = None
     while True:
-        done, code = os.waitpid(number, os.WNOHANG)
+        done, code, used = os.wait4(number, os.WNOHANG)
         spent = time.monotonic() - began
         if done:
             status = os.waitstatus_to_exitcode(code)
             break
         if spent > seconds:
             os.kill(number, signal.SIGKILL)
-            os.waitpid(number, 0)
+            _, _, used = os.wait4(number, 0)
             break
         time.sleep(min(0.02, seconds))
     texts = [Path(f"{log}.{name}") for name in ("out", "err")]
     out, err = (t.read_text(errors="replace") if t.is_file() else "" for t in texts)
-    return Ended(status, spent, out, err)
+    return Ended(status, spent, used.ru_utime + used.ru_stime, out, err)
 
 
 def run(

@@ -85,7 +85,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()
-    before = sys.argv
+    before, begun = sys.argv, list[Job]()
     try:
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
@@ -98,7 +98,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
         hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
-            _task(name)
+            _task(name, begun)
         )()
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
@@ -111,17 +111,26 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             traceback.print_exception(error)
         print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
         return FAILURE if isinstance(error, _FAILED) else MISTAKE
+    except Exception as error:
+        if begun or trace:
+            raise
+        # Hydra's own code stumbles over a choice that is null or a number, and the like
+        groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
+        where = ", ".join(groups) or "the settings"
+        print(f"{name}: {where}: cannot be read ({first_line(error)})", file=sys.stderr)
+        return MISTAKE
     finally:
         sys.argv = before
         release_all()
     return 0
 
 
-def _task(name: str) -> Callable[[DictConfig], Any]:
-    """Return the function that Hydra calls for each job."""
+def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
+    """Return the function that Hydra calls for each job, which it adds to those that have begun."""
 
     def task(cfg: DictConfig) -> Any:
         job = job_of(cfg)
+        begun.append(job)
         console = job.cfg.get("console", JSON)
         settle_logging(console)
         try:

@@ -2,14 +2,17 @@
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
-from posefilter.cli.job import Job
+from posefilter.cli.job import Job, check_out
 from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
 from posefilter.locks import hold
@@ -27,6 +30,20 @@ class KeepResults(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Check a run's folder."""
         HydraConfig.instance().set_config(config)  # which the folder's name refers to
+        with passing_hydra():
+            self._check_run(config)
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Check a sweep's folder: an earlier start of the sweep is gone on with."""
+        with passing_hydra():
+            check_out(config)
+            folder = Path(config.hydra.sweep.dir)
+            if holds_run(folder):
+                refuse(folder, "a single run; choose another folder for a sweep")
+            hold_folder(folder)
+
+    def _check_run(self, config: DictConfig) -> None:
+        check_out(config)
         folder = Path(config.hydra.run.dir)
         if config.hydra.job.name == "evaluate":
             if holds_evaluation(folder):
@@ -35,19 +52,21 @@ class KeepResults(Callback):
             refuse(
                 folder, f"a run already; choose another folder, or go on with it: resume={folder}"
             )
-        hold_or_refuse(folder)
+        hold_folder(folder)
 
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Check a sweep's folder: an earlier start of the sweep is gone on with."""
-        folder = Path(config.hydra.sweep.dir)
-        if holds_run(folder):
-            refuse(folder, "a single run; choose another folder for a sweep")
-        hold_or_refuse(folder)
+
+@contextmanager
+def passing_hydra() -> Iterator[None]:
+    """Have mistakes pass Hydra, which would go on after any exception of a callback."""
+    try:
+        yield
+    except (UserError, OmegaConfBaseException, OSError) as error:
+        raise Carrier(error) from error
 
 
 def refuse(folder: Path, what: str) -> None:
-    """Raise what passes Hydra."""
-    raise Carrier(UserError(f"out={folder}: holds {what}"))
+    """Refuse a folder for what it holds."""
+    raise UserError(f"out={folder}: holds {what}")
 
 
 def hold_folder(folder: Path) -> None:
@@ -62,14 +81,6 @@ def hold_folder(folder: Path) -> None:
         remove_parts(folder, _WRITTEN)
 
 
-def hold_or_refuse(folder: Path) -> None:
-    """Hold a folder as `hold_folder`, but raise what passes Hydra."""
-    try:
-        hold_folder(folder)
-    except UserError as error:
-        raise Carrier(error) from error
-
-
 def holds_run(folder: Path) -> bool:
     """Tell whether a training has been there."""
     return (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir()
@@ -78,7 +89,18 @@ def holds_run(folder: Path) -> bool:
 def holds_evaluation(folder: Path) -> bool:
     """Tell whether an evaluation has been there, other than a training's own test."""
     file = folder / "metrics.json"
-    return file.is_file() and json.loads(file.read_text()).get("command") == "evaluate"
+    return file.is_file() and read_metrics(file).get("command") == "evaluate"
+
+
+def read_metrics(file: Path) -> dict[str, Any]:
+    """Return what a metrics.json holds.  Raises UserError where it is damaged."""
+    try:
+        metrics = json.loads(file.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{file}: not readable as JSON ({error}); choose another out=") from error
+    if not isinstance(metrics, dict):
+        raise UserError(f"{file}: holds no metrics; choose another out=")
+    return metrics
 
 
 def remove_if_empty(folder: Path, command: str) -> None:

@@ -79,6 +79,14 @@ def run_of(path: Any) -> str:
     )
 
 
+def check_out(cfg: DictConfig) -> None:
+    """Raise UserError where `out` is something that cannot name a folder or file."""
+    out = cfg.get("out")
+    named = isinstance(out, str | int | float) and not isinstance(out, bool) and str(out).strip()
+    if out is not None and not named:
+        raise UserError(f"out={out}: names no folder; give one, or leave it out")
+
+
 def check_settings(cfg: DictConfig, command: str) -> None:
     """Check what needs nothing but the settings, before torch is imported.
 
@@ -92,6 +100,7 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
     check_ranges({str(key): value for key, value in plain.items()}, command)
+    check_out(cfg)
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")

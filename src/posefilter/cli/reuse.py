@@ -13,6 +13,7 @@ from posefilter.cli.checkpoints import read_checkpoint, recipe
 from posefilter.cli.comparing import HANDS, differing
 from posefilter.cli.console import say
 from posefilter.cli.files import save_whole
+from posefilter.cli.folders import read_metrics
 from posefilter.cli.instantiate import locate
 from posefilter.cli.job import Job
 from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
@@ -76,8 +77,7 @@ def own_metrics(folder: Path) -> dict[str, Any]:
     """
     for name in ("metrics_train.json", "metrics.json"):
         if (folder / name).is_file():
-            metrics: dict[str, Any] = json.loads((folder / name).read_text())
-            return metrics
+            return read_metrics(folder / name)
     return {}
 
 

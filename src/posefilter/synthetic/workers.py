@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import cv2
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
+from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.progress import bars
 from posefilter.synthetic.frame_renderer import FrameRenderer, Job
@@ -70,6 +72,11 @@ def _render_chunks(
             try:
                 for future in as_completed(futures):
                     yield future.result()
+            except BrokenProcessPool as error:
+                raise UserError(
+                    f"workers={workers}: the system has ended a process that rendered (was it out "
+                    f"of memory?); take fewer, and type the command again: it goes on"
+                ) from error
             finally:
                 pool.shutdown(cancel_futures=True)
 

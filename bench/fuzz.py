@@ -1,0 +1,217 @@
+"""Type command lines that make no sense, and see that each ends in one line.
+
+    python bench/fuzz.py [COUNT] [--seed SEED] [--command NAME] [--list]
+
+Each line is one that works, with one or two settings changed: to values that are no numbers, out
+of range, of another kind, or not in Hydra's grammar; to keys, choices, files and folders that there
+are not. It runs in a process of its own, forked from this one; trainings are cut to four steps. A
+line may be accepted, or be refused in one line with a status that is not 0. Prints the counts; the
+exit status is 1 where a line ended otherwise.
+"""
+
+import argparse
+import random
+import resource
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+from lightning import Trainer
+from omegaconf import OmegaConf
+
+HOME = Path(__file__).parents[1]
+sys.path.insert(0, str(HOME / "bench"))
+
+from forking import RAW, Ended, prepare, run  # noqa: E402
+
+import posefilter.cli.onboard  # noqa: E402
+from posefilter.cli.command import compose_job  # noqa: E402
+from posefilter.ranges import list_values  # noqa: E402
+
+SECONDS, PATIENCE, MEMORY = 20, 300, 12 << 30  # of one line: processor [s], clock [s], [bytes]
+ACCEPTED, REFUSED, USAGE = "accepted", "refused in one line", "refused with Hydra's usage"
+FAILURES = (
+    "raw traceback",
+    f"no answer within {SECONDS} s of processor time",
+    "ended by a signal",
+    "refused in several lines",
+    "refused without a word",
+)
+ODD = (
+    "-1", "0", "nan", "inf", "-inf", "1e-9", "1e30", "1000000000", "0.5", "text", "null", "true",
+    "[]", "[1,2]", "{a:1}", "", "\u00fc", "${seed}", "${nope}", "${oc.env:HOME}", "1,2", "'", '"',
+    "999999999999999999999", "a b", "/proc/x", "-", "\\", "4294967296", "5", "[nan]", "[[1]]",
+    "a=b", "(", ")", "]", "${", "!", "~", "${seed}.5", "/", ".", "..", "None", "''",
+)  # fmt: skip
+GARBAGE = (
+    "", "=", "=1", "x", "--foo", "-x", "a=b=c", "[", "~model", "~seed", "+a=1", "++a=1", "~~a",
+    "model", "model=", "a.b.c=1", "hydra=1", "hydra.run.dir=", "hydra/launcher=nope", "@",
+    "\u00fc=1", "--config-name=nope", "--config-dir=/nope", "-cd", "seed==1", "seed=1=2", "seed= 1",
+    "model@a=pose_pf", "filter@model.x=pose", "+filter/resample=none", "plugins=[os]", "plugins=x",
+    "plugins=[1]", "tags=5", "tags={a:1}", "console=", "console=loud", "debug=nope", "debug=[1]",
+    "~filter.particles", "filter=null", "filter={}", "data={}", "loss={}", "model={}", "trainer={}",
+)  # fmt: skip
+PLACES = (
+    "/proc/x", "/dev/null", "/dev/null/x", "", ".", "/nonexistent/\u00fc", "n" * 300, "5",
+    "null", "[a]", "{}", "/sys/x", "/etc/hostname", "//", "~", "${nope}", "a/../b", "tar",
+)  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Type so many lines; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("count", nargs="?", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--command")
+    parser.add_argument("--list", action="store_true", help="print each line")
+    given = parser.parse_args(arguments)
+    print(f"{given.count} command lines, seed {given.seed}")
+    prepare()
+    counts: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        lines = make_lines(place)
+        commands = [given.command] if given.command else [*lines, "train", "train", "predict"]
+        keys = {name: list_keys(name, place) for name in lines}
+        for number in range(given.count):
+            rng = random.Random(f"{given.seed} {number}")
+            command = commands[number % len(commands)]
+            own = [word.replace("NEW", f"new{number}") for word in lines[command]]
+            typed = change(own, keys[command], place, rng)
+            ended = run(command, typed, place / "log", PATIENCE, limit)
+            outcome = judge(ended)
+            counts[outcome] += 1
+            if given.list or outcome in FAILURES:
+                told = ended.err.strip().splitlines()
+                added = [word for word in typed if word not in own]
+                print(f"{number} {command} {added}: {outcome}: {told[-1][:300] if told else ''}")
+    for outcome in (ACCEPTED, REFUSED, USAGE, *FAILURES):
+        print(f"{counts[outcome]:6d}  {outcome}")
+    return 1 if any(counts[outcome] for outcome in FAILURES) else 0
+
+
+def judge(ended: Ended) -> str:
+    """Return what came of a line."""
+    lines = [line for line in ended.err.splitlines() if line.strip()]
+    if "Traceback (most recent call last)" in ended.err or ended.status == RAW:
+        return FAILURES[0]
+    if ended.status is None or ended.cpu > SECONDS:
+        return FAILURES[1]
+    if ended.status < 0:
+        return FAILURES[2]
+    if ended.status == 0:
+        return ACCEPTED
+    if lines and lines[0].startswith("usage:"):
+        return USAGE
+    if not lines:
+        return FAILURES[4]
+    return REFUSED if len(lines) == 1 else FAILURES[3]
+
+
+def limit() -> None:
+    """Bound what a line may take of this machine, and cut trainings short."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    whole = Trainer.fit
+
+    def fit(self: Trainer, *args: object, **more: object) -> None:
+        loop = self.fit_loop.epoch_loop
+        steps = loop.max_steps
+        loop.max_steps = 4 if steps < 0 else min(4, steps)
+        whole(self, *args, **more)  # type: ignore[arg-type]
+
+    Trainer.fit = fit  # type: ignore[method-assign]
+    posefilter.cli.onboard.STAGES = ()
+    posefilter.cli.onboard.tell = lambda work: None
+
+
+def make_lines(folder: Path) -> dict[str, list[str]]:
+    """Make what the commands need; return a line for each that works, `NEW` for a new name."""
+    data = folder / "data"
+    frames = ["frames=12", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=3"]
+    once = [*frames, "workers=1", "console=json", f"out={data}"]
+    assert run("generate", once, folder / "log").status == 0
+    rgb, depth = folder / "rgb.png", folder / "depth.png"
+    cv2.imwrite(str(rgb), np.full((120, 160, 3), 90, np.uint8))
+    cv2.imwrite(str(depth), np.full((120, 160), 7000, np.uint16))
+    quiet = ["console=json", "threads=1"]
+    small = ["debug=smoke", *quiet, "logger=none", "data.progress=false", f"data.root={data}"]
+    small += ["data.limit_train=4", "data.limit_val=1", "data.limit_test=2", "callbacks=none"]
+    small += ["trainer.max_steps=2", "trainer.val_check_interval=2"]
+    run_folder = folder / "run"
+    done = run("train", [*small, f"out={run_folder}"], folder / "log", before=limit)
+    if done.status:
+        raise SystemExit(done.err)
+    best = run_folder / "checkpoints" / "best.ckpt"
+    return {
+        "train": [*small, f"out={folder}/NEW", "model=cnn_patch"],
+        "evaluate": [*quiet, f"checkpoint={best}", f"data.root={data}", f"out={folder}/NEW"],
+        "predict": [
+            *quiet, f"checkpoint={best}", f"rgb={rgb}", f"depth={depth}", f"out={folder}/NEW",
+            "intrinsics=180,180,80,60", "depth_scale=10000",
+        ],
+        "generate": [
+            "console=json", f"out={folder}/NEW", "frames=2", "size=[96,72]", "workers=1",
+            "progress=false",
+        ],
+        "check_data": [
+            "console=json", f"data.root={data}", "data.object=carton", "limit=2",
+            f"out={folder}/NEW",
+        ],
+        "report": ["console=json", f"run={run_folder}", f"out={folder}/NEW"],
+        "export": ["console=json", f"checkpoint={best}", f"out={folder}/NEW.ckpt"],
+        "onboard": [*quiet, "mesh=carton", f"out={folder}/NEW"],
+    }  # fmt: skip
+
+
+def list_keys(command: str, folder: Path) -> list[str]:
+    """Return the settings that a command has."""
+    plain = OmegaConf.to_container(compose_job(command, HOME / "conf", [], folder).cfg)
+    assert isinstance(plain, dict)
+    keys = {key.partition("[")[0] for key, _, _ in list_values(plain)}
+    return sorted(key for key in keys if "_target_" not in key and key != "folder")
+
+
+def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -> list[str]:
+    """Return a line with one or two things changed."""
+    typed = list(line)
+    for _ in range(rng.choice([1, 1, 2])):
+        way = rng.choice(["value"] * 6 + ["place", "place", "key", "garbage", "group", "leave out"])
+        if way == "garbage":
+            typed.append(rng.choice(GARBAGE))
+        elif way == "leave out":
+            typed.remove(rng.choice(typed))
+        elif way == "key":
+            key = rng.choice(keys)
+            at = rng.randrange(len(key))
+            typed.append(f"{key[:at]}{rng.choice(['', 'x', '.', '/', '@'])}{key[at + 1 :]}=1")
+        elif way == "group":
+            groups = sorted(p for p in (HOME / "conf").rglob("*") if p.is_dir())
+            group = rng.choice(groups)
+            names = [file.stem for file in group.glob("*.yaml")] + ["nope", "null", "", "[a]", "5"]
+            typed.append(f"{group.relative_to(HOME / 'conf')}={rng.choice(names)}")
+        elif way == "place":
+            place = rng.choice(PLACES)
+            if place == "tar":
+                place = str(folder / "run.tar")
+                Path(place).write_bytes(bytes(1024))
+            names = (
+                "out",
+                "data.root",
+                "rgb",
+                "depth",
+                "checkpoint",
+                "meshes",
+                "data.meshes",
+                "run",
+            )
+            typed.append(f"{rng.choice([key for key in names if key in keys] or ['out'])}={place}")
+        else:
+            typed.append(f"{rng.choice(keys)}={rng.choice(ODD)}")
+    return typed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

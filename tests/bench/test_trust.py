@@ -1,0 +1,76 @@
+"""The programs that attack: what they try is noticed, and what goes unnoticed is told."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import pytest
+
+BENCH = Path(__file__).parents[2] / "bench"
+Load = Callable[[str], ModuleType]
+
+
+@pytest.fixture
+def load(load_script: Load, monkeypatch: pytest.MonkeyPatch) -> Load:
+    """Return a function that imports a script of bench/, which imports its neighbors."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return lambda name: load_script(f"bench/{name}.py")
+
+
+def test_spoiled_files_are_noticed(load: Load, capsys: pytest.CaptureFixture[str]) -> None:
+    assert load("mutations").main(["12", "--seed", "7"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == "12 mutations, seed 7"
+    assert sum(int(line.split()[0]) for line in told[1:]) == 12
+
+
+def test_what_nobody_notices_is_told(
+    load: Load, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mutations = load("mutations")
+    base = mutations.make_base("ycb_video", tmp_path / "base")
+    work = tmp_path / "work"
+
+    def tenth(folder: Path, rng: object) -> str:
+        path = folder / "0001" / "000001-depth.png"
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 10)
+        return "a tenth"
+
+    monkeypatch.setattr(mutations, "spoil", tenth)
+    assert mutations.try_one(base, work, None)[1] == "accepted, and listed by check_data"
+    monkeypatch.setattr(mutations, "list_problems", lambda *_: [])
+    assert mutations.try_one(base, work, None)[1] == "wrong data accepted"
+    monkeypatch.setattr(mutations, "judge", lambda *_: 1 / 0)
+    assert mutations.try_one(base, work, None)[1] == "raw traceback"
+
+
+def test_killed_trainings_end_with_the_same_bits(load: Load, tmp_path: Path) -> None:
+    kills = load("kills")
+    kills.prepare()
+    counts = kills.kill_many(tmp_path, [("cnn_patch", "0")], 2, seed=3)
+    assert sum(counts.values()) == 2
+    assert all(what.startswith("the same bits, killed") for what in counts), counts
+    assert kills.list_differing({"a": [1, 2]}, {"a": [1, 3]}) == [".a[1]"]
+
+
+@pytest.mark.parametrize(
+    ("status", "cpu", "err", "told"),
+    [
+        (0, 1, "", "accepted"),
+        (2, 1, "train: seed=-1: must be\n", "refused in one line"),
+        (70, 1, "Traceback (most recent call last)\n", "raw traceback"),
+        (None, 1, "", "no answer within 20 s of processor time"),
+        (0, 30, "", "no answer within 20 s of processor time"),
+        (-11, 1, "", "ended by a signal"),
+        (2, 1, "a\nb\n", "refused in several lines"),
+        (2, 1, "", "refused without a word"),
+    ],
+)
+def test_a_command_line_is_judged(
+    status: int | None, cpu: float, err: str, told: str, load: Load
+) -> None:
+    fuzz = load("fuzz")
+    assert fuzz.judge(fuzz.Ended(status, 1.0, cpu, "", err)) == told

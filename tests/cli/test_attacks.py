@@ -1,0 +1,71 @@
+"""Command lines that make no sense end in one line that names what is wrong, and leave nothing."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from posefilter.cli import run_command
+from posefilter.cli.build import make_trainer
+from posefilter.cli.command import compose_job
+from posefilter.cli.folders import read_metrics
+from posefilter.errors import UserError
+
+HOME = Path(__file__).parents[2]
+LINES = {
+    "an empty folder's name": ("train", ["out="], "out=: names no folder"),
+    "a list as a folder": ("check_data", ["out=[a]"], "Cannot convert 'ListConfig' to string"),
+    "a reference to nothing": ("train", ["out=${nope}"], "Interpolation key 'nope' not found"),
+    "a folder in /proc": ("train", ["out=/proc/x"], "/proc/x: cannot be written"),
+    "a file as a folder": ("evaluate", ["out=/dev/null/x", "checkpoint=x"], "/dev/null/x"),
+    "a name that is too long": ("train", [f"out={'n' * 300}"], "File name too long"),
+    "a number as a choice": ("train", ["loss/aux/likelihood=5"], "likelihood=5: cannot be read"),
+    "no model": ("train", ["model=null"], "model=null: cannot be read"),
+    "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
+    "an umlaut": (
+        "train",
+        ["data=fat", "data.root=/nope/\u00fc"],
+        "data.root=/nope/\u00fc: no such",
+    ),
+    "an equals sign": (
+        "train",
+        ["data=fat", "data.root=/nope/a=b"],
+        "data.root=/nope/a=b: no such",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LINES)
+def test_it_is_one_line(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    command, typed, told = LINES[case]
+    monkeypatch.chdir(tmp_path)
+    if command == "predict":
+        typed = [*typed, "checkpoint=003_cracker_box"]
+    assert run_command(command, HOME, [*typed, "console=json"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: ")
+    assert told in line
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
+    job = compose_job("train", HOME / "conf", ["trainer.accelerator=gpu"], tmp_path)
+    job.cfg.folder = str(tmp_path)
+    with pytest.raises(UserError, match=r"^trainer: cannot be set up \(accelerator=gpu") as caught:
+        make_trainer(job.cfg.trainer, [])
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_metrics_are_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "metrics.json"
+    for content in ("", "{", "[1]", "[" * 100_000, "\ud800".encode("utf-8", "surrogatepass")):
+        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(UserError, match=r"metrics\.json: ") as caught:
+            read_metrics(file)
+        assert "\n" not in str(caught.value)
+    file.write_text(json.dumps({"iou": 0.5}))
+    assert read_metrics(file) == {"iou": 0.5}
