@@ -11,6 +11,7 @@ import numpy as np
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
+from posefilter.data.absent import find_absent
 from posefilter.data.cache import CACHES, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
@@ -234,6 +235,31 @@ class PoseDataModule(LightningDataModule):
     def test_dataset(self) -> FrameDataset:
         """The test frames."""
         return self._dataset("test")
+
+    def absent_dataset(self, split: str, limit: int | None = None) -> FrameDataset:
+        """Return images of a split in which the object is not, the first so many of a fixed
+        shuffle; masks and poses are those of other objects.
+
+        An image counts where the dataset does not list the object in it, and where its scene is of
+        no other split.
+        """
+        reader = open_reader(self.source, self.root, None, None, "skip", **self._options)
+        records = reader.records()
+        scenes = self.split_record() if self._records else {name: {} for name in NAMES}
+        found = find_absent(records, self._records, scenes, split, self.objects[0])
+        order = np.random.default_rng([self._split_seed, 11]).permutation(len(found))
+        keep = partial(open_cache, "memory", Path(), "")
+        size = (self._image_width, self._image_height)
+        decoder = FrameDecoder(reader, records, *size, keep)
+        chosen, _ = usable(
+            [found[i] for i in order],
+            decoder.fetch,
+            Criteria(limit=limit, on_error="skip"),
+            max(self._workers, 2),
+            "decoding frames without the object",
+            self._progress,
+        )
+        return FrameDataset(chosen, decoder.cache)
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch whose augmentation is drawn (Lightning's loops do it by themselves)."""

@@ -20,6 +20,7 @@ from posefilter.synthetic.scenes import (
     SolidStore,
     draw_layout,
     draw_scene_set,
+    remove_target,
     shift_camera,
 )
 from posefilter.synthetic.sensor import sensor_model, simulate_sensor
@@ -56,6 +57,11 @@ class Job:
     def scene_generator(self, number: int) -> np.random.Generator:
         """Return the random generator of a folder's scene set."""
         return np.random.default_rng([self.seed, 1, number])
+
+    def lacks_target(self, frame: int) -> bool:
+        """Tell whether the target is taken out of a frame."""
+        share = self.scenes.absent_share
+        return share > 0 and bool(np.random.default_rng([self.seed, 3, frame]).random() < share)
 
     def files(self, out: Path, frame: int) -> list[Path]:
         """Return the files of a frame in the order of writing."""
@@ -129,6 +135,7 @@ class FrameRenderer:
         Raises:
             UserError: No layout shows enough of the target.
         """
+        absent = self.job.lacks_target(frame)
         scene, _ = self.scene(frame // self.job.frames_per_scene)
         rng = np.random.default_rng([self.job.seed, 2, frame])
         height, width = self.job.height, self.job.width
@@ -136,10 +143,11 @@ class FrameRenderer:
             layout = draw_layout(scene, self.job.scenes, self.K, height, width, rng)
             if layout is None:
                 continue
+            layout = remove_target(layout) if absent else layout
             picture = self.renderer.render(
                 layout.instances(), self.K, height, width, layout.lights, layout.planes
             )
-            if self._shows_target(picture):
+            if absent or self._shows_target(picture):
                 return layout, picture, rng
         raise UserError(
             f"frame {frame}: no layout of {self.job.object} fits after {ATTEMPTS} tries; "
@@ -192,7 +200,7 @@ class FrameRenderer:
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
         objects = []
         for k, one in enumerate(layout.placed):
-            if k == 0 or seen[k] > 0:
+            if one.solid.mesh.name == self.job.object or seen[k] > 0:
                 share = float(seen[k] / max(int(picture.unoccluded[k]), 1))
                 truncated = self._truncated(one.hull)
                 objects.append(

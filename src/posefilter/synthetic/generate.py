@@ -71,6 +71,7 @@ def generate(
     renderer: str = "embree",
     progress: bool = True,
     mesh_scale: float | None = None,
+    absent_share: float = 0.0,
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or go on with one that was begun.
 
@@ -81,7 +82,7 @@ def generate(
         out: The dataset's folder.
         frames: How many frames it is to hold.
         meshes: "builtin" or a folder.
-        object: The mesh that every frame shows.
+        object: The mesh that every frame shows, but for those of `absent_share`.
         seed: Decides every draw.
         workers: Processes that render.
         size: Width and height [px].
@@ -97,6 +98,8 @@ def generate(
         renderer: "embree" or "opengl".
         progress: Draw a bar.
         mesh_scale: Meters a unit of the mesh files; None: 1.
+        absent_share: The share of frames that the object is taken out of, once all else is placed:
+            so that a filter can be told to say that it is not there.
 
     Returns:
         What was done.
@@ -111,6 +114,7 @@ def generate(
         occluded_share=float(occluded_share),
         tabletop_share=float(tabletop_share),
         settle=bool(settle),
+        absent_share=float(absent_share),
     )
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
@@ -197,6 +201,7 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "occlusion": job.scenes.occlusion,
         "occluded_share": job.scenes.occluded_share,
         "tabletop_share": job.scenes.tabletop_share,
+        "absent_share": job.scenes.absent_share,
         "mesh_scale": job.mesh_scale,
     }
     check_ranges(numbers, "generate")
@@ -267,5 +272,6 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
-    out = {"mesh_scale": 1.0, **settings}
+    scenes = {"absent_share": 0.0, **settings["scenes"]}
+    out = {"mesh_scale": 1.0, **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out

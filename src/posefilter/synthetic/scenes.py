@@ -50,6 +50,7 @@ class SceneSettings:
     largest_truncation: float = 0.4  # share of the target's outline that may leave the frame
     shadow_share: float = 0.7
     settle: bool = False  # let the objects on a table fall and come to rest (mujoco)
+    absent_share: float = 0.0  # share of frames that the target is taken out of, once all is placed
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,6 +281,11 @@ def _draw_lights(up: np.ndarray, settings: SceneSettings, rng: np.random.Generat
         shadow_blur=float(rng.uniform(0.5, 3)),
         background=tuple(float(c) for c in random_color(rng)),  # type: ignore[arg-type]
     )
+
+
+def remove_target(layout: Layout) -> Layout:
+    """Return the layout without its target; all else stays where it is."""
+    return replace(layout, placed=layout.placed[1:])
 
 
 def shift_camera(layout: Layout, offset: float) -> Layout:

@@ -1,0 +1,53 @@
+"""Images of a dataset in which an object is not: where a filter must not find it."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+
+from posefilter.data.frames import FrameRecord
+from posefilter.types import Batch
+
+
+def find_absent(
+    records: Sequence[FrameRecord],
+    own: Sequence[FrameRecord],
+    scenes: Mapping[str, Mapping[str, int]],
+    split: str,
+    name: str,
+) -> list[FrameRecord]:
+    """Return one record of each image in which an object is not listed.
+
+    Scenes in which it is never listed are of no split: where validation and test have scenes, each
+    gets every other one of them, so that what a calibration saw is not tested on.
+
+    Args:
+        records: Of all classes of a dataset.
+        own: Those of the object.
+        scenes: The scenes of each split of the object's records, as `split_record` has them.
+        split: Images are of its scenes, and of its part of those that no split has.
+        name: The object's class.
+    """
+    elsewhere = {scene for part, found in scenes.items() if part != split for scene in found}
+    elsewhere -= set(scenes[split])  # a part may stand for another one's scenes
+    held = [part for part in ("val", "test") if scenes.get(part)]
+    if len(held) == 2 and split in held and set(scenes["val"]) != set(scenes["test"]):
+        taken = {scene for found in scenes.values() for scene in found}
+        free = sorted({record.group for record in records} - taken)
+        elsewhere |= {*free} - {*free[held.index(split) :: 2]}
+    showing = {record.name for record in own}
+    showing |= {record.name for record in records if record.object == name}
+    found: dict[str, FrameRecord] = {}
+    for record in records:
+        if record.name not in showing and record.group not in elsewhere:
+            found.setdefault(record.name, record)
+    return list(found.values())
+
+
+def hide_annotation(batch: Batch) -> Batch:
+    """Return a batch of images without the object: what is known of other objects is left out."""
+    count = len(batch.rgb)
+    return batch._replace(
+        mask=torch.zeros_like(batch.mask),
+        camera_from_object=torch.eye(4).expand(count, 4, 4).to(batch.camera_from_object),
+        visibility=torch.zeros_like(batch.visibility),
+    )

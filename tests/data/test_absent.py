@@ -1,0 +1,112 @@
+"""Frames without the object: rendered by leaving it out, and found in a dataset."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posefilter.data.absent import find_absent, hide_annotation
+from posefilter.data.frames import FrameRecord
+from posefilter.data.loaders import make_loader
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+from posefilter.synthetic.generate import generate
+
+SIZE = (96, 72)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return twelve frames in six scenes, of which some lack the carton."""
+    out = tmp_path_factory.mktemp("absent") / "scenes"
+    generate(
+        out,
+        12,
+        object="carton",
+        workers=1,
+        size=SIZE,
+        distractors=(1, 2),
+        frames_per_scene=2,
+        progress=False,
+        absent_share=0.5,
+    )
+    return out
+
+
+def list_classes(path: Path) -> set[str]:
+    return {one["class"] for one in json.loads(path.read_text())["objects"]}
+
+
+def test_some_frames_lack_the_object_and_the_rest_is_as_it_was(
+    scenes: Path, tmp_path: Path
+) -> None:
+    files = sorted(scenes.glob("mixed/*/[0-9]*.left.json"))
+    lacking = [file for file in files if "carton_16k" not in list_classes(file)]
+    assert 2 <= len(lacking) <= 10
+    generate(
+        tmp_path / "whole",
+        12,
+        object="carton",
+        workers=1,
+        size=SIZE,
+        distractors=(1, 2),
+        frames_per_scene=2,
+        progress=False,
+    )
+    for file in files:
+        twin = tmp_path / "whole" / file.relative_to(scenes)
+        picture, other = (one.with_name(one.name.replace("json", "jpg")) for one in (file, twin))
+        assert (picture.read_bytes() == other.read_bytes()) == (file not in lacking)
+    with pytest.raises(UserError, match="absent_share=2"):
+        generate(tmp_path / "no", 1, object="carton", absent_share=2, progress=False)
+
+
+def test_the_dataset_tells_them_apart(scenes: Path) -> None:
+    split = {"train": 0.4, "val": 0.2, "test": 0.4}
+    data = PoseDataModule("scenes", scenes, "carton", split=split, workers=0, progress=False)
+    shown = {record.name for part in ("train", "val", "test") for record in data.records(part)}
+    seen: list[str] = []
+    for part in ("val", "test"):
+        frames = data.absent_dataset(part)
+        names = {record.name for record in frames.records}
+        assert not names & shown
+        others = {
+            record.group
+            for other in ("train", "val", "test")
+            for record in data.records(other)
+            if other != part
+        }
+        assert not others & {record.group for record in frames.records}
+        seen += names
+        for batch in make_loader(frames, 4, 0):
+            hidden = hide_annotation(batch)
+            assert not bool(hidden.mask.any())
+            assert bool((hidden.camera_from_object == np.eye(4)).all())
+            assert bool((hidden.rgb == batch.rgb).all())
+    assert seen
+    assert len({*seen}) == len(seen)  # none in two splits
+    assert len(data.absent_dataset("test", 1)) <= 1
+
+
+def test_an_image_counts_once_and_only_where_the_object_is_not_listed() -> None:
+    def record(name: str, group: str, kind: str, number: int = 0) -> FrameRecord:
+        return FrameRecord(name, group, 0, number, 1, kind, number, ())
+
+    own = [record("a/0", "a", "box")]
+    everything = [
+        record("a/0", "a", "can", 1),  # the box is here
+        record("a/1", "a", "can"),
+        record("a/1", "a", "mug", 1),
+        record("b/0", "b", "can"),  # a scene of the training
+        record("c/0", "c", "can"),  # of no split
+        record("c/1", "c", "box"),
+    ]
+    splits = {"train": {"b": 3}, "val": {"a": 1}, "test": {}}
+    found = find_absent(everything, own, splits, "val", "box")
+    assert [one.name for one in found] == ["a/1", "c/0"]
+    both = {**splits, "test": {"e": 1}}
+    everything += [record(f"{group}/0", group, "can") for group in "de"]
+    names = {part: find_absent(everything, own, both, part, "box") for part in ("val", "test")}
+    assert [one.name for one in names["val"]] == ["a/1", "c/0"]
+    assert [one.name for one in names["test"]] == ["d/0", "e/0"]
