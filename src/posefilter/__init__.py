@@ -6,7 +6,7 @@ import posefilter
 
 estimator = posefilter.load("003_cracker_box")
 result = estimator.predict(rgb, depth, intrinsics)
-result.pose, result.score, result.covariance, result.modes, result.belief
+result.verdict, result.probability, result.pose, result.covariance, result.belief
 ```
 
 Public names are imported when they are first used: `import posefilter` does not import torch.
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from posefilter.api import build, build_data, compose, load
     from posefilter.belief import Belief, Mode
     from posefilter.cli.trust import trust
+    from posefilter.confidence.verdicts import Costs
     from posefilter.errors import UserError
     from posefilter.estimator import Estimator, Result
     from posefilter.tracking.settings import TrackerSettings
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Belief",
+    "Costs",
     "Estimator",
     "Mode",
     "Result",
@@ -49,6 +51,7 @@ __all__ = [
 
 _HOMES = {
     "Belief": "belief",
+    "Costs": "confidence.verdicts",
     "Estimator": "estimator",
     "Mode": "belief",
     "Result": "estimator",

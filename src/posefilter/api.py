@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.components import changes
 from posefilter.cli.job import Job
+from posefilter.confidence.verdicts import Costs
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
 from posefilter.weights import expand_weights
@@ -22,6 +23,7 @@ def load(
     *,
     overrides: Sequence[str] = (),
     device: str | None = None,
+    costs: Costs | None = None,
 ) -> Estimator:
     """Load one trained filter, or several that run in one call.
 
@@ -35,6 +37,7 @@ def load(
         overrides: What to change of the filter, as typed on the command line: such as
             `filter.particles=1000` or `filter/refine=none`.
         device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
+        costs: What errors cost, which `Result.verdict` goes by; None: the default.
 
     Returns:
         The estimator; see `Estimator.predict`.
@@ -46,7 +49,7 @@ def load(
     methods = [
         method_of(read_checkpoint(one), wanted, lightning=False) for one in expand_weights(weights)
     ]
-    return Estimator(methods, device)
+    return Estimator(methods, device, costs)
 
 
 def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig:

@@ -19,6 +19,10 @@ class ProblemsFound(UserError):  # noqa: N818
     """A check was done, and something is wrong with what it checked: the commands exit with 1."""
 
 
+class NotThere(UserError):  # noqa: N818
+    """What was looked for is not in the image: the commands exit with 1, as grep does."""
+
+
 class BadData(UserError):  # noqa: N818
     """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
 

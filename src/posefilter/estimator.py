@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -10,6 +10,8 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.belief import Belief, Mode
+from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
 from posefilter.limits import MOST_SIDE
@@ -29,25 +31,47 @@ class Result:
     Attributes:
         object: The object's name.
         pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
-            OpenCV's (x right, y down, z ahead), the object's that of its mesh file.
+            OpenCV's (x right, y down, z ahead), the object's that of its mesh file.  It is the best
+            guess, also where the object is not there: see `verdict`.
         score: The estimate's log-likelihood, up to a constant of the method.  It ranks images of
             one camera under one method; it is no probability, and says nothing of a wrong scale.
-        probability: That the object is there and the pose right.  Always None for now: it is not
-            calibrated yet.
+        probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
+            object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
+            not calibrated; `uncalibrated` says why.
+        presence: That the object is there, whatever the pose: at least `probability`, or None.
         belief: Every particle and its weight.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         seconds: The filter's time for this image, its share of a batch.
         model: The object's center, size, surface points and hull.
+        costs: What errors cost, which the verdict goes by.
+        uncalibrated: Why there is no probability; empty where there is one.
     """
 
     object: str
     pose: np.ndarray
     score: float
     probability: float | None
+    presence: float | None
     belief: Belief
     warnings: tuple[str, ...]
     seconds: float
     model: ObjectModel
+    costs: Costs = field(default_factory=Costs, kw_only=True)
+    uncalibrated: str = field(default="", kw_only=True)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What to go by: "found", "unsure" or "absent", whichever costs least on average.
+
+        None where there is no probability.  `decide` takes other costs.
+        """
+        return self.decide(self.costs)
+
+    def decide(self, costs: Costs) -> Verdict | None:
+        """Return the verdict at other costs of errors; None where there is no probability."""
+        if self.probability is None or self.presence is None:
+            return None
+        return decide(self.presence, self.probability, costs)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -62,7 +86,8 @@ class Result:
     def draw_overlay(
         self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
     ) -> np.ndarray:
-        """Draw the object's outline and axes on the image that it was found in.
+        """Draw the object's outline and axes on the image that it was found in; none where the
+        verdict is that it is absent.
 
         Args:
             rgb: The image (H, W, 3) uint8, RGB.
@@ -75,8 +100,16 @@ class Result:
         from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
 
         shape = self.model.hull if shape is None else shape
-        caption = f"{self.object}, score {self.score:.2f}"
-        return draw_overlay(rgb, np.asarray(intrinsics), self.pose, shape, caption=caption)
+        pose = None if self.verdict == "absent" else self.pose
+        return draw_overlay(rgb, np.asarray(intrinsics), pose, shape, caption=self.describe())
+
+    def describe(self) -> str:
+        """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""
+        if self.verdict is None:
+            return f"{self.object}, score {self.score:.2f}"
+        if self.verdict == "absent":
+            return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
+        return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
 
     def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
         """Draw the belief: rotations on a map, centers on the image, marginals.
@@ -106,6 +139,7 @@ class Run(NamedTuple):
     batch: Batch  # at the network's resolution
     trace: Trace
     seconds: float  # an image
+    found: Assessment | None = None  # None where there is no probability
 
 
 class Estimator:
@@ -116,13 +150,17 @@ class Estimator:
     Args:
         methods: A method an object, with its weights, its recipe and its object.
         device: Where to compute; None: on the GPU where there is one.
+        costs: What errors cost, which verdicts go by.
 
     Raises:
         UserError: There is no method, or one that detects and estimates no pose.
     """
 
     def __init__(
-        self, methods: Sequence[PoseEstimator], device: str | torch.device | None = None
+        self,
+        methods: Sequence[PoseEstimator],
+        device: str | torch.device | None = None,
+        costs: Costs | None = None,
     ) -> None:
         if not methods:
             raise UserError("an estimator needs the weights of one object at least")
@@ -131,6 +169,7 @@ class Estimator:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.methods = tuple(method.to(device).eval() for method in methods)
+        self.costs = costs or Costs()
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
 
     @property
@@ -164,7 +203,7 @@ class Estimator:
             UserError: Images or intrinsics are not as they should be.
         """
         images, batched = check_images(rgb, depth, intrinsics)
-        found = collect_results(self.run(images, seed))
+        found = collect_results(self.run(images, seed), self.costs)
         answers = [own if len(self.methods) > 1 else own[0] for own in found]
         return answers if batched else answers[0]
 
@@ -176,7 +215,8 @@ class Estimator:
         Returns:
             A list an image, of a `Result` an object.
         """
-        return collect_results(self.run(check_images(rgb, depth, intrinsics)[0], seed))
+        images, _ = check_images(rgb, depth, intrinsics)
+        return collect_results(self.run(images, seed), self.costs)
 
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did."""
@@ -187,20 +227,27 @@ class Estimator:
             start = time.perf_counter()
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
+                found = method.assess(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds))
+            runs.append(Run(method, batch, trace, seconds, found))
         return runs
 
 
-def collect_results(runs: Sequence[Run]) -> list[list[Result]]:
-    """Return the results of runs on the same images: a list an image, of a result an object."""
-    return [[make_result(run, i) for run in runs] for i in range(len(runs[0].batch.rgb))]
+def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:
+    """Return the results of runs on the same images: a list an image, of a result an object.
+
+    Args:
+        runs: A run an object.
+        costs: What errors cost; None: the default.
+    """
+    count = len(runs[0].batch.rgb)
+    return [[make_result(run, i, costs) for run in runs] for i in range(count)]
 
 
-def make_result(run: Run, image: int) -> Result:
+def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
     """Return what a run amounts to for one image of its batch."""
-    model, belief = run.method.model, run.trace.belief
+    model, belief, found = run.method.model, run.trace.belief, run.found
     weights = belief.log_weights[image].double().cpu().exp().numpy()
     center = model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
@@ -208,7 +255,8 @@ def make_result(run: Run, image: int) -> Result:
         object=model.name,
         pose=pose,
         score=float(belief.score[image]),
-        probability=None,
+        probability=None if found is None else float(found.probability[image]),
+        presence=None if found is None else float(found.presence[image]),
         belief=Belief(
             belief.poses[image].double().cpu().numpy(),
             weights / weights.sum(),
@@ -225,7 +273,15 @@ def make_result(run: Run, image: int) -> Result:
         ),
         seconds=run.seconds,
         model=model,
+        costs=costs or Costs(),
+        uncalibrated="" if found is not None else explain_missing(run.method),
     )
+
+
+def explain_missing(method: PoseEstimator) -> str:
+    """Return why an estimate has no probability."""
+    known = method.calibration is not None
+    return "the calibration is of single images, not of a track" if known else method.uncalibrated
 
 
 def get_trained_size(settings: dict[str, Any]) -> tuple[int | None, int | None]:

@@ -22,7 +22,9 @@ from posefilter.metrics.image_errors import FILE, ImageError, read_errors, write
 from posefilter.metrics.scores import summarize
 from posefilter.types import ObjectModel
 
-ROW = ImageError(1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125)
+ROW = ImageError(
+    1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125, 0.9, 0.8
+)
 
 
 def object_model(diameter: float = 0.2) -> ObjectModel:
@@ -44,6 +46,11 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
     rows = [ROW, ROW._replace(add_mm=math.inf, im_id=8, image='a "b", c', visibility=0.1 + 0.2)]
     write_errors(tmp_path / FILE, rows)
     assert read_errors(tmp_path / FILE) == rows
+    older = [line.rsplit(",", 2)[0] for line in (tmp_path / FILE).read_text().splitlines()]
+    (tmp_path / FILE).write_text("\n".join(older) + "\n")  # as before there were probabilities
+    read = read_errors(tmp_path / FILE)
+    assert [row[:-2] for row in read] == [row[:-2] for row in rows]
+    assert all(math.isnan(row.probability) for row in read)
     (tmp_path / FILE).write_text((tmp_path / FILE).read_text().replace("add_mm", "other", 1))
     with pytest.raises(ValueError, match="add_mm is missing"):
         read_errors(tmp_path / FILE)
@@ -60,6 +67,10 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
 
 class Method(torch.nn.Module):
     """What the callback uses of a method."""
+
+    def last_assessment(self, count: int) -> torch.Tensor:
+        """Return presence and probability."""
+        return torch.full((2, count), 0.5)
 
 
 @pytest.fixture

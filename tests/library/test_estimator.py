@@ -63,7 +63,9 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["camera_from_object"] == result.pose.tolist()
     assert told["score"] == result.score
     assert told["object"] == result.object == NAME
-    assert told["probability"] is result.probability is None
+    assert told["probability"] == result.probability
+    assert told["verdict"] == result.verdict
+    assert result.verdict in (None, "found")
     assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
     assert np.allclose(told["belief"]["covariance"], result.covariance)
     assert told["warnings"] == [] == list(result.warnings)

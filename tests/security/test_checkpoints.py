@@ -155,6 +155,22 @@ def laughs() -> list[Any]:
     return node
 
 
+def calibrated(**changes: Any) -> Callable[[dict[str, Any]], Any]:
+    """Return what gives a checkpoint a calibration, with some of it changed."""
+    one = {"weights": [1.0, 0.5], "bias": 0.0}
+    plain = {
+        "features": ["a", "b"],
+        "center": [0.0, 0.0],
+        "scale": [1.0, 1.0],
+        "presence": one,
+        "success": one,
+        "counts": {"right": 20, "wrong": 5, "absent": 20},
+        "source": "fat",
+        "quality": {"auroc": 0.9},
+    }
+    return lambda content: content.update(calibration={**plain, **changes})
+
+
 CONTENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "strides": lambda c: c["state_dict"].update({"x": large_by_strides()}),
     "strides in the object": lambda c: c["object_model"].update(
@@ -178,6 +194,24 @@ CONTENTS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no object": lambda c: c.update(object_model=[]),
     "no recipe": lambda c: c.update(recipe=[]),
     "more than a recipe": lambda c: c["recipe"].update(plugins=["os"]),
+    "a calibration that is none": lambda c: c.update(calibration=[1]),
+    "more than a calibration": calibrated(plugins=["os"]),
+    "a calibration without end": calibrated(features=["a"] * 1000),
+    "a feature twice": calibrated(features=["a", "a"]),
+    "a feature with a path": calibrated(features=["a", "../b"]),
+    "features that are no names": calibrated(features=["a", 1]),
+    "a center that is too short": calibrated(center=[0.0]),
+    "a center that is not finite": calibrated(center=[0.0, float("nan")]),
+    "a center that is a tensor": calibrated(center=torch.zeros(2)),
+    "a scale of zero": calibrated(scale=[1.0, 0.0]),
+    "weights below zero": calibrated(presence={"weights": [1.0, -0.5], "bias": 0.0}),
+    "weights without end": calibrated(success={"weights": [1.0, 1e30], "bias": 0.0}),
+    "a bias that is a text": calibrated(presence={"weights": [1.0, 1.0], "bias": "0"}),
+    "a regression with more": calibrated(presence={"weights": [1.0, 1.0], "bias": 0.0, "x": 1}),
+    "counts below zero": calibrated(counts={"right": -1, "wrong": 5, "absent": 20}),
+    "counts of other things": calibrated(counts={"right": 20}),
+    "a source with a line": calibrated(source="a\nb"),
+    "a quality that is none": calibrated(quality={"auroc": float("inf")}),
     "choices that are none": lambda c: c["recipe"]["choices"].update(model="a\nb"),
 }
 
@@ -199,3 +233,14 @@ def test_a_storage_is_as_large_as_its_part(content: dict[str, Any], save: Save, 
     with watch, pytest.raises(UserError, match="checkpoint=") as told:
         read_checkpoint(path)
     assert "\n" not in str(told.value)
+
+
+def test_a_calibration_as_it_should_be_is_read(content: dict[str, Any], save: Save) -> None:
+    """So that the others are refused for what was changed in them."""
+    calibrated()(content)
+    method = method_of(read_checkpoint(save(content)))
+    assert method.calibration is not None
+    assert method.calibration.features == ("a", "b")
+    other = method_of(read_checkpoint(save(content)), {"filter": {"particles": 5}})
+    assert other.calibration is None
+    assert "another filter" in other.uncalibrated

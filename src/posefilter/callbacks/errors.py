@@ -85,7 +85,9 @@ def measure_batch(
         errors = [(1000 * state[-1]).tolist() for state in (poses.add, poses.add_s, poses.diameter)]
     shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
-    return make_rows(records, batch, errors, shares, trace.belief.score.tolist(), [seconds] * count)
+    scores, times = trace.belief.score.tolist(), [seconds] * count
+    found = [values.tolist() for values in method.last_assessment(count)]
+    return make_rows(records, batch, errors, shares, scores, times, found)
 
 
 def make_rows(
@@ -95,10 +97,15 @@ def make_rows(
     shares: Sequence[float],
     scores: Sequence[float],
     seconds: Sequence[float],
+    found: Sequence[Sequence[float]] = (),
 ) -> list[ImageError]:
-    """Return a row an image; errors: ADD, ADD-S and the diameters, B numbers each [mm]."""
+    """Return a row an image.
+
+    errors: ADD, ADD-S and the diameters, B numbers each [mm]; found: presence and probability
+    likewise, or nothing.
+    """
     seen = batch.visibility.tolist()
     return [
         ImageError(r.scene_id, r.im_id, r.obj_id, r.object, r.name, *numbers)
-        for r, *numbers in zip(records, seen, *errors, shares, scores, seconds, strict=True)
+        for r, *numbers in zip(records, seen, *errors, shares, scores, seconds, *found, strict=True)
     ]

@@ -33,6 +33,7 @@ class Outcome(NamedTuple):
     seconds: float  # that the image took; NaN where it was not measured
     poses: np.ndarray  # (N, 4, 4) float32
     weights: np.ndarray  # (N,) float32, summing to 1
+    probability: float = math.nan  # that the estimate is right, where the method is calibrated
 
 
 class PoseRow(NamedTuple):
@@ -67,9 +68,12 @@ class Records(TraceCallback):
     ) -> None:
         """Take in one batch."""
         times = method.seconds_per_image
-        self.outcomes += collect_outcomes(
-            trace, batch, times[-1] if times else math.nan, self.beliefs
-        )
+        found = collect_outcomes(trace, batch, times[-1] if times else math.nan, self.beliefs)
+        probabilities = method.last_assessment(len(found)).probability.tolist()
+        self.outcomes += [
+            one._replace(probability=probability)
+            for one, probability in zip(found, probabilities, strict=True)
+        ]
 
 
 def collect_outcomes(
@@ -99,6 +103,7 @@ def to_rows(
 ) -> list[PoseRow]:
     """Return the estimates as lines of a results file.
 
+    The score is the probability where there is one, else the log-likelihood.
     Estimates that are not finite are left out, and so count as missed.
 
     Args:
@@ -114,9 +119,9 @@ def to_rows(
         record = records[outcome.frame_id]
         pose = to_native(outcome.estimate, native_from_mesh(record.object))
         seconds = outcome.seconds if math.isfinite(outcome.seconds) else -1.0
-        rows.append(
-            PoseRow(record.scene_id, record.im_id, record.obj_id, outcome.score, pose, seconds)
-        )
+        known = math.isfinite(outcome.probability)
+        score = outcome.probability if known else outcome.score
+        rows.append(PoseRow(record.scene_id, record.im_id, record.obj_id, score, pose, seconds))
     return rows
 
 

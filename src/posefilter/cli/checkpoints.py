@@ -13,6 +13,7 @@ from posefilter.cli.instantiate import instantiate_recipe
 from posefilter.cli.job import Job
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.cli.trust import Scope
+from posefilter.confidence.calibration import read_calibration
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack
@@ -74,17 +75,27 @@ def _with_lightning(kind: Any) -> Any:
     return with_lightning(kind) if issubclass(kind, PoseEstimator) else kind
 
 
-def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
-    """Read a checkpoint of ours, as data that others may have written.
+def find_checkpoint(path: str | Path | None) -> Path:
+    """Return the file that a checkpoint's path, its run's folder, or a name stands for.
 
-    Raises UserError where the path holds none, and where what it holds could do harm (see `archive`
-    and `recipe`).
+    Raises:
+        UserError: There is none.
     """
     file = find_weights(path)
     if file.is_dir():
         file = file / "checkpoints" / "best.ckpt"
     if not file.is_file():
         raise UserError(f"checkpoint={path}: no such file")
+    return file
+
+
+def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
+    """Read a checkpoint of ours, as data that others may have written.
+
+    Raises UserError where the path holds none, and where what it holds could do harm (see `archive`
+    and `recipe`).
+    """
+    file = find_checkpoint(path)
     said = f"checkpoint={path}"
     check_archive(file, said)
     try:
@@ -93,6 +104,8 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
     except Exception as error:
         raise UserError(f"{said}: not readable as a checkpoint ({type(error).__name__})") from error
     checkpoint = check_content(loaded, file, said)
+    if checkpoint.get("calibration") is not None:
+        read_calibration(checkpoint["calibration"], said)
     return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
 
 
@@ -103,7 +116,9 @@ def method_of(
     weights; `lightning` as in `build_method`.
     """
     recipe = checkpoint["recipe"]
-    recipe = {**recipe, "settings": without_pretrained(changed(recipe["settings"], wanted or {}))}
+    settings = changed(recipe["settings"], wanted or {})
+    same = settings == recipe["settings"]
+    recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
     with Bounded(elements, 20 * len(state) + _SPARE_TENSORS, "checkpoint"):
@@ -120,4 +135,9 @@ def method_of(
             f"checkpoint: its weights do not fit the method ({len(missing)} missing, "
             f"{len(foreign)} unknown)"
         )
+    if checkpoint.get("calibration") is not None:
+        if same:
+            method.calibration = read_calibration(checkpoint["calibration"], "checkpoint")
+        else:
+            method.uncalibrated = "the checkpoint was calibrated for another filter"
     return method.eval()

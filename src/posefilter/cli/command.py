@@ -46,6 +46,7 @@ from posefilter.errors import (
     INTERRUPTED,
     MISTAKE,
     Carrier,
+    NotThere,
     ProblemsFound,
     Stopped,
     UserError,
@@ -62,7 +63,7 @@ EXPECTED = (
     OSError,  # a full disk, a folder that may not be written
     MemoryError,
 )
-_FAILED = (FloatingPointError, ProblemsFound)  # nothing is wrong with the command line
+_FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
 # choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 _MULTIRUN = ("-m", "--multirun")

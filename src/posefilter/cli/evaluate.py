@@ -29,6 +29,8 @@ from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.reuse import check_same
+from posefilter.data.absent import hide_annotation
+from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
@@ -37,10 +39,12 @@ from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
+from posefilter.models.base import PoseEstimator
 from posefilter.paths import check_links
-from posefilter.types import ObjectModel
+from posefilter.types import Batch, ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
+_BATCH = 8  # images without the object
 _SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
 
 
@@ -89,6 +93,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}
+    judge_absent(method, data, job.cfg.absent_frames)
     native = data.reader.native_from_mesh
     if "pose" in method.capabilities:
         files["poses"] = job.folder / "poses.csv"
@@ -105,6 +110,24 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return record(
         method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
     ), files
+
+
+def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:
+    """Add frames of the test's scenes that lack the object to the metrics of a calibrated method.
+
+    Args:
+        method: It was tested on frames with the object.
+        data: The frames' dataset.
+        limit: How many frames at most.
+    """
+    if method.calibration is None or limit == 0:
+        return
+    frames = data.absent_dataset("test", limit)
+    with torch.no_grad():
+        for number, batch in enumerate(make_loader(frames, _BATCH, 0)):
+            hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
+            trace = method.predict_step(hidden, number)
+            method.judge_confidence(trace, hidden, there=False)
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
@@ -171,8 +194,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return metrics, {"errors": job.folder / ERRORS}
 
 
-def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictConfig:
-    """Return the settings of the data to test on.
+def data_settings(
+    job: Job, trained: dict[str, Any], name: str | None, part: str = "test"
+) -> DictConfig:
+    """Return the settings of the data to test on, or with `part` "val" to calibrate on.
 
     Without `data=` they are those that the checkpoint was trained with: its held-out test split,
     and it must lie where `check_data` lets it. With it, object and image size are the checkpoint's
@@ -207,14 +232,14 @@ def data_settings(job: Job, trained: dict[str, Any], name: str | None) -> DictCo
             raise UserError("data.root: is missing; name the dataset's folder")
         same = "root" in before and Path(root).resolve() == Path(before.root).resolve()
         if not any(key.startswith("split") for key in typed):
-            settings["split"] = before.split if same else {"test": 1.0}
+            settings["split"] = before.split if same else {part: 1.0}
             settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
         if "limit_test" not in typed:
             settings["limit_test"] = before.limit_test if same else None
         if same and "min_visibility_test" not in typed:
             settings["min_visibility_test"] = before.min_visibility_test
     elif chosen and not any(key.startswith("split") for key in typed):
-        settings["split"] = {"test": 1.0}
+        settings["split"] = {part: 1.0}
     data = OmegaConf.create({**tree, "data": settings}).data
     OmegaConf.resolve(data)
     if not chosen:

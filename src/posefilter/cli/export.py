@@ -15,7 +15,7 @@ from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.models.quantization import pack, unpack
 
-_KEPT = ("state_dict", "recipe", "object_model", "pytorch-lightning_version")
+_KEPT = ("state_dict", "recipe", "object_model", "calibration", "pytorch-lightning_version")
 
 
 def export(job: Job) -> None:
@@ -29,7 +29,10 @@ def export(job: Job) -> None:
         raise UserError(f"out={out}: must end in .ckpt")
     stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
     recipe = stripped["recipe"]
-    recipe["settings"] = changed(recipe["settings"], changes(job.cfg))
+    before = recipe["settings"]
+    recipe["settings"] = changed(before, changes(job.cfg))
+    if recipe["settings"] != before:  # what was calibrated is another filter
+        stripped.pop("calibration", None)
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
     size = write_weights(stripped, out, job.cfg.max_mb)
     following = [

@@ -15,10 +15,11 @@ _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 # settings that a command cannot do without
 _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
-    "predict": ("seed", "out"),
+    "predict": ("seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
+    "calibrate": ("frames", "seed", "replace"),
     "generate": ("seed",),
     "check_data": ("data", "out"),
-    "evaluate": ("trainer",),
+    "evaluate": ("trainer", "absent_frames"),
     "onboard": ("seed", "budget_minutes", "test_frames", "workers"),
     "export": ("points", "max_mb"),
 }

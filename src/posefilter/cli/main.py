@@ -15,6 +15,7 @@ COMMANDS = {
     "check_data": "check that a dataset and its meshes fit each other",
     "report": "explain a run or a sweep, or compare two runs, on one HTML page",
     "onboard": "go from a mesh to trained weights and a report",
+    "calibrate": "learn the probability that a checkpoint's poses are right",
     "export": "reduce a checkpoint to what prediction needs",
 }
 _USAGE = "usage: posefilter COMMAND [setting=value ...]; posefilter COMMAND --help for its settings"

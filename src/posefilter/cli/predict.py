@@ -1,11 +1,12 @@
 """Find the object, or several, in one photograph: poses, a picture, and beliefs."""
 
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import ListConfig
+from omegaconf import DictConfig, ListConfig
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changes
@@ -13,8 +14,9 @@ from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.results import write_json
+from posefilter.confidence.verdicts import Costs
 from posefilter.data.readers.decode import read_color, read_depth
-from posefilter.errors import UserError
+from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator, Result, Run, collect_results
 from posefilter.figures.canvas import save_image
 from posefilter.figures.overlay import draw_overlays
@@ -29,6 +31,10 @@ _FRAME = (
     "OpenCV camera (x right, y down, z ahead), the object as in its mesh file; camera_from_object "
     "in meters"
 )
+_PROBABILITY = (
+    "that the object is in the image and the pose within 0.1 diameters (ADD), calibrated on "
+    "validation scenes of which half showed the object; presence: that it is in the image"
+)
 _COVARIANCE = (
     "about the mean pose: x, y, z of the object's center in the camera's axes [m], then the "
     "rotation vector about it in the object's own axes [rad]"
@@ -36,17 +42,21 @@ _COVARIANCE = (
 
 
 def predict(job: Job) -> None:
-    """Find one object, or where several checkpoints are given, each of theirs."""
+    """Find one object, or where several checkpoints are given, each of theirs.
+
+    Raises:
+        NotThere: Everything is written, and the verdict on every object is that it is absent.
+    """
     settle(job.cfg.threads, job.cfg.seed)
-    if is_several(job.cfg.checkpoint):
-        predict_several(job)
-    else:
-        predict_one(job)
+    results = predict_several(job) if is_several(job.cfg.checkpoint) else predict_one(job)
+    if not job.swept and all(one.verdict == "absent" for one in results):
+        raise NotThere("; ".join(one.describe() for one in results))
 
 
-def predict_one(job: Job) -> None:
+def predict_one(job: Job) -> list[Result]:
     """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
     cfg, folder = job.cfg, job.folder
+    costs = read_costs(cfg)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
@@ -55,7 +65,7 @@ def predict_one(job: Job) -> None:
     mesh = store.load(method.model.name) if store else None
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
-    ((result,),) = collect_results([run])
+    ((result,),) = collect_results([run], costs)
     folder.mkdir(parents=True, exist_ok=True)
     save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
@@ -81,27 +91,31 @@ def predict_one(job: Job) -> None:
         following,
         **answer,
     )
+    return [result]
 
 
-def predict_several(job: Job) -> None:
-    """Write poses.json, a list with an object each, one overlay of all, and each one's belief."""
+def predict_several(job: Job) -> list[Result]:
+    """Write poses.json, a list with an object each, one overlay of those that are not absent, and
+    each one's belief.
+    """
     cfg, folder = job.cfg, job.folder
+    costs = read_costs(cfg)
     checkpoints = expand_weights(cfg.checkpoint)
     wanted = changes(cfg)
     estimator = Estimator(
-        [method_of(read_checkpoint(one), wanted, lightning=False) for one in checkpoints]
+        [method_of(read_checkpoint(one), wanted, lightning=False) for one in checkpoints],
+        costs=costs,
     )
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
     (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
-    shapes = [store.load(one.object) if store else one.model.hull for one in results]
-    marks = [
-        f"{one.object} ({'implausible' if one.warnings else f'{one.score:.1f}'})" for one in results
-    ]
+    seen = [one for one in results if one.verdict != "absent"]
+    shapes = [store.load(one.object) if store else one.model.hull for one in seen]
+    marks = [mark_result(one) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
-    picture = draw_overlays(rgb, K, [one.pose for one in results], shapes, marks)
+    picture = draw_overlays(rgb, K, [one.pose for one in seen], shapes, marks)
     save_image(picture, folder / "overlay.png")
     answers = []
     for number, (checkpoint, result) in enumerate(zip(checkpoints, results, strict=True)):
@@ -114,6 +128,7 @@ def predict_several(job: Job) -> None:
     files = {"poses": "poses.json", "overlay": "overlay.png", "beliefs": "beliefs"}
     paths = {name: folder / file for name, file in files.items()}
     ended(cfg.console, "predicted", paths, [], poses=answers)
+    return results
 
 
 def record_view(run: Run, shape: Any, path: Path) -> None:
@@ -122,10 +137,31 @@ def record_view(run: Run, shape: Any, path: Path) -> None:
     record(collect_view_data(run.trace, run.batch, method.model, method.space, shape), path)
 
 
+def read_costs(cfg: DictConfig) -> Costs:
+    """Return what errors cost, as typed."""
+    return Costs(cfg.cost_false_alarm, cfg.cost_miss, cfg.cost_unsure)
+
+
+def mark_result(result: Result) -> str:
+    """Return an object's name in the legend of several."""
+    if result.warnings:
+        return f"{result.object} (implausible)"
+    if result.probability is None:
+        return f"{result.object} ({result.score:.1f})"
+    unsure = "unsure, " if result.verdict == "unsure" else ""
+    return f"{result.object} ({unsure}{result.probability:.2f})"
+
+
 def print_result(result: Result) -> None:
-    """Print where the object is, and what speaks against it."""
+    """Print whether and where the object is, and what speaks against it."""
     place = np.array2string(1000 * result.pose[:3, 3], precision=1)
-    print(f"{result.object} at {place} mm, {result.seconds:.2f} s")
+    if result.verdict is None:
+        print(f"{result.object} at {place} mm, {result.seconds:.2f} s")
+        print(f"no probability: {result.uncalibrated}")
+    elif result.verdict == "absent":
+        print(f"{result.describe()}, {result.seconds:.2f} s")
+    else:
+        print(f"{result.describe()}, at {place} mm, {result.seconds:.2f} s")
     for warning in result.warnings:
         print(f"warning: {warning}")
 
@@ -133,14 +169,19 @@ def print_result(result: Result) -> None:
 def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]:
     """Return pose.json, or an entry of poses.json."""
     belief, pose = result.belief, result.pose
+    absent = result.verdict == "absent"
     return {
         "object": result.object,
-        "camera_from_object": pose.tolist(),
-        "rotation": pose[:3, :3].tolist(),
-        "translation_mm": (1000 * pose[:3, 3]).tolist(),
+        "verdict": result.verdict,
+        "probability": result.probability,
+        "presence": result.presence,
+        "probability_is": result.uncalibrated or _PROBABILITY,
+        "costs": asdict(result.costs),
+        "camera_from_object": None if absent else pose.tolist(),
+        "rotation": None if absent else pose[:3, :3].tolist(),
+        "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
         "score": result.score,
         "score_is": "log-likelihood up to a constant of the method; not a probability",
-        "probability": result.probability,
         "warnings": list(result.warnings),
         "belief": {
             "particles": len(belief.weights),

@@ -13,6 +13,7 @@ from posefilter.weights import expand_weights, find_weights, is_several
 _FILES = {"predict": ("rgb", "depth"), "evaluate": ("estimates",)}
 # by command: settings that name a folder to be read
 _FOLDERS = {
+    "calibrate": ("data.root", "data.meshes", "absent"),
     "check_data": ("data.root", "meshes"),
     "evaluate": ("data.root", "data.meshes"),
     "generate": ("meshes",),
@@ -43,7 +44,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
         _check_view(cfg.view, is_several(cfg.checkpoint))
     if command == "train":
         _check_loggers(cfg.logger)
-    if command in ("predict", "export") or (command == "evaluate" and cfg.checkpoint):
+    if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
         several = command == "predict" and is_several(cfg.checkpoint)
         for one in expand_weights(cfg.checkpoint) if several else [cfg.checkpoint]:
             find_weights(one)

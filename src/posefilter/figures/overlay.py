@@ -30,7 +30,7 @@ _NEAR = 0.01  # [m]; what is nearer to the camera's plane is not drawn
 def draw_overlay(
     rgb: np.ndarray,
     K: np.ndarray,
-    pose: np.ndarray,
+    pose: np.ndarray | None,
     shape: Shape,
     color: Color = ESTIMATE,
     truth: np.ndarray | None = None,
@@ -41,19 +41,14 @@ def draw_overlay(
     """Draw where a pose puts the object, and where the truth does; caption and legend are on a row
     below the photograph.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m]; width: of the
-    result at least [px]. -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W).
+    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m], None where there
+    is none; width: of the result at least [px]. -> (s H + row, s W, 3) uint8, enlarged by
+    s = max(1, width / W).
     """
-    picture = draw_poses(
-        rgb,
-        K,
-        pose,
-        shape,
-        full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1])),
-        color,
-        truth,
-    )
-    entries = [(label, color), *list_axes()]
+    view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
+    drawn = np.full((4, 4), np.nan) if pose is None else pose  # which draws nothing
+    picture = draw_poses(rgb, K, drawn, shape, view, color, truth)
+    entries = [] if pose is None else [(label, color), *list_axes()]
     return np.concatenate(
         [
             picture,

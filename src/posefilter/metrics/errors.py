@@ -28,6 +28,21 @@ def add(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:
     return torch.cat(parts).view(lead) if parts else turn.new_zeros(lead)
 
 
+def add_up_to_symmetry(poses: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) -> Tensor:
+    """Return the least ADD to any of the poses that the object's symmetries make of the truth.
+
+    Args:
+        poses: (B, 4, 4) camera_from_object [m].
+        truth: (B, 4, 4).
+        points: (P, 3) [m].
+        symmetries: (S, 4, 4) object_from_object, the identity among them.
+
+    Returns:
+        (B,) [m].
+    """
+    return add(poses[:, None], truth[:, None] @ symmetries.to(truth), points).amin(1)
+
+
 class NearestPoint:
     """Distances to the nearest of an object's points, by a k-d tree on the CPU."""
 

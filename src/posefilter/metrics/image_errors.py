@@ -1,6 +1,7 @@
 """Errors of each image of a test, as a CSV table."""
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -28,6 +29,8 @@ class ImageError(NamedTuple):
     particles_on_object: float  # share of the last particles
     score: float
     seconds: float
+    presence: float = math.nan  # probability that the object is there
+    probability: float = math.nan  # that it is there and the pose right
 
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:
@@ -54,6 +57,8 @@ def parse_row(row: dict[str, str]) -> ImageError:
     Raises:
         ValueError: A column is missing, or its value is malformed.
     """
+    optional = ImageError._field_defaults  # later than the others, so that older files have none
+    row = {name: str(value) for name, value in optional.items()} | row
     missing = [name for name in ImageError._fields if row.get(name) is None]
     if missing:
         raise ValueError(f"column {missing[0]} is missing")

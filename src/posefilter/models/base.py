@@ -16,6 +16,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
+from posefilter.confidence.calibration import Assessment, Calibration
+from posefilter.confidence.evidence import measure_belief, measure_depth
+from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.boxes import box_of_pose
@@ -56,6 +59,10 @@ class PoseEstimator(Module):
     provides: ClassVar[Capabilities] = ("rollout",)
     requires: ClassVar[Capabilities] = ()
     _trainer: Any = None  # of the LightningModule
+    # what makes probabilities of its evidence, and why there is none
+    calibration: Calibration | None = None
+    uncalibrated: str = "the checkpoint is not calibrated (calibrate.py does it)"
+    costs = Costs()  # of errors, by which verdicts are chosen
     test_only_settings: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 
     def __init__(
@@ -144,6 +151,7 @@ class PoseEstimator(Module):
         """Create the metrics of the object, by name."""
         from posefilter.metrics.bop import BopErrors  # torchmetrics: prediction needs none
         from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
+        from posefilter.metrics.confidence import Confidence
         from posefilter.metrics.visibility import ErrorsByVisibility
 
         metrics: dict[str, nn.Module] = {
@@ -155,6 +163,7 @@ class PoseEstimator(Module):
             metrics["bop"] = BopErrors([self.model])
             metrics["by_visibility"] = ErrorsByVisibility([self.model])
             metrics["belief"] = BeliefQuality([self.model])
+            metrics["confidence"] = Confidence()
         return metrics
 
     def set_object(self, model: ObjectModel) -> None:
@@ -172,6 +181,32 @@ class PoseEstimator(Module):
         epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
         return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
+
+    # -- confidence -------------------------------------------------------------------------------
+
+    def collect_evidence(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+        """Return what speaks for each estimate, by name.
+
+        Args:
+            trace: A finished run of the filter.
+            batch: Its B images; mask and pose are not used.
+
+        Returns:
+            (B,) each; more of it speaks for the estimate.
+        """
+        return {
+            **measure_belief(trace.belief, self.model),
+            **measure_depth(trace.belief.best, batch, self.model),
+        }
+
+    @torch.no_grad()
+    def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
+        """Return the probabilities that the object is there and its pose right, None where the
+        method is not calibrated; arguments as of `collect_evidence`.
+        """
+        if self.calibration is None:
+            return None
+        return self.calibration.assess(self.collect_evidence(trace, batch))
 
     # -- training ---------------------------------------------------------------------------------
 
@@ -291,6 +326,34 @@ class PoseEstimator(Module):
                 trace.belief.best, batch.camera_from_object, batch.visibility
             )
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
+            self.judge_confidence(trace, batch, there=True)
+
+    def last_assessment(self, count: int) -> Assessment:
+        """Return the probabilities of the batch that the metrics took in last, of `count` images;
+        NaN where the method is not calibrated.
+        """
+        if self.calibration is None or "confidence" not in self.scores:
+            return Assessment(*torch.full((2, count), torch.nan, dtype=torch.float64))
+        return Assessment(*self.scores["confidence"].rows[-1][:, :2].T)
+
+    def judge_confidence(self, trace: Trace, batch: Batch, there: bool) -> None:
+        """Add a batch's probabilities to the metrics, where the method is calibrated.
+
+        Args:
+            trace: A finished run of the filter.
+            batch: Its images.
+            there: Whether the object is in them; if not, the batch's poses are not used.
+        """
+        from posefilter.metrics.errors import add_up_to_symmetry  # trees of scipy
+
+        found = self.assess(trace, batch)
+        if found is None:
+            return
+        model, best = self.model, trace.belief.best
+        error = add_up_to_symmetry(best, batch.camera_from_object, model.points, model.symmetries)
+        right = (error < 0.1 * model.diameter) & there
+        verdict = score_verdicts(found, self.costs)
+        self.scores["confidence"].update(*found, torch.full_like(right, there), right, verdict)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
@@ -322,6 +385,8 @@ class PoseEstimator(Module):
         times = self.seconds_per_image
         out["seconds_per_image"] = sum(times) / len(times) if times else None
         out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
+        known = self.calibration is not None and "confidence" in self.scores
+        out["confidence"] = self.scores["confidence"].compute() if known else None
         out["by_visibility"] = (
             self.scores["by_visibility"].compute() if "poses" in self.scores else None
         )

@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
+from posefilter.confidence.evidence import measure_coordinates
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
@@ -185,6 +186,15 @@ class PosePF(PoseEstimator):
             losses["proposals"] = self.proposal_weight * fit
             self.log_scalar("coordinate_error_mm", 1000 * error.mean())
         return losses
+
+    def collect_evidence(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+        """Return what speaks for each estimate, with what the proposal network sees of it."""
+        evidence = super().collect_evidence(trace, batch)
+        if self.proposals is None:
+            return evidence
+        coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
+        cells = measure_cells(batch.depth, batch.intrinsics)
+        return evidence | measure_coordinates(trace.belief.best, coordinates, cells, self.model)
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the proposal network too."""

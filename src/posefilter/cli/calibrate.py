@@ -1,0 +1,164 @@
+"""Calibrate a checkpoint: the probability that the object is there and its pose right, learned from
+frames with the object and without.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from posefilter.cli.build import build_data
+from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
+from posefilter.cli.components import changes
+from posefilter.cli.console import JSON, ended, show_table, typed
+from posefilter.cli.evaluate import data_settings
+from posefilter.cli.files import save_whole
+from posefilter.cli.job import Job
+from posefilter.cli.machine import settle
+from posefilter.confidence.calibration import Assessment, Calibration
+from posefilter.confidence.fit import FEWEST, Frames, cross_validate, fit_calibration, make_frames
+from posefilter.confidence.verdicts import Costs, score_verdicts
+from posefilter.data.absent import hide_annotation
+from posefilter.data.dataset import FrameDataset
+from posefilter.data.loaders import make_loader
+from posefilter.errors import UserError
+from posefilter.metrics.confidence import Confidence
+from posefilter.metrics.errors import add_up_to_symmetry
+from posefilter.metrics.registry import find_metric
+from posefilter.models.base import PoseEstimator
+from posefilter.progress import watched
+from posefilter.types import Batch
+
+_BATCH = 8  # images
+_SHOWN = ("auroc", "auroc_presence", "ece", "brier", "found", "false_alarms")
+
+
+def calibrate(job: Job) -> None:
+    """Write the calibration into the checkpoint, or into a copy of it."""
+    cfg = job.cfg
+    settle(cfg.threads, cfg.seed)
+    if changes(cfg):
+        raise UserError(
+            "filter: a calibration is of the filter as the checkpoint has it; export.py writes a "
+            "checkpoint with another"
+        )
+    checkpoint, file = read_checkpoint(cfg.checkpoint), find_checkpoint(cfg.checkpoint)
+    out = file if cfg.out is None else Path(cfg.out)
+    check_out(checkpoint, file, out, cfg.replace)
+    method = method_of(checkpoint, lightning=False)
+    name = method.model.name
+    if "pose" not in method.capabilities:
+        raise UserError(
+            f"checkpoint={cfg.checkpoint}: {type(method).__name__} detects {name}, and estimates "
+            "no pose that could be right"
+        )
+    method.to("cuda" if torch.cuda.is_available() else "cpu").seed = cfg.seed
+    settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
+    settings.limit_val = cfg.frames
+    data = build_data(settings, cfg.console)
+    data.setup("validate")
+    absent = [data.absent_dataset("val", cfg.frames)]
+    if cfg.absent is not None and len(absent[0]) < cfg.frames:
+        settings.root, settings.split = str(cfg.absent), {"val": 1.0}
+        more = cfg.frames - len(absent[0])
+        absent.append(build_data(settings, cfg.console).absent_dataset("val", more))
+    if sum(map(len, absent)) < FEWEST:
+        raise UserError(
+            f"{data.root}: {sum(map(len, absent))} frames of its validation scenes lack {name}, "
+            f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
+            f"{typed('generate', out='DIR', object=name, absent_share=1, frames=60)} meshes=...)"
+        )
+    shown = cfg.console != JSON
+    frames = collect_frames(method, [data.val_dataset], absent, shown)
+    calibration = learn(frames, data.source)
+    save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
+    tell(job, method, calibration, out)
+
+
+def check_out(checkpoint: dict[str, Any], file: Path, out: Path, replace: bool) -> None:
+    """Raise UserError where the calibration cannot be written without overwriting something."""
+    if out.suffix != ".ckpt":
+        raise UserError(f"out={out}: must end in .ckpt")
+    same = out.exists() and out.samefile(file)
+    if out.exists() and not same:
+        raise UserError(f"out={out}: is there already")
+    if same and checkpoint.get("calibration") is not None and not replace:
+        raise UserError(f"{file}: is calibrated already; replace=true calibrates it anew")
+
+
+def collect_frames(
+    method: PoseEstimator,
+    present: Sequence[FrameDataset],
+    absent: Sequence[FrameDataset],
+    shown: bool = False,
+) -> Frames:
+    """Run a filter on frames with the object and without, and return what speaks for each
+    estimate, and whether it is right.
+
+    Args:
+        method: A method with its weights.
+        present: Frames with the object.
+        absent: Frames without.
+        shown: Draw a bar.
+    """
+    evidence, there, right = [], [], []
+    parts = [(one, True) for one in present] + [(one, False) for one in absent]
+    batches = [
+        (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
+    ]
+    for number, (batch, is_there) in enumerate(watched(batches, "estimating", shown)):
+        truth = batch.camera_from_object
+        seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
+        with torch.no_grad():
+            trace = method.predict_step(seen, number)
+            evidence.append(method.collect_evidence(trace, seen))
+        there.append(np.full(len(truth), is_there))
+        right.append(is_there & is_right(method, trace.belief.best.cpu(), truth).numpy())
+    return make_frames(evidence, there, right)
+
+
+def is_right(method: PoseEstimator, best: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Return which estimates are within 0.1 diameters (ADD) of the truth, or of a pose that the
+    object's symmetries make of it.  (B, 4, 4) x 2 -> (B,) bool.
+    """
+    model = method.model
+    return add_up_to_symmetry(best, truth, model.points, model.symmetries) < 0.1 * model.diameter
+
+
+def learn(frames: Frames, source: str) -> Calibration:
+    """Return the calibration of frames, with its quality on held-out parts of them."""
+    held = measure_quality(frames, cross_validate(frames))
+    quality = {key: float(held[key]) for key in _SHOWN if math.isfinite(held[key])}
+    return fit_calibration(frames, source, quality)
+
+
+def measure_quality(frames: Frames, found: Assessment) -> dict[str, Any]:
+    """Return the numbers of `Confidence` for probabilities of frames, at the default costs."""
+    metric = Confidence()
+    there, right = torch.from_numpy(frames.there), torch.from_numpy(frames.right)
+    metric.update(*found, there, right, score_verdicts(found, Costs()))
+    quality: dict[str, Any] = metric.compute()
+    return quality
+
+
+def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -> None:
+    """Say what was learned, from what, and how good it is."""
+    counts, quality = calibration.counts, calibration.quality
+    rows = [
+        ("frames with the object", str(counts["right"] + counts["wrong"])),
+        ("of these, the pose is right", str(counts["right"])),
+        ("frames without", str(counts["absent"])),
+    ]
+    infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
+    rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
+    if job.cfg.console != JSON:
+        show_table(f"{method.model.name}: held-out parts of the calibration frames", rows)
+    following = [
+        f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
+        f"intrinsics=fx,fy,cx,cy depth_scale=10000"
+    ]
+    content = {"object": method.model.name, "counts": dict(counts), "quality": dict(quality)}
+    ended(job.cfg.console, "calibrated", {"weights": out}, following, **content)

@@ -1,0 +1,177 @@
+"""The calibrated probability: two logistic regressions on the evidence of a finished filter.
+
+presence    = sigmoid(a . x + b)                that the object is in the image
+probability = presence * sigmoid(c . x + d)     that it is, and the pose within 0.1 diameters
+
+x is the evidence, standardized by the calibration frames and limited to `LIMIT` standard deviations
+on either side: what lies beyond what calibration saw counts as its edge. Each kind of evidence is
+such that more of it speaks for the estimate, and a, c >= 0: so both probabilities rise with each.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from posefilter.errors import UserError
+
+LIMIT = 3.0  # standard deviations
+COUNTS = ("right", "wrong", "absent")
+_MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+
+
+class Logistic(NamedTuple):
+    """A logistic regression on standardized evidence."""
+
+    weights: tuple[float, ...]  # >= 0
+    bias: float
+
+
+class Assessment(NamedTuple):
+    """Probabilities of B estimates, float64."""
+
+    presence: Tensor  # (B,) that the object is there
+    probability: Tensor  # (B,) that it is there and the pose right; at most `presence`
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What turns evidence into probabilities; plain data, carried in a checkpoint.
+
+    Attributes:
+        features: The names of the evidence.
+        center: Its mean over the calibration frames.
+        scale: Its standard deviation there, above 0.
+        presence: Whether the object is there.
+        success: Whether the pose is right, given that the object is there.
+        counts: Calibration frames: right, wrong, absent.
+        source: The kind of data that they are of, such as `fat`.
+        quality: Of held-out predictions on those frames, by cross-validation.
+    """
+
+    features: tuple[str, ...]
+    center: tuple[float, ...]
+    scale: tuple[float, ...]
+    presence: Logistic
+    success: Logistic
+    counts: Mapping[str, int]
+    source: str
+    quality: Mapping[str, float]
+
+    def assess(self, evidence: Mapping[str, Tensor]) -> Assessment:
+        """Return the probabilities of estimates.
+
+        Args:
+            evidence: (B,) by name; more than the calibration uses does no harm.
+
+        Raises:
+            UserError: The method gives no evidence of a name that the calibration uses.
+        """
+        missing = [name for name in self.features if name not in evidence]
+        if missing:
+            raise UserError(
+                f"calibration: is of another method, whose evidence has {missing[0]}; calibrate "
+                "the checkpoint again"
+            )
+        x = torch.stack([evidence[name].detach().double().cpu() for name in self.features], dim=-1)
+        return self.assess_features(x)
+
+    def assess_features(self, x: Tensor) -> Assessment:
+        """Return the probabilities of evidence (B, F), in the order of `features`.
+
+        Evidence that is not a number speaks against the estimate as far as any can.
+        """
+        x = (x - x.new_tensor(self.center)) / x.new_tensor(self.scale)
+        x = x.nan_to_num(-LIMIT).clamp(-LIMIT, LIMIT)
+        presence, success = (
+            torch.sigmoid(x @ x.new_tensor(one.weights) + one.bias)
+            for one in (self.presence, self.success)
+        )
+        return Assessment(presence, presence * success)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return it as dictionaries, lists, numbers and strings; `read_calibration` reads them."""
+        plain = asdict(self)
+        for name in ("presence", "success"):
+            one: Logistic = getattr(self, name)
+            plain[name] = {"weights": list(one.weights), "bias": one.bias}
+        return {
+            key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
+        }
+
+
+def read_calibration(content: Any, said: str) -> Calibration:
+    """Return the calibration that a checkpoint holds, as data that others may have written.
+
+    Args:
+        content: What the checkpoint holds under that name.
+        said: How the user named the checkpoint, for messages.
+
+    Raises:
+        UserError: It is no calibration: other keys, numbers that are not finite or far too large,
+            negative weights, names that are none.
+    """
+    try:
+        return _read(content)
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(f"{said}: its calibration {error.args[0]}") from error
+
+
+def _read(content: Any) -> Calibration:
+    names = {field.name for field in fields(Calibration)}
+    if not isinstance(content, dict) or set(content) != names:
+        raise ValueError(f"should hold {', '.join(sorted(names))}, nothing else")
+    features = content["features"]
+    good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
+    if not good or not all(isinstance(one, str) and _NAME.fullmatch(one) for one in features):
+        raise ValueError(f"should name 1 to {_MOST_FEATURES} features")
+    if len(set(features)) < len(features):
+        raise ValueError("names a feature twice")
+    count = len(features)
+    scale = _numbers(content["scale"], count, "scale", least=1e-9)
+    counts, source = content["counts"], content["source"]
+    if not isinstance(counts, dict) or set(counts) != set(COUNTS):
+        raise ValueError(f"should count {', '.join(COUNTS)}")
+    if not all(type(one) is int and 0 <= one <= _MOST_FRAMES for one in counts.values()):
+        raise ValueError("counts no frames")
+    if not (isinstance(source, str) and _NAME.fullmatch(source)):
+        raise ValueError("names no source of data")
+    quality = content["quality"]
+    if not isinstance(quality, dict) or len(quality) > _MOST_FEATURES:
+        raise ValueError("has no table of its quality")
+    if not all(isinstance(key, str) and _NAME.fullmatch(key) for key in quality):
+        raise ValueError("has a quality without a name")
+    numbers = _numbers(list(quality.values()), len(quality), "quality")
+    return Calibration(
+        tuple(features),
+        _numbers(content["center"], count, "center"),
+        scale,
+        _logistic(content["presence"], count, "presence"),
+        _logistic(content["success"], count, "success"),
+        dict(counts),
+        source,
+        dict(zip(quality, numbers, strict=True)),
+    )
+
+
+def _logistic(content: Any, count: int, name: str) -> Logistic:
+    if not isinstance(content, dict) or set(content) != {"weights", "bias"}:
+        raise ValueError(f"should have weights and bias in {name}")
+    weights = _numbers(content["weights"], count, f"{name}'s weights", least=0.0)
+    return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
+
+
+def _numbers(values: Any, count: int, name: str, least: float = -_LARGEST) -> tuple[float, ...]:
+    """Return finite numbers of moderate size."""
+    if not isinstance(values, list) or len(values) != count:
+        raise ValueError(f"should have {count} numbers in {name}")
+    for value in values:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and math.isfinite(value) and least <= value <= _LARGEST):
+            raise ValueError(f"has {str(value)[:30]!r} in {name}")
+    return tuple(float(value) for value in values)

@@ -1,0 +1,107 @@
+"""Evidence for an estimate: cheap numbers of a finished filter, of which more speaks for it.
+
+A learned likelihood compares poses of one image; between images its level is arbitrary.  So the
+evidence asks what the likelihood does not: do the particles agree, does the measured depth show a
+surface where the pose says, and does the proposal network, which has seen the image as a whole,
+take the same pixels for the same points of the object?
+"""
+
+import torch
+from torch import Tensor
+
+from posefilter.geometry.camera import project
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel
+from posefilter.geometry.pose import invert, transform
+from posefilter.geometry.pose_error import subsample
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.nets.coordinates import Cells, Coordinates
+from posefilter.types import Batch, Belief, ObjectModel
+
+_POINTS = 200  # of the surface: as many as exported weights carry
+_NOISE = 0.005  # [m] of the depth
+_CELLS = 6  # of the network, that a small object covers
+_NEAREST = 0.01  # [m] points before the camera's plane
+
+
+def measure_belief(belief: Belief, model: ObjectModel) -> dict[str, Tensor]:
+    """Return how the particles agree with the estimate.
+
+    Args:
+        belief: B beliefs.
+        model: The object.
+
+    Returns:
+        (B,) each. `score`: the estimate's log-likelihood. `concentration`: the negative logarithm
+        of the particles' root mean square distance from the estimate (`PoseSpace`), in diameters.
+    """
+    x, y, z = model.center.tolist()
+    space = PoseSpace((x, y, z), model.radius)
+    weights = belief.log_weights.exp()
+    distance = space.distance(belief.poses, belief.best[:, None]) / model.diameter
+    spread = (weights * distance.square()).sum(1).sqrt()
+    return {"score": belief.score, "concentration": -spread.clamp(1e-3, 1e3).log()}
+
+
+def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, Tensor]:
+    """Return whether the depth shows a surface where poses put the object's.
+
+    A surface point whose pixel shows a surface at its own depth agrees; one before which something
+    is measured is hidden, by the object itself or by another, and says nothing; one whose pixel
+    shows what lies behind it is seen through, and speaks against the pose.
+
+    Args:
+        best: (B, 4, 4) camera_from_object [m].
+        batch: B images.
+        model: The object.
+
+    Returns:
+        (B,) each. `surface`: the share of the points that agree. `solid`: of those that agree or
+        are seen through, the share that agrees.
+    """
+    points = transform(best, subsample(model.points, _POINTS).to(best))
+    pixels = nearest_pixel(project(points, batch.intrinsics))
+    depth = gather_pixels(batch.depth, pixels)[..., 0]  # 0 off the frame
+    known = (depth > 0) & (points[..., 2] > _NEAREST)
+    behind = depth - points[..., 2]  # what is measured lies so far behind the point
+    tolerance = _NOISE + 0.05 * model.diameter
+    agrees = (known & (behind.abs() < tolerance)).float().mean(1)
+    through = (known & (behind >= tolerance)).float().mean(1)
+    few = 1 / points.shape[1]
+    return {"surface": agrees, "solid": (agrees + few) / (agrees + through + 2 * few)}
+
+
+def measure_coordinates(
+    best: Tensor, coordinates: Coordinates, cells: Cells, model: ObjectModel
+) -> dict[str, Tensor]:
+    """Return whether the network of dense object coordinates sees the object where poses put it.
+
+    A cell is on the object where its measured point lies on the object's surface at the pose.
+
+    Args:
+        best: (B, 4, 4) camera_from_object [m].
+        coordinates: The network's output.
+        cells: The measured point of each cell.
+        model: The object.
+
+    Returns:
+        (B,) each. `explained`: of the cells that the network takes for the object, by its
+        probability, the share that is on it. `recognized`: of the cells that are on the object, the
+        share that the network takes for it. `coordinates`: of the cells that the network takes for
+        the object, the share whose predicted object point is the one that the pose puts there,
+        within a fifth of the radius. `glimpsed`: the mean probability of the cells that the network
+        is surest of, wherever they are.
+    """
+    share = torch.sigmoid(coordinates.logit).flatten(1) * cells.valid.flatten(1)
+    points = transform(invert(best), cells.point.flatten(1, 2))
+    surface = subsample(model.points, _POINTS).to(best)
+    nearest = torch.cdist(points, surface.expand(len(best), -1, -1)).amin(-1)
+    on = (nearest < _NOISE + 0.08 * model.diameter) & cells.valid.flatten(1)
+    predicted = coordinates.coordinate.flatten(1, 2)
+    error = (predicted - (points - model.center.to(best)) / model.radius).norm(dim=-1)
+    total, few = share.sum(1), 0.5  # cells, so that few of them tell little
+    return {
+        "explained": (share * on).sum(1) / (total + few),
+        "recognized": (share * on).sum(1) / (on.sum(1) + few),
+        "coordinates": (share * (error < 0.2)).sum(1) / (total + few),
+        "glimpsed": share.topk(min(_CELLS, share.shape[1]), dim=1).values.mean(1),
+    }

@@ -1,0 +1,153 @@
+"""Fit a calibration to frames with and without the object.
+
+Each regression is the maximum of a posterior (MAP): a logistic likelihood with Platt's targets
+(1999), which are a little off 0 and 1 as few frames warrant, and a normal prior on the weights,
+which are not negative. It is convex, so that the same frames give the same calibration.
+
+References:
+    Platt: Probabilistic outputs for support vector machines. Advances in Large Margin Classifiers
+        (1999).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from posefilter.confidence.calibration import LIMIT, Assessment, Calibration, Logistic
+from posefilter.errors import UserError
+
+FEWEST = 10  # frames with the object, and without
+PENALTY = 1.0  # of the squared weights: the inverse variance of their prior
+
+
+class Frames(NamedTuple):
+    """Calibration frames."""
+
+    features: tuple[str, ...]
+    evidence: np.ndarray  # (n, F)
+    there: np.ndarray  # (n,) bool: the object is in the image
+    right: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
+
+    def select(self, index: np.ndarray) -> "Frames":
+        """Return some of the frames."""
+        return Frames(self.features, self.evidence[index], self.there[index], self.right[index])
+
+
+def make_frames(
+    evidence: Sequence[Mapping[str, torch.Tensor]],
+    there: Sequence[np.ndarray],
+    right: Sequence[np.ndarray],
+) -> Frames:
+    """Return the frames of batches of evidence, each (B,) by name."""
+    names = tuple(evidence[0])
+    rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in evidence]
+    return Frames(names, np.concatenate(rows), np.concatenate(there), np.concatenate(right))
+
+
+def fit_calibration(
+    frames: Frames, source: str, quality: Mapping[str, float] | None = None
+) -> Calibration:
+    """Fit both regressions.
+
+    The presence counts frames with and without the object as if there were as many of each: it is
+    calibrated for a prior of one half.
+
+    Args:
+        frames: n frames.
+        source: The kind of data that they are of.
+        quality: Of held-out predictions.
+
+    Raises:
+        UserError: There are too few frames with the object, or without.
+    """
+    for count, which in (
+        (int(frames.there.sum()), "with"),
+        (int((~frames.there).sum()), "without"),
+    ):
+        if count < FEWEST:
+            raise UserError(
+                f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
+            )
+    return _fit(frames, source, quality or {})
+
+
+def _fit(frames: Frames, source: str, quality: Mapping[str, float]) -> Calibration:
+    there, right = frames.there, frames.right
+    counts = {
+        "right": int(right.sum()),
+        "wrong": int((there & ~right).sum()),
+        "absent": int((~there).sum()),
+    }
+    center = np.nanmean(frames.evidence, 0)
+    scale = np.nanstd(frames.evidence, 0).clip(1e-6)
+    x = np.nan_to_num((frames.evidence - center) / scale, nan=-LIMIT).clip(-LIMIT, LIMIT)
+    share = there.mean()
+    balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
+    return Calibration(
+        frames.features,
+        tuple(center.tolist()),
+        tuple(scale.tolist()),
+        fit_logistic(x, there, balance),
+        fit_logistic(x[there], right[there]),
+        counts,
+        source,
+        dict(quality),
+    )
+
+
+def fit_logistic(
+    x: np.ndarray, label: np.ndarray, balance: np.ndarray | None = None, penalty: float = PENALTY
+) -> Logistic:
+    """Return the logistic regression of highest posterior density, with weights of 0 or more.
+
+    Args:
+        x: (n, F) standardized features.
+        label: (n,) bool.
+        balance: (n,) how much each frame counts; None: 1.
+        penalty: Inverse variance of the weights' normal prior.
+    """
+    from scipy.optimize import minimize  # prediction needs none
+
+    count = np.ones(len(x)) if balance is None else balance
+    many, few = float(count[label].sum()), float(count[~label].sum())
+    target = np.where(label, (many + 1) / (many + 2), 1 / (few + 2))
+
+    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        weights, bias = parameters[:-1], parameters[-1]
+        z = x @ weights + bias
+        value = (count * (np.logaddexp(0, z) - target * z)).sum()
+        slope = count * (1 / (1 + np.exp(-z)) - target)
+        gradient = np.append(x.T @ slope + penalty * weights, slope.sum())
+        return value + 0.5 * penalty * weights @ weights, gradient
+
+    start = np.zeros(x.shape[1] + 1)
+    bounds = [(0, None)] * x.shape[1] + [(None, None)]
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, tol=1e-10).x
+    return Logistic(tuple(found[:-1].tolist()), float(found[-1]))
+
+
+def cross_validate(frames: Frames, folds: int = 5, seed: int = 0) -> Assessment:
+    """Return the probabilities of frames, each by a calibration that has not seen it.
+
+    Args:
+        frames: n frames.
+        folds: Parts, each with its share of right, wrong and absent frames.
+        seed: Of their shuffle.
+    """
+    rng = np.random.default_rng(seed)
+    kind = frames.there.astype(int) + frames.right
+    fold = np.empty(len(kind), int)
+    for one in np.unique(kind):
+        own = np.flatnonzero(kind == one)
+        fold[rng.permutation(own)] = np.arange(len(own)) % folds
+    presence, probability = torch.zeros(2, len(kind), dtype=torch.float64)
+    for k in range(folds):
+        held = np.flatnonzero(fold == k)
+        if not len(held):
+            continue
+        part = _fit(frames.select(np.flatnonzero(fold != k)), "held_out", {})
+        found = part.assess_features(torch.from_numpy(frames.evidence[held]))
+        presence[held], probability[held] = found
+    return Assessment(presence, probability)

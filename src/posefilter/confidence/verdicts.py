@@ -1,0 +1,72 @@
+"""A verdict from probabilities, by what an error costs: the reject option of Chow (1970).
+
+References:
+    Chow: On optimum recognition error and reject tradeoff. IEEE Transactions on Information Theory
+        16 (1970).
+"""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from posefilter.confidence.calibration import Assessment
+from posefilter.errors import UserError
+
+Verdict = Literal["found", "unsure", "absent"]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What errors cost; only their ratios count.
+
+    Attributes:
+        false_alarm: Of declaring a pose that is wrong, or of an object that is not there.
+        miss: Of declaring an object absent that is there.
+        unsure: Of declaring nothing, such as another look.
+
+    Raises:
+        UserError: One is not a positive number.
+    """
+
+    false_alarm: float = 5.0
+    miss: float = 5.0
+    unsure: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check that the costs are positive."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (number and 0 < value < math.inf):
+                raise UserError(f"cost_{field.name}={value}: must be a positive number")
+
+
+def decide(presence: float, probability: float, costs: Costs | None = None) -> Verdict:
+    """Return the verdict of least expected cost.
+
+    "found" costs `false_alarm` with probability 1 - `probability`, "absent" costs `miss` with
+    probability `presence`, "unsure" always costs `unsure`. Of equal costs "unsure" is chosen
+    first, then "absent".
+
+    Args:
+        presence: Probability that the object is there.
+        probability: Probability that it is there and the pose right; at most `presence`.
+        costs: What errors cost; None: the default.
+    """
+    costs = costs or Costs()
+    expected: dict[Verdict, float] = {
+        "unsure": costs.unsure,
+        "absent": presence * costs.miss,
+        "found": (1 - probability) * costs.false_alarm,
+    }
+    return min(expected, key=lambda verdict: expected[verdict])
+
+
+def score_verdicts(found: Assessment, costs: Costs | None = None) -> Tensor:
+    """Return the verdicts on B estimates as numbers, (B,) float64: 1 found, 0 unsure, -1 absent."""
+    number = {"found": 1.0, "unsure": 0.0, "absent": -1.0}
+    pairs = zip(found.presence.tolist(), found.probability.tolist(), strict=True)
+    return torch.tensor([number[decide(q, p, costs)] for q, p in pairs], dtype=torch.float64)

@@ -1,0 +1,106 @@
+"""How well a probability tells right from wrong, and whether it means what it says."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from posefilter.metrics.collect import concat_state
+from posefilter.metrics.diagnostics import auroc
+
+COVERAGE = 0.8  # share of the images that are kept where an error rate is given
+_BINS = 10
+
+
+def calibration_error(probability: Tensor, right: Tensor, bins: int = _BINS) -> Tensor:
+    """Return the expected calibration error (Naeini et al. 2015).
+
+    The mean over bins of equal width, weighted by their number of predictions, of |mean probability
+    - share that is right|. With n predictions a perfect forecaster has an error of about
+    sqrt(bins / n) / 4, so that few tell little.
+
+    (M,), (M,) bool -> (); NaN without predictions.
+    """
+    if not len(probability):
+        return torch.tensor(torch.nan)
+    bin = (probability * bins).long().clamp(0, bins - 1)
+    gap = torch.zeros(bins, dtype=torch.float64).index_add(
+        0, bin, probability.double() - right.double()
+    )
+    return gap.abs().sum() / len(probability)
+
+
+def error_at_coverage(probability: Tensor, right: Tensor, coverage: float = COVERAGE) -> Tensor:
+    """Return the share that is wrong among the predictions of highest probability.
+
+    Args:
+        probability: (M,).
+        right: (M,) bool.
+        coverage: Share of the predictions that are kept; the rest is refused.
+
+    Returns:
+        (), NaN without predictions. Of equal probabilities all count alike.
+    """
+    count = len(probability)
+    if not count:
+        return torch.tensor(torch.nan)
+    kept = max(1, round(coverage * count))
+    least = probability.double().sort(descending=True).values[kept - 1]
+    above, equal = probability > least, probability == least
+    share = (kept - above.sum()) / equal.sum()
+    wrong = (~right).double()
+    return (wrong[above].sum() + share * wrong[equal].sum()) / kept
+
+
+class Confidence(Metric):
+    """The quality of calibrated probabilities, over frames with and without the object.
+
+    auroc: of the probability, right against wrong poses, among frames with the object.
+    auroc_presence: of the presence, frames with the object against frames without. ece, brier: of
+    the probability, over all frames. wrong: share of wrong poses among frames with the object;
+    wrong_at_80: the same among the 80 % of highest probability. found, absent: share of the frames
+    with the object that are declared so. false_alarms: number of frames without the object in which
+    one is found.
+    """
+
+    full_state_update = False
+    rows: list[Tensor]
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_state("rows", default=[], dist_reduce_fx="cat")
+
+    def update(
+        self, presence: Tensor, probability: Tensor, there: Tensor, right: Tensor, verdict: Tensor
+    ) -> None:
+        """Accumulate estimates.
+
+        Args:
+            presence: (B,) probabilities.
+            probability: (B,) likewise.
+            there: (B,) bool, the object is in the image.
+            right: (B,) bool, and the pose within 0.1 diameters.
+            verdict: (B,) 1 where it is found, -1 where absent, 0 where unsure.
+        """
+        columns = (presence, probability, there, right, verdict)
+        self.rows.append(torch.stack([x.double().cpu() for x in columns], dim=1))
+
+    def compute(self) -> dict[str, Any]:
+        """Return the numbers; those that need frames of a kind that is missing are NaN."""
+        presence, probability, there, right, verdict = concat_state(self.rows).T
+        own, is_right = there > 0, right > 0
+        with_object, declared = probability[own], verdict[own]
+        return {
+            "frames": int(own.sum()),
+            "frames_without": int((~own).sum()),
+            "auroc": float(auroc(with_object, is_right[own])),
+            "auroc_presence": float(auroc(presence, own)),
+            "ece": float(calibration_error(probability, is_right)),
+            "brier": float((probability - right).square().mean()),
+            "wrong": float((1 - right[own]).mean()),
+            "wrong_at_80": float(error_at_coverage(with_object, is_right[own])),
+            "found": float((declared > 0).double().mean()),
+            "absent": float((declared < 0).double().mean()),
+            "false_alarms": int((verdict[~own] > 0).sum()),
+        }

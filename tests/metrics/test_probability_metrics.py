@@ -1,0 +1,56 @@
+"""Metrics of calibrated probabilities, against counting and against known answers."""
+
+import math
+
+import pytest
+import torch
+
+from posefilter.metrics.confidence import Confidence, calibration_error, error_at_coverage
+
+
+def test_calibration_error_is_the_mean_gap_of_the_bins() -> None:
+    probability = torch.tensor([0.05, 0.05, 0.95, 0.95, 0.95, 0.95])
+    right = torch.tensor([False, True, True, True, True, False])
+    # two bins: |0.05 - 0.5| and |0.95 - 0.75|
+    assert float(calibration_error(probability, right)) == pytest.approx(
+        (2 * 0.45 + 4 * 0.2) / 6, abs=1e-6
+    )
+    assert math.isnan(calibration_error(probability[:0], right[:0]))
+
+
+def test_labels_drawn_from_the_probabilities_have_little_calibration_error() -> None:
+    probability = torch.rand(20_000, dtype=torch.float64)
+    right = torch.rand(20_000, dtype=torch.float64) < probability
+    assert float(calibration_error(probability, right)) < 0.02
+    assert float(calibration_error(probability, ~right)) > 0.3
+
+
+def test_refusing_the_least_probable_leaves_the_errors_of_the_rest() -> None:
+    probability = torch.tensor([0.9, 0.8, 0.7, 0.6, 0.1])
+    right = torch.tensor([True, True, False, True, False])
+    assert float(error_at_coverage(probability, right, 1.0)) == pytest.approx(0.4)
+    assert float(error_at_coverage(probability, right, 0.8)) == pytest.approx(0.25)
+    assert float(error_at_coverage(probability, right, 0.4)) == 0
+    ties = torch.full((10,), 0.5)
+    wrong = torch.arange(10) < 3
+    assert float(error_at_coverage(ties, ~wrong)) == pytest.approx(0.3)
+
+
+def test_frames_without_the_object_count_for_presence_and_false_alarms_alone() -> None:
+    metric = Confidence()
+    own = torch.tensor([True, True, True, False])
+    metric.update(
+        torch.tensor([0.9, 0.8, 0.7, 0.6]),
+        torch.tensor([0.9, 0.5, 0.6, 0.1]),
+        own,
+        torch.tensor([True, False, True, False]),
+        torch.tensor([1.0, 0.0, -1.0, 1.0]),
+    )
+    told = metric.compute()
+    assert (told["frames"], told["frames_without"], told["false_alarms"]) == (3, 1, 1)
+    assert told["auroc"] == 1
+    assert told["auroc_presence"] == 1
+    assert told["wrong"] == pytest.approx(1 / 3)
+    assert told["found"] == pytest.approx(1 / 3)
+    assert told["absent"] == pytest.approx(1 / 3)
+    assert told["brier"] == pytest.approx((0.01 + 0.25 + 0.16 + 0.01) / 4, abs=1e-6)

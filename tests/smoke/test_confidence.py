@@ -1,0 +1,194 @@
+"""A probability, the whole way at toy size: calibrated, stored, predicted, evaluated."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from posefilter import Costs, load
+from posefilter.cli import run_command
+from posefilter.cli.build import build_data
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
+from posefilter.errors import UserError
+from posefilter.synthetic.generate import generate
+
+HOME = Path(__file__).parents[2]
+QUIET = ["console=json", "threads=1"]
+TINY = ["debug=smoke", *QUIET, "logger=none", "data.progress=false", "filter.particles=16"]
+
+
+@pytest.fixture(scope="module")
+def weights(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return an untrained checkpoint of the pose-space method."""
+    folder = tmp_path_factory.mktemp("untrained")
+    words = [*TINY, f"data.root={tiny_scenes}", "filter.steps=3"]
+    job = compose_job("train", HOME / "conf", words, folder)
+    data = build_data(job.cfg.data, "json")
+    method = build_method(recipe(job), data.object_model(0), lightning=False)
+    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
+    method.on_save_checkpoint(content)
+    torch.save(content, folder / "untrained.ckpt")
+    return folder / "untrained.ckpt"
+
+
+@pytest.fixture(scope="module")
+def without(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return twelve frames that lack the carton."""
+    out = tmp_path_factory.mktemp("without") / "scenes"
+    few = {"distractors": (1, 2), "frames_per_scene": 4, "workers": 1, "progress": False}
+    generate(out, 12, object="carton", size=(160, 120), absent_share=1.0, **few)  # type: ignore[arg-type]
+    return out
+
+
+@pytest.fixture(scope="module")
+def calibrated(
+    weights: Path, tiny_scenes: Path, without: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """Return a calibrated copy, written by the command."""
+    out = tmp_path_factory.mktemp("calibrated") / "carton.ckpt"
+    typed = [
+        f"checkpoint={weights}",
+        f"data.root={tiny_scenes}",
+        "data.split={train: 0, val: 1.0, test: 0}",
+    ]
+    typed += ["data.min_visibility_test=0", f"absent={without}", "frames=12", f"out={out}", *QUIET]
+    assert run_command("calibrate", HOME, typed) == 0
+    return out
+
+
+def plant(path: Path, out: Path, presence: float, success: float) -> Path:
+    """Write a copy whose calibration answers the same whatever it sees."""
+    content = torch.load(path, weights_only=True)
+    for name, bias in (("presence", presence), ("success", success)):
+        none = [0.0] * len(content["calibration"]["features"])
+        content["calibration"][name] = {"weights": none, "bias": bias}
+    torch.save(content, out)
+    return out
+
+
+def photograph(scenes: Path) -> list[str]:
+    rgb = min(scenes.rglob("*.left.jpg"))
+    depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
+    return [f"rgb={rgb}", f"depth={depth}", "intrinsics=266,266,78,60", *QUIET]
+
+
+def test_a_calibration_is_stored_and_not_overwritten(
+    calibrated: Path, weights: Path, tiny_scenes: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stored = torch.load(calibrated, weights_only=True)["calibration"]
+    assert stored["counts"]["right"] + stored["counts"]["wrong"] == 12
+    assert 10 <= stored["counts"]["absent"] <= 12  # one that shows nothing at all is not listed
+    assert stored["source"] == "scenes"
+    again = [f"checkpoint={calibrated}", f"data.root={tiny_scenes}", *QUIET]
+    assert run_command("calibrate", HOME, again) == 2
+    assert "replace=true" in capfd.readouterr().err
+    assert run_command("calibrate", HOME, [*again, "filter.particles=9"]) == 2
+    assert "export.py" in capfd.readouterr().err
+    few = [
+        f"checkpoint={weights}",
+        f"data.root={tiny_scenes}",
+        "data.split={train: 0, val: 1.0, test: 0}",
+        *QUIET,
+    ]
+    assert run_command("calibrate", HOME, few) == 2
+    assert "absent_share=1" in capfd.readouterr().err
+
+
+def test_an_absent_object_gets_no_pose_and_status_1(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    nothing = plant(calibrated, tmp_path / "nothing.ckpt", -9.0, 9.0)
+    typed = [f"checkpoint={nothing}", *photograph(tiny_scenes), f"out={tmp_path / 'a'}"]
+    assert run_command("predict", HOME, typed) == 1
+    out, err = capfd.readouterr()
+    assert err.splitlines() == ["predict: carton: absent, probability 0.00 that it is there"]
+    assert json.loads(out.splitlines()[-1])["verdict"] == "absent"
+    told = json.loads((tmp_path / "a" / "pose.json").read_text())
+    assert told["verdict"] == "absent"
+    assert told["camera_from_object"] is None
+    assert told["presence"] < 0.01
+    rgb = cv2.imread(typed[1].removeprefix("rgb="))
+    height = rgb.shape[0] * 640 // rgb.shape[1]
+    drawn = cv2.imread(str(tmp_path / "a" / "overlay.png"))[:height]
+    plain = cv2.resize(rgb, (640, height), interpolation=cv2.INTER_CUBIC)
+    assert np.abs(drawn.astype(int) - plain).mean() < 1
+
+    there = plant(calibrated, tmp_path / "there.ckpt", 9.0, 9.0)
+    both = [f"checkpoint=[{nothing},{there}]", *typed[1:-1], f"out={tmp_path / 'b'}"]
+    assert run_command("predict", HOME, both) == 0
+    rows = json.loads((tmp_path / "b" / "poses.json").read_text())
+    assert [row["verdict"] for row in rows] == ["absent", "found"]
+    assert [row["camera_from_object"] is None for row in rows] == [True, False]
+
+
+def test_verdicts_go_by_what_errors_cost(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    fair = plant(calibrated, tmp_path / "fair.ckpt", 1.0, 1.0)  # 0.73, and 0.53 for the pose
+    typed = [f"checkpoint={fair}", *photograph(tiny_scenes)]
+    verdicts = []
+    for number, words in enumerate(([], ["cost_false_alarm=1"], ["cost_miss=1", "cost_unsure=5"])):
+        assert run_command("predict", HOME, [*typed, *words, f"out={tmp_path / str(number)}"]) < 2
+        told = json.loads((tmp_path / str(number) / "pose.json").read_text())
+        verdicts.append(told["verdict"])
+        assert told["probability"] == pytest.approx(0.731**2, abs=1e-3)
+    assert verdicts == ["unsure", "found", "absent"]
+    capfd.readouterr()
+    assert run_command("predict", HOME, [*typed, "cost_miss=-1", f"out={tmp_path / 'c'}"]) == 2
+    assert "cost_miss=-1" in capfd.readouterr().err
+
+
+def test_the_library_gives_what_the_command_gives(
+    calibrated: Path, weights: Path, tiny_scenes: Path
+) -> None:
+    rgb = cv2.imread(str(min(tiny_scenes.rglob("*.left.jpg"))))[..., ::-1]
+    depth = np.full(rgb.shape[:2], 0.7)
+    K = np.array([[266.0, 0, 78], [0, 266, 60], [0, 0, 1]])
+    result = load(calibrated, device="cpu").predict(rgb, depth, K)
+    assert 0 <= result.probability <= result.presence <= 1
+    assert result.verdict in ("found", "unsure", "absent")
+    assert result.decide(Costs(miss=1e6)) != "absent"
+    plain = load(weights, device="cpu").predict(rgb, depth, K)
+    assert plain.probability is plain.presence is plain.verdict is None
+    assert "calibrate.py" in plain.uncalibrated
+    other = load(calibrated, overrides=["filter.particles=8"], device="cpu").predict(rgb, depth, K)
+    assert other.probability is None
+    assert "another filter" in other.uncalibrated
+
+
+def test_an_evaluation_reports_how_much_the_probability_tells(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path
+) -> None:
+    typed = [f"checkpoint={calibrated}", f"data.root={tiny_scenes}", *QUIET, f"out={tmp_path}"]
+    assert run_command("evaluate", HOME, [*typed, "data.split={train: 0, val: 0, test: 1.0}"]) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["confidence"]["frames"] == metrics["instances"] > 5
+    assert metrics["confidence"]["frames_without"] == 0
+    assert 0 <= metrics["confidence"]["ece"] <= 1
+    with (tmp_path / "errors.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    with (tmp_path / "poses.csv").open() as file:
+        scores = [float(row["score"]) for row in csv.DictReader(file)]
+    assert scores == [float(row["probability"]) for row in rows]
+    assert all(float(row["probability"]) <= float(row["presence"]) <= 1 for row in rows)
+
+
+def test_a_detector_is_refused(tiny_scenes: Path, tmp_path: Path) -> None:
+    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch"]
+    job = compose_job("train", HOME / "conf", words, tmp_path)
+    data = build_data(job.cfg.data, "json")
+    method = build_method(recipe(job), data.object_model(0), lightning=False)
+    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
+    method.on_save_checkpoint(content)
+    torch.save(content, tmp_path / "detector.ckpt")
+    from posefilter.cli.calibrate import calibrate
+
+    typed = [f"checkpoint={tmp_path / 'detector.ckpt'}"]
+    with pytest.raises(UserError, match="estimates no pose"):
+        calibrate(compose_job("calibrate", HOME / "conf", typed, tmp_path))
