@@ -11,13 +11,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.build import build_data
-from posefilter.cli.checkpoints import read_checkpoint
+from posefilter.cli.calibrate import collect_frames, learn
+from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
-from posefilter.cli.console import ended, say, typed
+from posefilter.cli.console import JSON, ended, say, typed
 from posefilter.cli.export import strip, write_weights
+from posefilter.cli.files import save_whole
 from posefilter.cli.folders import hold_folder
 from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
@@ -28,6 +31,7 @@ from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
 from posefilter.cli.stages import Stages
 from posefilter.cli.train import build, finish, fit, test
+from posefilter.confidence.fit import FEWEST
 from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.meshes.inspect_mesh import list_concerns
@@ -41,6 +45,7 @@ RECORD = "onboarding.json"
 _FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 40, 200, 2000
 _FEWEST_STEPS, _MOST_STEPS = 100, 8000
 _VALIDATED = 8  # images, once at the end
+_CALIBRATED = 40  # images with the object, and as many without
 _REST = 45.0  # [s] reserved for figures, weights and report
 
 
@@ -159,7 +164,8 @@ class Onboarding:
 
     def rest(self, speed: Speed) -> float:
         """Return how long all that follows the training takes [s]."""
-        return float(speed.image * (_VALIDATED + self.cfg.test_frames) + _REST)
+        images = _VALIDATED + self.cfg.test_frames + 2 * min(_CALIBRATED, self.frames // 10)
+        return float(speed.image * images + _REST)
 
 
 def onboard(job: Job) -> None:
@@ -239,6 +245,33 @@ def export(work: Onboarding) -> None:
     write_weights(strip(checkpoint, points=200, compact=True), work.weights, max_mb=5)
 
 
+def calibrate(work: Onboarding) -> None:
+    """Give the weights a probability, from validation scenes and from renders without the object;
+    say so where there are too few.
+    """
+    job = work.job(work.training, f"data.limit_val={_CALIBRATED}")
+    data = build_data(job.cfg.data, work.cfg.console)
+    data.setup("validate")
+    count = len(data.val_dataset)
+    if count < FEWEST:
+        said = f"not calibrated: {count} validation frames, and {FEWEST} are needed"
+        work.stages.keep(calibration=None)
+        say(work.cfg.console, "calibrated", said, frames=count, calibrated=False)
+        return
+    settings = job.cfg.data
+    OmegaConf.set_struct(settings, False)
+    settings.generate.update(frames=count, absent_share=1.0, seed=int(work.cfg.seed) + 1)
+    settings.root, settings.split = str(work.out / "absent"), {"val": 1.0}
+    without = build_data(settings, work.cfg.console).absent_dataset("val", count)
+    checkpoint = read_checkpoint(work.weights)
+    method = method_of(checkpoint, lightning=False)
+    method.to("cuda" if torch.cuda.is_available() else "cpu")
+    shown = work.cfg.console != JSON
+    calibration = learn(collect_frames(method, [data.val_dataset], [without], shown), data.source)
+    save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)
+    work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
+
+
 def report(work: Onboarding) -> None:
     """Write the page."""
     record = read_run(work.training)
@@ -292,5 +325,6 @@ STAGES = (
     Stage("train", "training", ("mesh", *_TRAINED), train, True),
     Stage("test", "testing on held-out renders", ("mesh", *_TRAINED, "test_frames"), evaluate),
     Stage("export", "writing the weights", ("mesh", *_TRAINED), export),
+    Stage("calibrate", "calibrating the probability", ("mesh", *_TRAINED), calibrate),
     Stage("report", "writing the report", ("mesh", *_TRAINED, "test_frames"), report),
 )
