@@ -1,0 +1,126 @@
+"""Look for every object in every photograph of a dataset, whether it is there or not, and count
+what calibrated checkpoints declare.
+
+    python bench/confidence.py --source ycb_video --root DIR --meshes DIR [--weights FILE ...]
+        [--every 10] [--input depth_x2] [--out FILE.json]
+
+Photographs serve as a test alone: no calibration sees them.  `--input` spoils what a user types or
+connects, so that every estimate is of a scene that there is not: a wrong depth scale, another focal
+length, red and blue exchanged.  With it, no answer is right to be sure.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import posefilter
+from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.metrics.errors import add_up_to_symmetry
+
+Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
+HEAD = ("object", "with it", "right", "found", "found and right", "absent")
+HEAD += ("without it", "found", "unsure", "highest probability")
+
+
+def _stretch(factor: float) -> Callable[[Sample], Inputs]:
+    return lambda one: (one.rgb, factor * one.depth, one.intrinsics)
+
+
+def _zoom(factor: float) -> Callable[[Sample], Inputs]:
+    return lambda one: (one.rgb, one.depth, one.intrinsics @ np.diag([factor, factor, 1.0]))
+
+
+SPOILED: dict[str, Callable[[Sample], Inputs]] = {
+    "as_it_is": lambda one: (one.rgb, one.depth, one.intrinsics),
+    "depth_x2": _stretch(2.0),
+    "depth_x0.5": _stretch(0.5),
+    "depth_x1.25": _stretch(1.25),
+    "focal_x1.5": _zoom(1.5),
+    "focal_x0.67": _zoom(0.67),
+    "swapped": lambda one: (one.rgb[..., ::-1].copy(), one.depth, one.intrinsics),
+}
+
+
+def list_images(reader: Reader, every: int) -> list[list[int]]:
+    """Return the records of each image, every so many images of a scene."""
+    images: dict[str, list[int]] = {}
+    for i, record in enumerate(reader.records()):
+        images.setdefault(record.name, []).append(i)
+    scenes: dict[str, list[list[int]]] = {}
+    records: list[FrameRecord] = list(reader.records())
+    for own in images.values():
+        scenes.setdefault(records[own[0]].group, []).append(own)
+    return [own for many in scenes.values() for own in many[::every]]
+
+
+def look(
+    estimator: posefilter.Estimator, reader: Reader, images: list[list[int]], spoil: str
+) -> list[dict[str, Any]]:
+    """Return a row an object and image: whether it is there, right, and what was declared."""
+    records, rows = list(reader.records()), []
+    for own in images:
+        there = {records[i].object: reader.read(i) for i in own}
+        (results,) = estimator.predict_batch(*SPOILED[spoil](reader.read(own[0])))
+        for result in results:
+            row = {"object": result.object, "image": records[own[0]].name}
+            row |= {"there": result.object in there, "verdict": result.verdict}
+            row |= {"probability": result.probability, "presence": result.presence}
+            if result.object in there:
+                truth = torch.from_numpy(there[result.object].camera_from_object).double()[None]
+                pose, model = torch.from_numpy(result.pose)[None], result.model
+                symmetries = model.symmetries.double()
+                error = add_up_to_symmetry(pose, truth, model.points, symmetries)
+                row["right"] = bool(error < 0.1 * model.diameter)
+            rows.append(row)
+            print(json.dumps(row), flush=True)
+    return rows
+
+
+def tabulate(rows: list[dict[str, Any]]) -> str:
+    """Return the counts as a Markdown table."""
+    lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
+    for name in dict.fromkeys(row["object"] for row in rows):
+        own = [row for row in rows if row["object"] == name and row["there"]]
+        other = [row for row in rows if row["object"] == name and not row["there"]]
+        found = [row for row in own if row["verdict"] == "found"]
+        right = sum(row["right"] for row in own)
+        lost = sum(row["verdict"] == "absent" for row in own)
+        cells = [name, len(own), right, len(found), sum(row["right"] for row in found), lost]
+        cells += [len(other), *(sum(r["verdict"] == v for r in other) for v in ("found", "unsure"))]
+        cells.append(f"{max((row['probability'] for row in other), default=0):.2f}")
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print a row a line, then the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--weights", nargs="+", default=["all"])
+    parser.add_argument("--source", default="ycb_video")
+    parser.add_argument("--root", type=Path, required=True)
+    parser.add_argument("--meshes", required=True)
+    parser.add_argument("--every", type=int, default=10, help="images of a scene")
+    parser.add_argument("--input", choices=SPOILED, default="as_it_is")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    meshes = open_meshes(options.meshes, None, options.source, None)
+    reader = open_reader(options.source, options.root, None, meshes, "skip")
+    estimator = posefilter.load(options.weights)
+    rows = look(estimator, reader, list_images(reader, options.every), options.input)
+    print(tabulate(rows))
+    if options.out is not None:
+        options.out.write_text(json.dumps(rows, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
