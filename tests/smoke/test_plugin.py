@@ -47,6 +47,8 @@ def test_method_reader_and_loss_of_ones_own(
     monkeypatch.syspath_prepend(str(PLUGIN))
     run = tmp_path / "run"
     assert train(npz_scenes, run, "model=color_walk", "loss=brier", "data=npz") == 0
+    following = json.loads(capfd.readouterr().out.splitlines()[-1])["next"]
+    assert any("evaluate" in line and "plugins=[posefilter_example]" in line for line in following)
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["instances"] > 0
     assert 0 <= metrics["particles_on_object"] <= 1

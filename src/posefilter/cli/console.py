@@ -78,6 +78,8 @@ def is_installed() -> bool:
 
 def setting(key: str, value: Any) -> str:
     """Return one setting as it is typed; what Hydra would take apart is quoted for it."""
+    if isinstance(value, list):
+        return shlex.quote(f"{key}=[{','.join(map(str, value))}]")
     text = str(value)
     if not re.fullmatch(r"[\w./:\-~ ]*", text):
         text = "'" + text.replace("'", "\\'") + "'"

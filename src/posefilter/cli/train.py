@@ -125,7 +125,7 @@ def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[
     metrics = record(results, job, run.data.describe(), run.best) | {"training": training}
     write_json(file, metrics)
     report = typed("report", run=job.folder)
-    evaluate = typed("evaluate", checkpoint=run.best, **places(job))
+    evaluate = typed("evaluate", checkpoint=run.best, **places(job), **plugins(job))
     board = "tensorboard --logdir outputs" if is_installed() else "make board"
     show(
         metrics,
@@ -150,6 +150,11 @@ def places(job: Job) -> dict[str, Any]:
     }
 
 
+def plugins(job: Job) -> dict[str, Any]:
+    """Return the plug-ins that a later command is to be told, as no checkpoint names any."""
+    return {"plugins": list(job.cfg.plugins)} if job.cfg.get("plugins") else {}
+
+
 def cost(steps: int, before: int, wall: float, cpu: float) -> dict[str, float | None]:
     """Return what a step of training took, validations included: by the clock, and of this
     process's own processor time.
@@ -169,7 +174,7 @@ def say_stopped(run: Run) -> None:
     job, step = run.job, run.trainer.global_step
     sentence, again = f"stopped at step {step}", None
     if (job.folder / "checkpoints" / LAST).is_file():
-        again = typed("train", resume=job.folder)
+        again = typed("train", resume=job.folder, **plugins(job))
         if job.swept:
             again = f"the same command with out={job.folder.parent}"
         sentence += f"; go on with: {again}"
