@@ -33,7 +33,7 @@ from dataset_trees import HIGH, LOW, bop_scene, fat_tree, pose, write_mesh, ycb_
 from spoiling import spoil  # noqa: E402
 
 from posefilter.data.checking.check import check_dataset  # noqa: E402
-from posefilter.data.frames import Sample  # noqa: E402
+from posefilter.data.frames import NotShown, Sample  # noqa: E402
 from posefilter.data.module import PoseDataModule  # noqa: E402
 from posefilter.data.readers.registry import open_reader  # noqa: E402
 from posefilter.errors import BadData, UserError  # noqa: E402
@@ -142,21 +142,23 @@ def try_one(base: Base, work: Path, rng: random.Random) -> tuple[str, str, str]:
 def judge(base: Base, work: Path) -> tuple[str, str]:
     """Return what comes of reading a spoiled dataset, and its words."""
     name = _NAMES[base.source]
-    refused, samples = "", dict[str, Sample]()
+    refused, told, samples = "", True, dict[str, Sample]()
     try:
         reader = open_reader(base.source, work, name, base.meshes)
         for i, record in enumerate(reader.records()):
             samples[record.key] = reader.read(i)
             reader.others(i)
     except UserError as error:
-        refused = str(error)
+        # an object that is hidden has no pixel of the label, which is no problem of the data
+        refused, told = str(error), not isinstance(error, NotShown)
     if "\n" in refused:
         return FAILURES[2], f": {refused}"[:300]
     problems = list_problems(base, work)
     if refused:
         counted = count_skipped(base, work)
         words = f": {refused[:200]}"
-        return (OUTCOMES[0], words) if counted and problems else (FAILURES[3], words)
+        noticed = counted and (problems or not told)
+        return (OUTCOMES[0] if noticed else FAILURES[3]), words
     wrong = [
         flaw
         for key, sample in samples.items()

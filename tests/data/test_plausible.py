@@ -80,6 +80,8 @@ WRONG = {
     "behind": ({"poses": moved(-0.5)}, "behind the camera"),
     "1e30 m": ({"poses": moved(1e30)}, "wrong unit"),
     "classes of text": ({"cls_indexes": lambda m: np.array(["box"])}, "cls_indexes"),
+    "classes complex": ({"cls_indexes": lambda m: m + 1j}, "complex"),
+    "poses complex": ({"poses": lambda m: m + 1j}, "complex"),
     "classes NaN": ({"cls_indexes": lambda m: m * np.nan}, "unknown class"),
 }
 
@@ -150,6 +152,7 @@ def broken_bop(change):
 BOP = {
     "null": lambda c: {**c, "0": None},
     "a list": lambda c: [c],
+    "a ragged list": lambda c: {**c, "0": [{**c["0"][0], "cam_t_m2c": [0, [1], 2]}]},
     "null record": lambda c: {**c, "0": [None]},
     "text": lambda c: {**c, "0": "x"},
     "no number": lambda c: {**c, "0": [{**c["0"][0], "obj_id": None}]},

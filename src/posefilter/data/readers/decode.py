@@ -114,7 +114,7 @@ def numbers(
     Raises BadData where it is missing or otherwise.
     """
     value = need(record, key, path, where)
-    if np.iscomplexobj(value):
+    if isinstance(value, np.ndarray) and np.iscomplexobj(value):
         raise BadData(path, f"'{where}{key}' is not numbers", "they are complex")
     try:
         array = np.asarray(value, dtype=np.float64)

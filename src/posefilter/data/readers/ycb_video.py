@@ -214,6 +214,8 @@ class YCBVideoReader(BaseReader):
         path = stem.with_name(f"{stem.name}-meta.mat")
         meta = read_meta(check_inside(path, self.root))
         try:
+            if np.iscomplexobj(meta["cls_indexes"]):
+                raise TypeError("they are complex")
             indices = np.asarray(meta["cls_indexes"], dtype=np.float64).ravel()
         except (TypeError, ValueError) as error:
             raise BadData(path, "'cls_indexes' is not numbers", str(error)) from error
