@@ -29,7 +29,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
         assert result.status == ("tracked" if number else "started")
         assert result.found
         assert off(result, pose) < 0.008
-        assert result.odds > 5
+        assert result.presence > 0.8
         if number:
             assert len(result.belief.weights) < 150 < toy.filter.particles
     assert result.object == "toy"
@@ -79,7 +79,7 @@ def test_one_bad_frame_is_no_loss() -> None:
         result = tracker.update(RGB, depth, K)
         assert result.found
         assert off(result, pose) < 0.01
-        assert (result.odds == -np.inf) == (depth is NONE)
+        assert (result.presence == 0) == (depth is NONE)
     assert result.status == "tracked"
 
 
@@ -124,6 +124,7 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
     ("wrong", "told"),
     [
         ({"patience": 0}, "patience=0 must be a whole number, 1 or more"),
+        ({"lost_below": 0.9}, "found_above=0.3 must lie in"),
         ({"reach": 0.5}, "reach 1 or more"),
         ({"quantile": 1.0}, "quantile between 0 and 1"),
     ],
@@ -140,7 +141,7 @@ def test_impossible_efforts_and_methods_are_refused(monkeypatch: pytest.MonkeyPa
     with pytest.raises(UserError, match="noise levels fall"):
         Effort(10, 20, 0, 2, 0.001, 0.004, 64)
     toy, estimator = make_toy()
-    monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses"))
+    monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses", "relevance"))
     toy.__dict__.pop("capabilities", None)
     with pytest.raises(UserError, match=r"Toy provides no propose_poses; .*model/proposals=dense"):
         posefilter.Tracker(estimator)

@@ -1,6 +1,6 @@
 """A toy object whose likelihood is made by hand: a function of the distance to the true pose."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,8 @@ from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
 from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
-from posefilter.geometry.pose import pose_about
+from posefilter.geometry.camera import pixel_grid, project
+from posefilter.geometry.pose import origin_of, pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
@@ -28,10 +29,23 @@ K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
 RGB, DEPTH = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
 
 
+class ToyScene(NamedTuple):
+    """The true pose, and a map of the cells about where it puts the object."""
+
+    truth: Tensor | None
+    relevance: Tensor
+
+
 class Toy(PoseEstimator):
     """A method that sees the true pose, `truth`, or nothing where that is None."""
 
-    provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses", "propose_poses")
+    provides: ClassVar[Capabilities] = (
+        "pose",
+        "pose_space",
+        "score_poses",
+        "propose_poses",
+        "relevance",
+    )
 
     def __init__(self) -> None:
         filter = ParticleFilter(
@@ -53,7 +67,14 @@ class Toy(PoseEstimator):
 
     def encode(self, batch: Batch) -> Any:
         self.encoded.append(tuple(batch.rgb.shape[-2:]))
-        return self.truth
+        height, width = batch.rgb.shape[-2:]
+        cells = pixel_grid(height, width, 4).reshape(-1, 2)
+        if self.truth is None:
+            return ToyScene(None, torch.zeros(1, 1, height // 4, width // 4))
+        middle = origin_of(self.truth.float(), torch.tensor(CENTER))
+        reach = SPACE.radius * batch.intrinsics[0, 0, 0] / middle[2]
+        near = (cells - project(middle[None], batch.intrinsics[0])).norm(dim=1) < reach
+        return ToyScene(self.truth, near.float().view(1, 1, height // 4, width // 4))
 
     def measure(self, scene: Any, particles: Any, step: Any, generator: Generator) -> Any:
         from posefilter.tracking.scoring import Glance
@@ -64,9 +85,9 @@ class Toy(PoseEstimator):
         self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         noise = 0.2 * torch.randn(poses.shape[:2], generator=generator)
-        if scene is None:
+        if scene.truth is None:
             return noise - 10
-        distance = SPACE.distance(poses, scene.to(poses)[None, None])
+        distance = SPACE.distance(poses, scene.truth.to(poses)[None, None])
         return noise - 10 * torch.log1p((distance / (sigma + 0.002)).square() / 5)
 
     def propose_poses(self, scene: Any, particles: int, generator: Generator) -> Tensor:
@@ -74,11 +95,11 @@ class Toy(PoseEstimator):
         place = torch.rand(particles, 3, generator=generator) - 0.5 + torch.tensor([0, 0, 1.0])
         R = random_rotation(particles, generator=generator)
         poses = pose_about(R, place, torch.tensor(CENTER))
-        if scene is not None:
+        if scene.truth is not None:
             near = torch.randn(particles // 2, 6, generator=generator) * SPACE.noise_scale(
                 torch.tensor(0.03)
             )
-            poses[: particles // 2] = SPACE.move(scene.float().expand(len(near), 4, 4), near)
+            poses[: particles // 2] = SPACE.move(scene.truth.float().expand(len(near), 4, 4), near)
         return poses[None]
 
 

@@ -11,6 +11,7 @@ COMMANDS = {
     "train": "train a method and test it",
     "evaluate": "test a checkpoint, or poses of any other method, on a dataset",
     "predict": "estimate the pose of one object or several in an RGB-D image",
+    "track": "follow objects through a video",
     "generate": "render a dataset",
     "check_data": "check that a dataset and its meshes fit each other",
     "report": "explain a run or a sweep, or compare two runs, on one HTML page",

@@ -19,6 +19,7 @@ _FOLDERS = {
     "generate": ("meshes",),
     "predict": ("meshes",),
     "report": ("run", "sweep_folder"),
+    "track": ("frames", "meshes", "data.root", "data.meshes"),
     "train": ("data.root", "data.meshes"),
 }
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name

@@ -68,6 +68,7 @@ def draw_overlays(
     shapes: Sequence[Shape],
     labels: Sequence[str],
     width: int = WIDTH,
+    caption: str = "",
 ) -> np.ndarray:
     """Draw where poses put several objects, each in a color of its own, the nearest last.
 
@@ -78,6 +79,7 @@ def draw_overlays(
         shapes: A mesh or hull an object.
         labels: Its name in the legend.
         width: Of the result at least [px].
+        caption: What is written below the legend.
 
     Returns:
         The picture (h, w, 3) uint8, with the legend below.
@@ -89,6 +91,7 @@ def draw_overlays(
         draw_pose(picture, shown, np.asarray(poses[i], np.float64), shapes[i], colors[i])
     entries = list(zip(labels, colors, strict=True))
     rows = [draw_row(picture.shape[1], "", entries[i : i + 2]) for i in range(0, len(entries), 2)]
+    rows += [draw_row(picture.shape[1], caption)] if caption else []
     return np.concatenate([picture, *rows])
 
 

@@ -3,6 +3,8 @@
 import torch
 from torch import Tensor
 
+from posefilter.geometry.lookup import argmin
+
 
 def gather_fragment(position: Tensor, fragment: Tensor) -> Tensor:
     """Return the positions in given fragments.  (*, K, 3), (*) int64 -> (*, 3)."""
@@ -12,8 +14,8 @@ def gather_fragment(position: Tensor, fragment: Tensor) -> Tensor:
 def nearest_fragment(points: Tensor, centers: Tensor) -> Tensor:
     """Return the fragment that each point belongs to.  (B, *, 3), (B, K, 3) -> (B, *) int64."""
     flat = points.flatten(1, -2)
-    nearness = 2 * flat @ centers.transpose(1, 2) - centers.square().sum(-1)[:, None]
-    return nearness.argmax(-1).unflatten(1, points.shape[1:-1])
+    farness = centers.square().sum(-1)[:, None] - 2 * flat @ centers.transpose(1, 2)
+    return argmin(farness).unflatten(1, points.shape[1:-1])
 
 
 def sample_farthest_points(points: Tensor, count: int) -> tuple[Tensor, float]:

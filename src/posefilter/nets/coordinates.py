@@ -17,6 +17,7 @@ from posefilter.geometry.fragments import (
     nearest_fragment,
     within_bounds,
 )
+from posefilter.geometry.lookup import gather_rows
 
 STRIDE = 8  # pixels a cell
 
@@ -161,7 +162,12 @@ def flatten_context(coordinates: Coordinates, height: int, width: int) -> Contex
     )
     shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])
     return Context(
-        grid.flatten(2).transpose(1, 2), share, position, coordinates.centers, shape, columns
+        grid.flatten(2).transpose(1, 2).contiguous(),
+        share,
+        position,
+        coordinates.centers,
+        shape,
+        columns,
     )
 
 
@@ -194,11 +200,9 @@ def query(context: Context, u: Tensor, v: Tensor, position: Tensor) -> Tensor:
         index = (row * w + column) * K + fragment
         part = near * context.share.gather(1, index) + 1e-12
         total = total + part
-        predicted = predicted + part[..., None] * context.position.gather(
-            1, index[..., None].expand(-1, -1, 3)
-        )
+        predicted = predicted + part[..., None] * gather_rows(context.position, index)
     at = (v.flatten(1).long() // 2) * context.columns + u.flatten(1).long() // 2
-    smooth = context.smooth.gather(1, at[..., None].expand(-1, -1, context.smooth.shape[-1]))
+    smooth = gather_rows(context.smooth, at)
     out = torch.cat(
         [total.clamp_min(1e-6).log()[..., None], predicted / total[..., None], smooth], dim=-1
     )

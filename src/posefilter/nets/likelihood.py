@@ -21,6 +21,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project, rays
+from posefilter.geometry.lookup import gather_rows
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
 from posefilter.nets.layers import ResnetFC, fourier
@@ -112,9 +113,7 @@ def sample_points(
     )
     u, v = pixels[..., 0].clamp(0, W - 1), pixels[..., 1].clamp(0, H - 1)
     index = (v.long() * W + u.long()).flatten(1)
-    values = image.values.gather(1, index[..., None].expand(-1, -1, 4)).unflatten(
-        1, inside.shape[1:]
-    )
+    values = gather_rows(image.values, index).unflatten(1, inside.shape[1:])
     color, z = values[..., :3], values[..., 3:]
     ray = rays(torch.stack([u, v], dim=-1).flatten(1, 2), K).unflatten(1, inside.shape[1:])
     R = rotation_of(poses)

@@ -71,10 +71,9 @@ def count_needed(cells: Tensor, epsilon: float, quantile: float, least: int) -> 
     Returns:
         The number of draws, from `least` to N; N where more would be needed.
     """
-    _, cell = cells.unique(dim=0, return_inverse=True)
-    seen, count = set[int](), 0
+    seen, count = set[tuple[int, ...]](), 0
     needed = least
-    for count, own in enumerate(cell.tolist(), start=1):
+    for count, own in enumerate(map(tuple, cells.tolist()), start=1):
         if own not in seen:
             seen.add(own)
             needed = max(least, kld_size(len(seen), epsilon, quantile))

@@ -65,7 +65,10 @@ class RandomWalk:
 
 
 def _three(value: float | Sequence[float], name: str) -> tuple[float, ...]:
-    parts = tuple(float(x) for x in ([value] * 3 if isinstance(value, int | float) else value))
+    try:
+        parts = tuple(float(x) for x in ([value] * 3 if isinstance(value, int | float) else value))
+    except (TypeError, ValueError) as error:
+        raise UserError(f"motion.{name}={value}: one number or three are due") from error
     if len(parts) != 3 or not all(math.isfinite(x) and x >= 0 for x in parts):
         raise UserError(f"motion.{name}={value}: one number or three, 0 or more")
     return parts

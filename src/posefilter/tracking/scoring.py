@@ -10,7 +10,7 @@ from posefilter.nets.layers import fast_bfloat16
 from posefilter.protocols import Scene
 from posefilter.types import Batch, ParticleOutput, Particles, Step
 
-_NEEDED = ("pose_space", "score_poses", "propose_poses")
+_NEEDED = ("pose_space", "score_poses", "propose_poses", "relevance")
 
 
 def check_method(method: PoseEstimator) -> None:
@@ -30,12 +30,22 @@ class Glance:
         method: Scores and proposes poses.
         scene: The frame, as the method has encoded it.
         points: Image points that a pose is scored from.
+        jumps: Number of particles, the last ones at the first step, that no motion led to.
+        against: Log odds against such a jump, taken off their scores at the first step [nat].
     """
 
     latent_width = 0
 
-    def __init__(self, method: PoseEstimator, scene: Scene, points: int) -> None:
+    def __init__(
+        self,
+        method: PoseEstimator,
+        scene: Scene,
+        points: int,
+        jumps: int = 0,
+        against: float = 0.0,
+    ) -> None:
         self.method, self.scene, self.points = method, scene, points
+        self.jumps, self.against = jumps, against
 
     @property
     def space(self) -> PoseSpace:
@@ -54,6 +64,8 @@ class Glance:
         """Score every particle at the step's noise level."""
         state = particles.state
         score = self.score_poses(scene, state, float(step.sigma), generator, self.points)
+        if step.number == 0 and self.jumps:
+            score[:, -self.jumps :] -= self.against
         no_move = state.new_zeros(*state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, state, particles.latent)
 

@@ -62,6 +62,8 @@ class TrackerSettings:
         search: What it costs while the object is lost.
         walk: Standard deviation of the move between two steps, over the noise level.
         rounds: Rounds of mean shift that end a frame; 0: the mean of the mode as it is.
+        jump: Log odds against a jump to what the network proposes, while the object is tracked
+            [nat]; so that it does not flip between faces that look alike.
         epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
         quantile: Probability that it stays below.
         cell: Side of the cells that it counts [m].
@@ -70,8 +72,8 @@ class TrackerSettings:
         side: Largest side of the window about the object that it sees otherwise [px].
         reach: Half the window's side, in projected radii of the object.
         noise: Standard deviation of the estimate of a single frame, for smoothing [m]; 0: none.
-        lost_below: A frame counts against the object where its log odds are below [nat].
-        found_above: What a search finds is taken up where its log odds are above [nat].
+        lost_below: A frame counts against the object where its presence is below, in [0, 1].
+        found_above: What a search finds is taken up where its presence is above.
         patience: Frames in a row that count against an object that is lost.
         full_every: While it is lost, every so many frames the estimator's own filter searches;
             0: never.
@@ -81,26 +83,32 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(48, 300, 8, 3, 0.012, 0.004, 64)
+    follow: Effort = Effort(64, 300, 8, 2, 0.010, 0.004, 64)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
     rounds: int = 0
+    jump: float = 5.0
     epsilon: float = 0.15
     quantile: float = 0.95
     cell: float = 0.03
     look_around: int = 10
-    side: int = 160
+    side: int = 128
     reach: float = 1.6
-    noise: float = 0.002
-    lost_below: float = 3.0
-    found_above: float = 5.0
+    noise: float = 0.003
+    lost_below: float = 0.05
+    found_above: float = 0.3
     patience: int = 2
     full_every: int = 5
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_whole(self, rounds=0, look_around=0, side=64, patience=1, full_every=0)
-        if not (self.walk >= 0 and self.noise >= 0 and self.reach >= 1):
-            raise UserError("tracker: walk and noise must be 0 or more, reach 1 or more")
+        if not (min(self.walk, self.noise, self.jump) >= 0 and self.reach >= 1):
+            raise UserError("tracker: walk, noise and jump must be 0 or more, reach 1 or more")
+        if not 0 <= self.lost_below <= self.found_above <= 1:
+            raise UserError(
+                f"tracker: lost_below={self.lost_below} and found_above={self.found_above} must "
+                f"lie in [0, 1], the second no lower"
+            )
         if not (self.epsilon > 0 and self.cell > 0 and 0 < self.quantile < 1):
             raise UserError("tracker: epsilon and cell must be above 0, quantile between 0 and 1")

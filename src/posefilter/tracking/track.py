@@ -1,6 +1,5 @@
 """One object, followed from frame to frame."""
 
-import math
 import time
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,9 +19,10 @@ from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images, make_batch
 from posefilter.models.base import PoseEstimator
-from posefilter.tracking.clutter import measure_odds
+from posefilter.protocols import Scene
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
+from posefilter.tracking.presence import measure_presence
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.window import clean_depth, cut_window, place_window
@@ -39,11 +39,12 @@ class TrackResult(Result):
     Attributes:
         status: "started" by an estimate on a single image, "tracked" from the frame before,
             "found" again after a loss, or "lost": then the pose is no more than a guess.
-        odds: Log odds of the pose against poses at random surfaces of the image [nat].
+        presence: What the network says of the pixels that the object covers: the mean probability
+            that they show it. Occlusion lowers it. It is not calibrated.
     """
 
     status: str
-    odds: float
+    presence: float
 
     @property
     def found(self) -> bool:
@@ -64,7 +65,7 @@ class Sight(NamedTuple):
 
     batch: Batch  # the image, or the window of it that was looked at
     belief: Belief | None  # None where nothing has depth
-    odds: float  # of the estimate against clutter [nat]
+    presence: float  # the mean relevance of the pixels that the estimate covers
 
 
 class Track:
@@ -114,13 +115,13 @@ class Track:
             sight = self._estimate(images)
         else:
             sight = self._follow(images, predicted)
-        trusted, status = self._judge(sight.odds)
+        trusted, status = self._judge(sight.presence)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
         result = make_result(self._describe(sight), 0)
         content = {**vars(result), "seconds": time.perf_counter() - start}
-        return TrackResult(**content, status=status, odds=sight.odds)
+        return TrackResult(**content, status=status, presence=sight.presence)
 
     # -- the steps of a frame ---------------------------------------------------------------------
 
@@ -147,19 +148,21 @@ class Track:
         """Run the estimator's own filter on the whole image."""
         batch = self._take(make_batch(clean_depth(images), *self.size))
         if not bool(batch.depth.any()):
-            return Sight(batch, None, -math.inf)
+            return Sight(batch, None, 0.0)
         self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
         scene = self.method.encode(batch)
-        return self._weigh(batch, trace.belief, Glance(self.method, scene, 1))
+        return self._weigh(batch, scene, trace.belief)
 
     def _follow(self, images: Images, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
         batch = self._take(self._look(images, predicted.best[0]))
         if not bool(batch.depth.any()):
-            return Sight(batch, None, -math.inf)
+            return Sight(batch, None, 0.0)
         effort, settings = self._effort, self.settings
-        glance = Glance(self.method, self.method.encode(batch), effort.points)
+        scene = self.method.encode(batch)
+        against = 0.0 if self.lost else settings.jump
+        glance = Glance(self.method, scene, effort.points, effort.proposals, against)
         refine = MeanShift(settings.rounds, 16) if settings.rounds else NoRefine()
         filter = ParticleFilter(
             particles=predicted.belief.state.shape[1],
@@ -173,7 +176,7 @@ class Track:
             refine=refine,
         )
         trace = filter(batch, glance, self.generator)
-        return self._weigh(batch, trace.belief, glance)
+        return self._weigh(batch, glance.scene, trace.belief)
 
     def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State:
         """Return the state after a frame; `belief` is None where what it shows is not trusted."""
@@ -223,19 +226,20 @@ class Track:
     def _take(self, batch: Batch) -> Batch:
         return Batch(*(x.to(self.method.device) for x in batch))
 
-    def _weigh(self, batch: Batch, belief: Belief, glance: Glance) -> Sight:
-        """Return what a frame shows, with the odds of its estimate."""
-        odds = measure_odds(glance, glance.scene, batch, belief.best[0], self.space, self.generator)
-        return Sight(batch, belief, odds)
+    def _weigh(self, batch: Batch, scene: Scene, belief: Belief) -> Sight:
+        """Return what a frame shows, and whether the object is where the estimate puts it."""
+        points = self.method.model.points
+        presence = measure_presence(scene.relevance, batch, belief.best[0], points)
+        return Sight(batch, belief, presence)
 
-    def _judge(self, odds: float) -> tuple[bool, str]:
+    def _judge(self, presence: float) -> tuple[bool, str]:
         """Return whether a frame's estimate is to be trusted, and the object's status after it."""
         settings = self.settings
         if self.lost:
-            trusted = odds > settings.found_above
+            trusted = presence > settings.found_above
             status = LOST if not trusted else FOUND if self.ever_found else STARTED
         else:
-            trusted = odds > settings.lost_below
+            trusted = presence > settings.lost_below
             self.doubts = 0 if trusted else self.doubts + 1
             status = LOST if self.doubts >= settings.patience else TRACKED
         self.lost = status == LOST

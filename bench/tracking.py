@@ -1,0 +1,185 @@
+"""Tracks against single images on YCB-Video's photographs, and losses that are planted.
+
+    python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--threads 1]
+
+For each object whose weights ship and that is in the scenes: every frame by itself, then the same
+frames tracked, in one process. Times are the processor's of this process, so that other work on the
+machine changes them little; the ratio of the two is what to go by. Then the frames once more, of
+which six are replaced by those of another scene: how many are said to show the object, and after
+how many frames it is found again. Writes the tables of docs/results/tracking.md.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+import posefilter
+from posefilter.cli.machine import keep_freed_memory
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.metrics.errors import add, add_s
+from posefilter.metrics.scores import auc
+from posefilter.metrics.tracks import measure_jitter
+from posefilter.weights import list_shipped
+
+HOME = Path(__file__).parents[1]
+PAGE = HOME / "docs" / "results" / "tracking.md"
+MARK, END = "<!-- table: {} -->", "<!-- end -->"
+AWAY = range(7, 13)  # frames that are replaced
+HEAD = (
+    "object", "scene", "stride", "frames", "single: ADD AUC", "ADD-S AUC", "jitter mm", "degrees",
+    "tracked: ADD AUC", "ADD-S AUC", "jitter mm", "degrees", "lost", "single s", "tracked ms",
+    "ratio",
+)  # fmt: skip
+LOSSES = ("object", "scene", "away", "said to be there", "of these in the first", "found after")
+
+
+class Outcome(NamedTuple):
+    """What came of the frames in one way."""
+
+    add: float  # AUC
+    add_s: float
+    jitter: tuple[float, float]  # [mm], [degrees]
+    lost: int
+    seconds: float  # the median frame's; of a track without its first
+
+
+def judge(
+    results: Sequence[Any], frames: Sequence[VideoFrame], seconds: Sequence[float]
+) -> Outcome:
+    """Return the figures of results, a frame each; what is lost counts as missed."""
+    model = results[0].model
+    poses = torch.from_numpy(np.stack([one.pose for one in results]))
+    truth = torch.from_numpy(np.stack([frame.truth[model.name] for frame in frames]))
+    missed = torch.tensor([not getattr(one, "found", True) for one in results])
+    errors = [f(poses, truth, model.points.double()) for f in (add, add_s)]
+    areas = [auc(torch.where(missed, math.inf, error)) for error in errors]
+    jitter = measure_jitter(poses, truth, model.center.double())
+    return Outcome(areas[0], areas[1], jitter, int(missed.sum()), float(np.median(seconds)))
+
+
+def run_single(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame]
+) -> tuple[list[Any], list[float]]:
+    """Estimate every frame by itself; return the results and the processor's seconds."""
+    results, seconds = [], []
+    for frame in frames:
+        start = time.process_time()
+        results.append(estimator.predict(frame.rgb, frame.depth, frame.intrinsics))
+        seconds.append(time.process_time() - start)
+    return results, seconds
+
+
+def run_tracked(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame]
+) -> tuple[list[Any], list[float]]:
+    """Track the frames; return the results and the processor's seconds."""
+    tracker, results, seconds = posefilter.Tracker(estimator), [], []
+    for frame in frames:
+        start = time.process_time()
+        results.append(tracker.update(frame.rgb, frame.depth, frame.intrinsics))
+        seconds.append(time.process_time() - start)
+    return results, seconds
+
+
+def measure_loss(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame], other: Sequence[VideoFrame]
+) -> list[str]:
+    """Replace some frames by another scene's, and return the row of what became of the track."""
+    name = estimator.objects[0]
+    mixed = [other[n] if n in AWAY else frame for n, frame in enumerate(frames)]
+    results, _ = run_tracked(estimator, mixed)
+    said = [results[n].found for n in AWAY]
+    model = estimator.models[0]
+    back = "not again"
+    for n in range(AWAY.stop, len(frames)):
+        truth = torch.from_numpy(frames[n].truth[name])[None]
+        error = float(add_s(torch.from_numpy(results[n].pose)[None], truth, model.points))
+        if results[n].found and error < 0.1 * model.diameter:
+            back = str(n - AWAY.stop + 1)
+            break
+    early = sum(said[: posefilter.TrackerSettings().patience - 1])
+    return [name, "", str(len(AWAY)), str(sum(said)), str(early), back]
+
+
+def make_row(name: str, scene: str, stride: int, single: Outcome, tracked: Outcome, n: int) -> str:
+    """Return a line of the table."""
+    both = [
+        f"{x:.{digits}f}"
+        for one in (single, tracked)
+        for x, digits in ((one.add, 1), (one.add_s, 1), (one.jitter[0], 1), (one.jitter[1], 2))
+    ]
+    cells = [name, scene, str(stride), str(n), *both, str(tracked.lost), f"{single.seconds:.2f}"]
+    cells += [f"{1000 * tracked.seconds:.0f}", f"{single.seconds / tracked.seconds:.0f}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def write_table(name: str, head: Sequence[str], lines: Sequence[str]) -> None:
+    """Put a table into the page, between its marks."""
+    text = PAGE.read_text()
+    before, rest = text.split(MARK.format(name), 1)
+    rows = [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head))]
+    table = "\n".join([MARK.format(name), *rows, *lines, END])
+    PAGE.write_text(before + table + rest.split(END, 1)[1])
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
+    parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
+    parser.add_argument("--only", action="append", help="an object; can be repeated")
+    parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    keep_freed_memory()
+    torch.set_num_threads(options.threads)
+    names = options.only or list(list_shipped())
+    reader = open_reader(
+        "ycb_video",
+        options.frames,
+        names,
+        open_meshes(options.meshes, None, "ycb_video", names),
+        parts=["data"],
+    )
+    groups = list_groups(reader)
+    every = {group: SceneVideo(reader, group, names) for group in groups}
+    rows, losses = [], []
+    for group, video in every.items():
+        frames = list(video)
+        other = [frame for one in groups if one != group for frame in every[one]]
+        for name in video.objects or ():
+            estimator = posefilter.load(name, device="cpu")
+            estimator.predict(frames[0].rgb, frames[0].depth, frames[0].intrinsics)  # warm
+            results, seconds = run_single(estimator, frames)
+            for stride in options.stride or [1, 4]:
+                single = judge(results[::stride], frames[::stride], seconds[::stride])
+                tracked = judge(*_tracked(estimator, frames[::stride]))
+                rows.append(make_row(name, group, stride, single, tracked, len(frames[::stride])))
+                print(rows[-1], flush=True)
+            if other:
+                cells = measure_loss(estimator, frames, other)
+                cells[1] = group
+                losses.append(f"| {' | '.join(cells)} |")
+                print(losses[-1], flush=True)
+    write_table("tracks", HEAD, rows)
+    write_table("losses", LOSSES, losses)
+
+
+def _tracked(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame]
+) -> tuple[list[Any], Sequence[VideoFrame], list[float]]:
+    results, seconds = run_tracked(estimator, frames)
+    return results, frames, seconds[1:]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Follow objects through videos: poses, figures, and an annotated video."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from posefilter.callbacks.records import PoseRow, to_native, write_poses_csv
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.components import changes
+from posefilter.cli.console import JSON, ended, finite, say, show_table
+from posefilter.cli.job import Job
+from posefilter.cli.machine import settle
+from posefilter.cli.predict import read_intrinsics
+from posefilter.cli.results import write_json
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.data.sequences import FolderVideo, SceneVideo, Video, VideoFrame, list_groups
+from posefilter.errors import UserError
+from posefilter.estimator import Estimator
+from posefilter.figures.overlay import Shape, draw_overlays
+from posefilter.figures.video import VideoWriter
+from posefilter.meshes.store import MeshStore
+from posefilter.tracking.motion import RandomWalk
+from posefilter.tracking.records import (
+    TrackRow,
+    compute_figures,
+    describe_row,
+    make_row,
+    write_rows,
+)
+from posefilter.tracking.settings import Effort, TrackerSettings
+from posefilter.tracking.track import TrackResult
+from posefilter.tracking.tracker import Tracker
+from posefilter.weights import expand_weights
+
+POSES = "poses.csv"
+
+
+def track(job: Job) -> None:
+    """Write poses.csv, poses.jsonl, tracks.csv, metrics.json, and a video of each scene."""
+    cfg, folder = job.cfg, job.folder
+    if (folder / POSES).is_file():
+        raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
+    settle(cfg.threads, cfg.seed)
+    settings = make_settings(cfg.tracker)
+    wanted = changes(cfg)
+    estimator = Estimator(
+        [
+            method_of(read_checkpoint(one), wanted, lightning=False)
+            for one in expand_weights(cfg.checkpoint)
+        ]
+    )
+    videos, native = open_videos(cfg, estimator.objects)
+    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
+    shapes: dict[str, Shape] = {
+        model.name: store.load(model.name) if store else model.hull for model in estimator.models
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: list[TrackRow] = []
+    files: dict[str, Path] = {"poses": folder / POSES, "lines": folder / "poses.jsonl"}
+    for video in videos:
+        name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
+        writer = VideoWriter(folder / name, cfg.video, float(cfg.fps))
+        rows += list(follow(video, estimator, settings, cfg, writer, shapes))
+        if cfg.video != "none":
+            files[name] = writer.path
+    write_rows(folder, [finite(describe_row(row)) for row in rows])
+    write_poses_csv(folder / POSES, [to_pose_row(row, native) for row in rows if row.result.found])
+    metrics = {
+        model.name: compute_figures(own, model)
+        for model in estimator.models
+        if (own := [row for row in rows if row.result.object == model.name])
+    }
+    write_json(folder / "metrics.json", metrics)
+    files |= {"tracks": folder / "tracks.csv", "metrics": folder / "metrics.json"}
+    if cfg.console != JSON:
+        for name, figures in metrics.items():
+            show_table(name, list_figures(figures))
+    ended(cfg.console, "tracked", files, [], metrics=metrics)
+
+
+def follow(
+    video: Video,
+    estimator: Estimator,
+    settings: TrackerSettings,
+    cfg: DictConfig,
+    writer: VideoWriter,
+    shapes: dict[str, Shape],
+) -> Iterator[TrackRow]:
+    """Track the objects through one video, write its pictures, and yield its rows."""
+    methods = [
+        m for m in estimator.methods if video.objects is None or m.model.name in video.objects
+    ]
+    if not methods:
+        return
+    tracker = Tracker(Estimator(methods), settings, cfg.seed)
+    say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
+    with writer:
+        for frame in video:
+            results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
+            writer.add(draw_frame(frame, results, shapes))
+            for number, result in enumerate(results):
+                ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
+                truth = frame.truth.get(result.object)
+                yield make_row(video.name, frame.name, ids, result, truth)
+
+
+def draw_frame(
+    frame: VideoFrame, results: Sequence[TrackResult], shapes: dict[str, Shape]
+) -> np.ndarray:
+    """Draw the objects that are found; the legend names those that are lost, too."""
+    found = [one for one in results if one.found]
+    labels = [f"{one.object}: {one.status}" for one in found]
+    lost = [one.object for one in results if not one.found]
+    poses = [one.pose for one in found]
+    own = [shapes[one.object] for one in found]
+    return draw_overlays(frame.rgb, frame.intrinsics, poses, own, labels, caption=_name_lost(lost))
+
+
+def _name_lost(lost: Sequence[str]) -> str:
+    return f"lost: {', '.join(lost)}" if lost else ""
+
+
+def make_settings(node: DictConfig) -> TrackerSettings:
+    """Return the settings of the section `tracker`.
+
+    Raises UserError where one is no number of its kind.
+    """
+    plain: Any = OmegaConf.to_container(node, resolve=True)
+    try:
+        return TrackerSettings(
+            **{
+                **plain,
+                "motion": RandomWalk(**plain["motion"]),
+                "follow": Effort(**plain["follow"]),
+                "search": Effort(**plain["search"]),
+            }
+        )
+    except TypeError as error:
+        raise UserError(f"tracker: {error}") from error
+
+
+def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video], Any]:
+    """Return the videos that the settings name, and the frames of their objects (by class).
+
+    Raises UserError where they name none, or both a folder and a dataset.
+    """
+    data = cfg.get("data")
+    if bool(cfg.frames) == bool(data):
+        raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
+    if not isinstance(cfg.stride, int) or cfg.stride < 1:
+        raise UserError(f"stride={cfg.stride}: must be a whole number, 1 or more")
+    if cfg.frames:
+        if cfg.intrinsics is None:
+            raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
+        K, scale = read_intrinsics(cfg.intrinsics), check_scale(cfg.depth_scale)
+        return [FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride)], lambda _: np.eye(4)
+    if data.get("root") is None:
+        raise UserError("data.root: is missing; name the dataset's folder")
+    names = list(objects)
+    meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
+    options = OmegaConf.to_container(data.options, resolve=True) if data.options else {}
+    reader = open_reader(data.source, data.root, None, meshes, data.on_error, **options)  # type: ignore[arg-type]
+    groups = list_groups(reader)
+    if cfg.scene is not None:
+        known, groups = groups, [one for one in groups if _is_scene(one, cfg.scene)]
+        if not groups:
+            some = ", ".join(known[:5]) + (", ..." if len(known) > 5 else "")
+            raise UserError(f"scene={cfg.scene}: {data.root} has no such scene; it has {some}")
+    videos = [SceneVideo(reader, one, names, cfg.stride) for one in groups]
+    shown = [video for video in videos if video.objects]
+    if not shown:
+        raise UserError(
+            f"data.root={data.root}: none of the objects is annotated there ({', '.join(names)})"
+        )
+    return shown, reader.native_from_mesh
+
+
+def check_scale(depth_scale: Any) -> float:
+    """Return the units of a depth image in a meter; raise UserError where it is no such number."""
+    if not isinstance(depth_scale, int | float) or not depth_scale > 0:
+        raise UserError(f"depth_scale={depth_scale}: units in a meter, a positive number")
+    return float(depth_scale)
+
+
+def _is_scene(group: str, scene: Any) -> bool:
+    """Tell whether a scene is meant: by its name, or by its number where that is a number."""
+    same = group.isdigit() and str(scene).isdigit() and int(group) == int(scene)
+    return group == str(scene) or same
+
+
+def to_pose_row(row: TrackRow, native_from_mesh: Any) -> PoseRow:
+    """Return a row of the results file, in the dataset's own object frame."""
+    pose = to_native(row.result.pose, native_from_mesh(row.result.object))
+    score, seconds = row.result.score, row.result.seconds
+    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, seconds)
+
+
+def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the rows of the table that is printed."""
+    out = [("frames", str(figures["frames"])), ("lost", str(figures["lost"]))]
+    if "add" in figures:
+        out += [
+            ("ADD AUC", f"{figures['add']['auc']:.1f}"),
+            ("ADD-S AUC", f"{figures['add_s']['auc']:.1f}"),
+            ("false tracks", str(figures["false_tracks"])),
+            ("jitter", f"{figures['jitter_mm']:.1f} mm, {figures['jitter_deg']:.2f} degrees"),
+        ]
+    if figures["frames_per_second"] is not None:
+        out.append(("a frame", f"{1000 * figures['seconds_tracked']:.0f} ms"))
+    return out

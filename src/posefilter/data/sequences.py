@@ -1,0 +1,153 @@
+"""Videos: frames in their order, from a folder of pictures or from a dataset."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from posefilter.data.frames import FrameRecord, NotShown, Reader
+from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
+from posefilter.errors import UserError
+
+_COLOR, _DEPTH = (".png", ".jpg", ".jpeg"), (".png", ".npy")
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrame:
+    """One frame of a video, with the poses that are known in it."""
+
+    name: str  # of the image, unique in the video
+    im_id: int
+    rgb: np.ndarray  # (H, W, 3) uint8
+    depth: np.ndarray  # (H, W) float32 z-depth [m], 0 where unknown
+    intrinsics: np.ndarray  # (3, 3) [px]
+    truth: dict[str, np.ndarray]  # by object: camera_from_object (4, 4) [m], mesh frame
+
+
+class Video(Protocol):
+    """Frames in their order; they are read when they are come to."""
+
+    name: str
+    scene_id: int
+    objects: tuple[str, ...] | None  # that are known to be in it; None: that is not known
+    ids: dict[str, int]  # their numbers in the dataset
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        ...
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """Yield the frames.  Raises BadData where a file is not as it should be."""
+        ...
+
+
+class FolderVideo:
+    """A folder with `rgb/` and `depth/`: pictures of the same names, or as many of each.
+
+    Args:
+        folder: The folder.
+        intrinsics: (3, 3) camera matrix of all frames [px].
+        depth_scale: Units of the depth images in a meter.
+        stride: Take every so many frames.
+
+    Raises:
+        UserError: A folder is missing or empty, or the pictures do not pair.
+    """
+
+    scene_id = 0
+    objects: tuple[str, ...] | None = None
+
+    def __init__(
+        self, folder: Path, intrinsics: np.ndarray, depth_scale: float, stride: int = 1
+    ) -> None:
+        self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
+        self.ids: dict[str, int] = {}
+        color = _list_pictures(folder, "rgb", _COLOR)
+        depth = _list_pictures(folder, "depth", _DEPTH)
+        by_stem = {path.stem: path for path in depth}
+        if all(path.stem in by_stem for path in color):
+            depth = [by_stem[path.stem] for path in color]
+        elif len(color) != len(depth):
+            raise UserError(
+                f"frames={folder}: {len(color)} pictures in rgb/ and {len(depth)} in depth/, of "
+                f"other names; name both alike"
+            )
+        self._pairs = [*zip(color, depth, strict=True)][::stride]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """Yield the frames."""
+        for number, (color, depth) in enumerate(self._pairs):
+            rgb, z = read_color(color), read_depth(depth, self._scale)
+            expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
+            yield VideoFrame(color.stem, number, rgb, z, self._K, {})
+
+
+class SceneVideo:
+    """A scene of a dataset, with the true poses of the objects that are asked for.
+
+    Args:
+        reader: Of the dataset.
+        group: The scene, as its records name it.
+        objects: Whose poses are to be known.
+        stride: Take every so many frames.
+    """
+
+    def __init__(self, reader: Reader, group: str, objects: Sequence[str], stride: int = 1) -> None:
+        self.name, self._reader, self._wanted = group, reader, set(objects)
+        frames: dict[int, list[tuple[int, FrameRecord]]] = {}
+        for index, record in enumerate(reader.records()):
+            if record.group == group:
+                frames.setdefault(record.im_id, []).append((index, record))
+        self._frames = [frames[number] for number in sorted(frames)][::stride]
+        own = [record for frame in self._frames for _, record in frame if record.object in objects]
+        self.objects: tuple[str, ...] | None = tuple(
+            name for name in objects if any(r.object == name for r in own)
+        )
+        self.ids = {record.object: record.obj_id for record in own}
+        self.scene_id = self._frames[0][0][1].scene_id
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self._frames)
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """Yield the frames."""
+        for frame in self._frames:
+            truth: dict[str, np.ndarray] = {}
+            sample = None
+            for index, record in frame:
+                wanted = record.object in self._wanted and record.object not in truth
+                if sample is not None and not wanted:
+                    continue
+                try:
+                    sample = self._reader.read(index)
+                except NotShown:
+                    continue
+                if wanted:
+                    truth[record.object] = sample.camera_from_object.astype(np.float64)
+            if sample is None:  # nothing of it is labeled, so that no reader opens it
+                continue
+            K, record = sample.intrinsics.astype(np.float64), frame[0][1]
+            yield VideoFrame(record.name, record.im_id, sample.rgb, sample.depth, K, truth)
+
+
+def list_groups(reader: Reader) -> list[str]:
+    """Return the scenes of a dataset, in the order of their records."""
+    return list(dict.fromkeys(record.group for record in reader.records()))
+
+
+def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> list[Path]:
+    """Return the pictures of a folder within, in the order of their names."""
+    inner = folder / name
+    if not inner.is_dir():
+        raise UserError(f"frames={folder}: has no folder {name}/; rgb/ and depth/ are due")
+    found = sorted(inner / one for one in list_folder(inner) if Path(one).suffix.lower() in endings)
+    if not found:
+        raise UserError(f"frames={folder}: no pictures in {name}/ ({', '.join(endings)})")
+    return found

@@ -1,0 +1,72 @@
+"""Write annotated frames as a video."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.figures.gif import encode_gif
+
+FORMATS = ("mp4", "gif", "none")
+_GIF_WIDTH = 480  # [px]
+
+
+class VideoWriter:
+    """Write pictures to an .mp4 or .gif file as they come; use as a context.
+
+    Args:
+        path: The file, without its ending.
+        form: "mp4", "gif", or "none" to write nothing.
+        fps: Frames a second.
+
+    Raises:
+        UserError: There is no such format.
+    """
+
+    def __init__(self, path: Path, form: str, fps: float) -> None:
+        if form not in FORMATS:
+            raise UserError(f"video={form}: choose {', '.join(FORMATS)}")
+        if not fps > 0:
+            raise UserError(f"fps={fps}: must be above 0")
+        self.path, self.form, self.fps = path.with_name(f"{path.name}.{form}"), form, fps
+        self._writer: cv2.VideoWriter | None = None
+        self._pictures: list[np.ndarray] = []
+        self._size: tuple[int, int] | None = None
+
+    def __enter__(self) -> "VideoWriter":
+        """Return the writer."""
+        return self
+
+    def add(self, picture: np.ndarray) -> None:
+        """Add a picture (H, W, 3) uint8; later ones are brought to the first one's size.
+
+        Raises:
+            UserError: This OpenCV cannot encode videos.
+        """
+        if self.form == "none":
+            return
+        if self._size is None:
+            height, width = picture.shape[:2]
+            scale = min(1.0, _GIF_WIDTH / width) if self.form == "gif" else 1.0
+            # even, as codecs want it
+            self._size = (2 * round(scale * width / 2), 2 * round(scale * height / 2))
+        if picture.shape[1::-1] != self._size:
+            picture = cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA)
+        if self.form == "gif":
+            self._pictures.append(picture)
+            return
+        if self._writer is None:
+            code = cv2.VideoWriter.fourcc(*"mp4v")
+            self._writer = cv2.VideoWriter(str(self.path), code, self.fps, self._size)
+            if not self._writer.isOpened():
+                raise UserError("video=mp4: this OpenCV cannot encode it; choose video=gif or none")
+        self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
+
+    def __exit__(self, *_: object) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.release()
+        if self._pictures:
+            wait = round(1000 / self.fps)
+            self.path.write_bytes(encode_gif(self._pictures, wait, hold=wait))

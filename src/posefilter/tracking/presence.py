@@ -1,0 +1,40 @@
+"""Is the object where a pose puts it? What the network says of the pixels there."""
+
+import torch
+from torch import Tensor
+
+from posefilter.filters.guided import gather_relevance
+from posefilter.geometry.camera import project
+from posefilter.geometry.pose import transform
+from posefilter.types import Batch
+
+_POINTS = 256  # of the surface, that are looked at
+
+
+def measure_presence(relevance: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
+    """Return the mean relevance of the pixels that a pose's object covers.
+
+    The score of a pose cannot tell this: scores are log-likelihoods up to a constant of the image,
+    and of an image without the object the search finds a pose that scores as high.
+
+    Args:
+        relevance: (1, 1, h, w) the probability that each cell of the image shows the object.
+        batch: The image.
+        pose: (4, 4) camera_from_object [m].
+        points: (P, 3) surface points of the object [m].
+
+    Returns:
+        The mean over the object's points in the frame, in [0, 1]; 0 where none is, or one is behind
+        the camera.
+    """
+    height, width = batch.rgb.shape[-2:]
+    camera = transform(pose, points[:: max(1, len(points) // _POINTS)].to(pose))
+    if not bool((camera[:, 2] > 0).all()):
+        return 0.0
+    pixels = project(camera, batch.intrinsics[0])
+    size = pixels.new_tensor([width, height])
+    inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(1)
+    if not bool(inside.any()):
+        return 0.0
+    found = gather_relevance(relevance, pixels[inside][None], height, width)
+    return float(torch.mean(found))

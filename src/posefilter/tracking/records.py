@@ -1,0 +1,153 @@
+"""What a track is written down as: a row an object and frame, and the figures of all rows."""
+
+import csv
+import json
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from posefilter.metrics.errors import add, add_s
+from posefilter.metrics.scores import summarize
+from posefilter.metrics.tracks import find_gaps, measure_jitter
+from posefilter.tracking.track import TrackResult
+from posefilter.types import ObjectModel
+
+_COLUMNS = (
+    "video", "frame", "object", "status", "score", "presence", "probability", "particles", "add_mm",
+    "add_s_mm", "seconds",
+)  # fmt: skip
+
+
+class TrackRow(NamedTuple):
+    """One object in one frame."""
+
+    video: str
+    frame: str
+    scene_id: int
+    im_id: int
+    obj_id: int
+    result: TrackResult
+    truth: np.ndarray | None  # (4, 4) camera_from_object [m], where it is known
+    add: float  # error of the pose [m]; NaN without a truth
+    add_s: float
+
+
+def make_row(
+    video: str,
+    frame: str,
+    ids: tuple[int, int, int],
+    result: TrackResult,
+    truth: np.ndarray | None,
+) -> TrackRow:
+    """Return the row of a frame's result.  ids: of scene, image and object, as BOP has them."""
+    errors = (math.nan, math.nan)
+    if truth is not None:
+        pair = (torch.from_numpy(result.pose)[None], torch.from_numpy(truth).double()[None])
+        points = result.model.points.cpu()
+        errors = (float(add(*pair, points.double())), float(add_s(*pair, points)))
+    return TrackRow(video, frame, *ids, result, truth, *errors)
+
+
+def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, Any]:
+    """Return the figures of one object's rows, frames of one video or of several in their order.
+
+    A frame counts as missed where the object is lost, and its error as infinite. A false track is
+    a frame in which the object is said to be there, and its ADD-S is 0.1 diameters or more.
+
+    Args:
+        rows: Of one object.
+        model: The object.
+
+    Returns:
+        `frames`, `lost`, `gaps` (frames until each loss ended; null where it did not), the seconds
+        of a first frame and the median of the others; and where truths are known `add` and `add_s`
+        as in metrics.json, `false_tracks`, and the jitter of frames that follow each other.
+    """
+    found = [row.result.found for row in rows]
+    later = [r.result.seconds for r in rows if r.result.status == "tracked"]
+    gaps = [
+        gap.length if gap.ended else None
+        for video in dict.fromkeys(row.video for row in rows)
+        for gap in find_gaps([row.result.found for row in rows if row.video == video])
+    ]
+    seconds = float(np.median(later)) if later else math.nan
+    started = [row.result.seconds for row in rows if row.result.status == "started"]
+    out: dict[str, Any] = {
+        "frames": len(rows),
+        "lost": len(rows) - sum(found),
+        "gaps": gaps,
+        "seconds_started": started[0] if started else None,
+        "seconds_tracked": seconds,
+        "frames_per_second": 1 / seconds if later else None,
+    }
+    known = [row for row in rows if row.truth is not None]
+    if not known:
+        return out
+    for name in ("add", "add_s"):
+        errors = [getattr(row, name) if row.result.found else math.inf for row in known]
+        out[name] = summarize(torch.tensor(errors), model.diameter)
+    wrong = [row for row in known if row.result.found and row.add_s >= 0.1 * model.diameter]
+    absent = [row for row in rows if row.truth is None and row.result.found]
+    out["false_tracks"] = len(wrong) + len(absent)
+    jitters = [measure_row_jitter(run, model) for run in _follow_ups(known)]
+    shifts, turns = zip(*jitters, strict=True) if jitters else ((), ())
+    out["jitter_mm"], out["jitter_deg"] = _rms(shifts), _rms(turns)
+    return out
+
+
+def measure_row_jitter(pair: Sequence[TrackRow], model: ObjectModel) -> tuple[float, float]:
+    """Return the jitter of two rows that follow each other, in mm and degrees."""
+    poses = torch.from_numpy(np.stack([row.result.pose for row in pair]))
+    truth = torch.from_numpy(np.stack([row.truth for row in pair if row.truth is not None]))
+    return measure_jitter(poses, truth.double(), model.center.cpu().double())
+
+
+def _follow_ups(rows: Sequence[TrackRow]) -> list[tuple[TrackRow, TrackRow]]:
+    """Return the pairs of rows, one after the other in a video, in which the object was found."""
+    return [
+        (a, b)
+        for a, b in pairwise(rows)
+        if a.video == b.video and a.result.found and b.result.found
+    ]
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else math.nan
+
+
+def describe_row(row: TrackRow) -> dict[str, Any]:
+    """Return a row as plain content, a line of poses.jsonl."""
+    result = row.result
+    return {
+        "video": row.video,
+        "frame": row.frame,
+        "object": result.object,
+        "status": result.status,
+        "camera_from_object": result.pose.tolist(),
+        "score": result.score,
+        "presence": result.presence,
+        "probability": result.probability,
+        "particles": len(result.belief.weights),
+        "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),
+        "add_mm": 1000 * row.add,
+        "add_s_mm": 1000 * row.add_s,
+        "seconds": result.seconds,
+    }
+
+
+def write_rows(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write poses.jsonl, a line a row, and tracks.csv, the same without the poses.
+
+    Numbers that are none are null in the one, and empty in the other.
+    """
+    with (folder / "poses.jsonl").open("w", encoding="utf-8") as file:
+        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+    with (folder / "tracks.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

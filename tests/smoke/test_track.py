@@ -1,0 +1,100 @@
+"""The command `track`: on a folder of pictures, on a dataset, and its refusals."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from posefilter.cli.command import compose_job, run_command
+from posefilter.cli.track import make_settings
+from posefilter.tracking.settings import TrackerSettings
+
+HOME = Path(__file__).parents[2]
+SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
+FEW = ["filter.particles=100", "filter.first_particles=300", "filter.steps=5", "filter/refine=none"]
+COMMON = ["checkpoint=003_cracker_box", "console=json", "threads=1", *FEW]
+CAMERA = "intrinsics=533.39,533.74,156.24,120.41"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a picture four times, the third of them black and without depth."""
+    stem = min(SCENE.glob("*.left.jpg")).name.removesuffix(".left.jpg")
+    rgb = cv2.imread(str(SCENE / f"{stem}.left.jpg"))
+    depth = cv2.imread(str(SCENE / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED)
+    for name in ("rgb", "depth"):
+        (tmp_path / "video" / name).mkdir(parents=True)
+    for number in range(4):
+        shown = number != 2
+        cv2.imwrite(str(tmp_path / "video" / "rgb" / f"{number:03d}.png"), rgb * shown)
+        cv2.imwrite(str(tmp_path / "video" / "depth" / f"{number:03d}.png"), depth * shown)
+    return tmp_path / "video"
+
+
+def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]
+    assert run_command("track", HOME, typed) == 0
+    lines = [json.loads(line) for line in (out / "poses.jsonl").read_text().splitlines()]
+    assert [one["status"] for one in lines] == ["started", "tracked", "tracked", "tracked"]
+    assert lines[2]["presence"] == 0
+    places = np.array([one["camera_from_object"] for one in lines])[:, :3, 3]
+    notes = json.loads(min(SCENE.glob("*.left.json")).read_text())
+    truth = np.array(notes["objects"][0]["location"]) / 100
+    assert np.abs(places - places[0]).max() < 0.03
+    assert np.linalg.norm(places[3] - truth) < 0.2  # the mesh's origin is not FAT's
+    with (out / "poses.csv").open() as file:
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["0", "1", "2", "3"]
+    metrics = json.loads((out / "metrics.json").read_text())["003_cracker_box"]
+    assert metrics["frames"] == 4
+    assert metrics["lost"] == 0
+    assert "add" not in metrics
+    video = cv2.VideoCapture(str(out / "video.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
+    assert video.read()[1].std() > 20
+    assert run_command("track", HOME, typed) == 2  # nothing is overwritten
+
+
+def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None:
+    """Its frames are of one scene each: a video of one frame is a single estimate."""
+    root = SCENE.parents[1]
+    typed = [*COMMON, "data=fat", f"data.root={root}", "scene=scene0003_0", "video=gif"]
+    assert run_command("track", HOME, [*typed, f"out={tmp_path}"]) == 0
+    (line,) = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
+    metrics = json.loads((tmp_path / "metrics.json").read_text())["003_cracker_box"]
+    assert metrics["add"]["median_mm"] == pytest.approx(line["add_mm"], rel=1e-4)
+    assert line["add_s_mm"] <= line["add_mm"] < 40
+    assert metrics["jitter_mm"] is None
+    assert (tmp_path / "video.gif").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (["frames=FOLDER"], "intrinsics: is missing"),
+        ([], "give either frames=DIR, or data="),
+        (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
+        (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
+        (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
+        (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0 must be a whole number"),
+        (["frames=FOLDER", CAMERA, "tracker.motion.shift_mm=fast"], "motion.shift_mm=fast"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    wrong: list[str], told: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = [one.replace("FOLDER", str(folder)) for one in wrong]
+    assert run_command("track", HOME, [*COMMON, *typed, f"out={tmp_path / 'out'}"]) == 2
+    assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
+
+
+def test_the_commands_defaults_are_the_librarys(tmp_path: Path) -> None:
+    job = compose_job("track", HOME / "conf", [], tmp_path)
+    made, own = make_settings(job.cfg.tracker), TrackerSettings()
+    assert vars(made.motion) == vars(own.motion)
+    assert {**vars(made), "motion": 0} == {**vars(own), "motion": 0}
+    assert {*OmegaConf.to_container(job.cfg.tracker)} == {*vars(own)}
