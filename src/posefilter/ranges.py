@@ -113,6 +113,9 @@ RANGES: dict[str, Range] = {
     "predict.cost_unsure": POSITIVE,
     "evaluate.absent_frames": COUNT_OR_NONE,
     "calibrate.frames": _whole(10, 1_000_000),
+    "track.depth_scale": Range(1e-2, 1e7),
+    "track.stride": COUNT,
+    "track.fps": Range(0, 1000, above=True),
     "export.points": COUNT,
     "export.max_mb": Range(0, above=True),
     "onboard.budget_minutes": Range(0, 1e6, above=True),
@@ -120,6 +123,37 @@ RANGES: dict[str, Range] = {
     "onboard.frames": _whole(1, 10_000_000),
     "onboard.test_frames": COUNT,
     "onboard.workers": _whole(1, 256),
+    # tracker
+    "motion.shift_mm": Range(0, 10_000),
+    "motion.turn_deg": Range(0, 180),
+    "motion.momentum": SHARE,
+    **{
+        f"tracker.{effort}.{name}": allowed
+        for effort in ("follow", "search")
+        for name, allowed in {
+            "least": _whole(1, 100_000),
+            "most": _whole(1, 100_000),
+            "proposals": _whole(0, 100_000),
+            "steps": _whole(1, 10_000),
+            "start": METERS,
+            "stop": METERS,
+            "points": COUNT,
+        }.items()
+    },
+    "tracker.walk": Range(0, 100),
+    "tracker.rounds": _whole(0, 10_000),
+    "tracker.jump": Range(0, 1000),
+    "tracker.epsilon": POSITIVE,
+    "tracker.quantile": Range(0, 0.999_999_999, above=True),
+    "tracker.cell": METERS,
+    "tracker.look_around": COUNT_OR_NONE,
+    "tracker.side": _whole(64, MOST_SIDE),
+    "tracker.reach": Range(1, 100),
+    "tracker.noise": Range(0, 100),
+    "tracker.lost_below": SHARE,
+    "tracker.found_above": SHARE,
+    "tracker.patience": COUNT,
+    "tracker.full_every": COUNT_OR_NONE,
     # trainer, callbacks
     "trainer.max_steps": _whole(1, 10**12, words=(-1,)),
     "trainer.min_steps": _whole(0, 10**12),

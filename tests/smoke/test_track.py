@@ -80,7 +80,7 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
-        (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0 must be a whole number"),
+        (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "tracker.motion.shift_mm=fast"], "motion.shift_mm=fast"),
     ],
 )

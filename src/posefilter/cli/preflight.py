@@ -28,6 +28,7 @@ _LOGGERS = {
     "lightning.pytorch.loggers.WandbLogger": "wandb",
 }
 _SHOWN = {"sweep_folder": "sweep"}  # as it is typed
+_VIDEOS = ("mp4", "gif", "none")  # as figures/video.py writes them
 _NEEDED = {"predict": ("rgb", "depth", "intrinsics")}
 
 
@@ -43,6 +44,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
     """
     if command == "predict":
         _check_view(cfg.view, is_several(cfg.checkpoint))
+    if command == "track":
+        _check_video(cfg)
     if command == "train":
         _check_loggers(cfg.logger)
     if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
@@ -66,6 +69,21 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if key == "data.root" and _select(cfg, "data.generate") is not None:
             continue  # it is rendered
         raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+
+
+def _check_video(cfg: DictConfig) -> None:
+    """Raise UserError where there is no video to be tracked, or none that can be written."""
+    if cfg.video not in _VIDEOS:
+        raise UserError(f"video={cfg.video}: choose {', '.join(_VIDEOS)}")
+    find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
+    for one in find_all:
+        find_weights(one)
+    if bool(cfg.frames) == bool(cfg.data):
+        raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
+    if cfg.frames and cfg.intrinsics is None:
+        raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
+    if cfg.data and cfg.data.root is None:
+        raise UserError("data.root: is missing; name the dataset's folder")
 
 
 def _check_mesh(mesh: Any) -> None:

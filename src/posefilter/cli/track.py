@@ -145,20 +145,12 @@ def make_settings(node: DictConfig) -> TrackerSettings:
 def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video], Any]:
     """Return the videos that the settings name, and the frames of their objects (by class).
 
-    Raises UserError where they name none, or both a folder and a dataset.
+    Raises UserError where there are no frames, or no objects in them.
     """
     data = cfg.get("data")
-    if bool(cfg.frames) == bool(data):
-        raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
-    if not isinstance(cfg.stride, int) or cfg.stride < 1:
-        raise UserError(f"stride={cfg.stride}: must be a whole number, 1 or more")
     if cfg.frames:
-        if cfg.intrinsics is None:
-            raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
-        K, scale = read_intrinsics(cfg.intrinsics), check_scale(cfg.depth_scale)
+        K, scale = read_intrinsics(cfg.intrinsics), float(cfg.depth_scale)
         return [FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride)], lambda _: np.eye(4)
-    if data.get("root") is None:
-        raise UserError("data.root: is missing; name the dataset's folder")
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
     options = OmegaConf.to_container(data.options, resolve=True) if data.options else {}
@@ -176,13 +168,6 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
             f"data.root={data.root}: none of the objects is annotated there ({', '.join(names)})"
         )
     return shown, reader.native_from_mesh
-
-
-def check_scale(depth_scale: Any) -> float:
-    """Return the units of a depth image in a meter; raise UserError where it is no such number."""
-    if not isinstance(depth_scale, int | float) or not depth_scale > 0:
-        raise UserError(f"depth_scale={depth_scale}: units in a meter, a positive number")
-    return float(depth_scale)
 
 
 def _is_scene(group: str, scene: Any) -> bool:

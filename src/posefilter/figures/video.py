@@ -8,7 +8,6 @@ import numpy as np
 from posefilter.errors import UserError
 from posefilter.figures.gif import encode_gif
 
-FORMATS = ("mp4", "gif", "none")
 _GIF_WIDTH = 480  # [px]
 
 
@@ -20,15 +19,9 @@ class VideoWriter:
         form: "mp4", "gif", or "none" to write nothing.
         fps: Frames a second.
 
-    Raises:
-        UserError: There is no such format.
     """
 
     def __init__(self, path: Path, form: str, fps: float) -> None:
-        if form not in FORMATS:
-            raise UserError(f"video={form}: choose {', '.join(FORMATS)}")
-        if not fps > 0:
-            raise UserError(f"fps={fps}: must be above 0")
         self.path, self.form, self.fps = path.with_name(f"{path.name}.{form}"), form, fps
         self._writer: cv2.VideoWriter | None = None
         self._pictures: list[np.ndarray] = []
