@@ -28,7 +28,7 @@ REFUSED = {
     "predict checkpoint=003_cracker_box": "rgb: is missing",
     "predict checkpoint=003_cracker_box rgb=a.png depth=b.png intrinsics=1,1,1,1": "rgb=a.png: no",
     "track": "checkpoint: is missing",
-    "track checkpoint=003_cracker_box frames=nowhere": "frames=nowhere: no such folder",
+    "track checkpoint=003_cracker_box frames=nowhere intrinsics=1,1,1,1": "frames=nowhere: no such",
     "track checkpoint=[003_cracker_box,nowhere.ckpt]": "checkpoint=nowhere.ckpt: no such file",
     "generate meshes=nowhere": "meshes=nowhere: no such folder",
     "check_data meshes=nowhere": "meshes=nowhere: no such folder",

@@ -78,11 +78,12 @@ def _check_video(cfg: DictConfig) -> None:
     find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
     for one in find_all:
         find_weights(one)
-    if bool(cfg.frames) == bool(cfg.data):
+    data = cfg.get("data")
+    if bool(cfg.frames) == bool(data):
         raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
-    if cfg.data and cfg.data.root is None:
+    if data and data.root is None:
         raise UserError("data.root: is missing; name the dataset's folder")
 
 

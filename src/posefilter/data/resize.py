@@ -1,6 +1,7 @@
 """Resize a sample, so that camera, color, depth and mask still agree to a fraction of a pixel."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -84,8 +85,8 @@ def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
     -> (height, width) [m].
     """
     if depth.shape == (2 * height, 2 * width):  # the same corners, without an index
-        corner = (depth[i::2, j::2] for i in (0, 1) for j in (0, 1))
-        return _blend(*corner, np.float32(0.5), np.float32(0.5))
+        four = [depth[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+        return _blend(four, np.float32(0.5), np.float32(0.5))
     corners, fractions = [], []
     for new, old in ((height, depth.shape[0]), (width, depth.shape[1])):
         at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
@@ -94,14 +95,13 @@ def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
         fractions.append((at - low).astype(np.float32))
     (top, bottom), (left, right) = corners
     fy, fx = fractions[0][:, None], fractions[1][None, :]
-    corner = (depth[rows][:, columns] for rows in (top, bottom) for columns in (left, right))
-    return _blend(*corner, fx, fy)
+    four = [depth[rows][:, columns] for rows in (top, bottom) for columns in (left, right)]
+    return _blend(four, fx, fy)
 
 
-def _blend(
-    a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, fx: Any, fy: Any
-) -> np.ndarray:
+def _blend(four: Sequence[np.ndarray], fx: Any, fy: Any) -> np.ndarray:
     """Return depth between four neighbors, above left to below right, at fractions of a pixel."""
+    a, b, c, d = four
     low, high = (
         np.minimum(np.minimum(a, b), np.minimum(c, d)),
         np.maximum(np.maximum(a, b), np.maximum(c, d)),
