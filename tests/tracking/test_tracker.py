@@ -29,7 +29,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
         assert result.status == ("tracked" if number else "started")
         assert result.found
         assert off(result, pose) < 0.008
-        assert result.presence > 0.8
+        assert result.relevance > 0.8
         if number:
             assert len(result.belief.weights) < 150 < toy.filter.particles
     assert result.object == "toy"
@@ -79,7 +79,7 @@ def test_one_bad_frame_is_no_loss() -> None:
         result = tracker.update(RGB, depth, K)
         assert result.found
         assert off(result, pose) < 0.01
-        assert (result.presence == 0) == (depth is NONE)
+        assert (result.relevance == 0) == (depth is NONE)
     assert result.status == "tracked"
 
 

@@ -18,8 +18,8 @@ from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
 _COLUMNS = (
-    "video", "frame", "object", "status", "score", "presence", "probability", "particles", "add_mm",
-    "add_s_mm", "seconds",
+    "video", "frame", "object", "status", "score", "relevance", "probability", "particles",
+    "add_mm", "add_s_mm", "seconds",
 )  # fmt: skip
 
 
@@ -130,7 +130,7 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
         "status": result.status,
         "camera_from_object": result.pose.tolist(),
         "score": result.score,
-        "presence": result.presence,
+        "relevance": result.relevance,
         "probability": result.probability,
         "particles": len(result.belief.weights),
         "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),

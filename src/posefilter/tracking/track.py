@@ -22,7 +22,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.protocols import Scene
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
-from posefilter.tracking.presence import measure_presence
+from posefilter.tracking.relevance import measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.window import clean_depth, cut_window, place_window
@@ -39,12 +39,12 @@ class TrackResult(Result):
     Attributes:
         status: "started" by an estimate on a single image, "tracked" from the frame before,
             "found" again after a loss, or "lost": then the pose is no more than a guess.
-        presence: What the network says of the pixels that the object covers: the mean probability
+        relevance: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
     """
 
     status: str
-    presence: float
+    relevance: float
 
     @property
     def found(self) -> bool:
@@ -65,7 +65,7 @@ class Sight(NamedTuple):
 
     batch: Batch  # the image, or the window of it that was looked at
     belief: Belief | None  # None where nothing has depth
-    presence: float  # the mean relevance of the pixels that the estimate covers
+    relevance: float  # the mean relevance of the pixels that the estimate covers
 
 
 class Track:
@@ -115,13 +115,13 @@ class Track:
             sight = self._estimate(images)
         else:
             sight = self._follow(images, predicted)
-        trusted, status = self._judge(sight.presence)
+        trusted, status = self._judge(sight.relevance)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
         result = make_result(self._describe(sight), 0)
         content = {**vars(result), "seconds": time.perf_counter() - start}
-        return TrackResult(**content, status=status, presence=sight.presence)
+        return TrackResult(**content, status=status, relevance=sight.relevance)
 
     # -- the steps of a frame ---------------------------------------------------------------------
 
@@ -229,17 +229,17 @@ class Track:
     def _weigh(self, batch: Batch, scene: Scene, belief: Belief) -> Sight:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
         points = self.method.model.points
-        presence = measure_presence(scene.relevance, batch, belief.best[0], points)
-        return Sight(batch, belief, presence)
+        relevance = measure_relevance(scene.relevance, batch, belief.best[0], points)
+        return Sight(batch, belief, relevance)
 
-    def _judge(self, presence: float) -> tuple[bool, str]:
+    def _judge(self, relevance: float) -> tuple[bool, str]:
         """Return whether a frame's estimate is to be trusted, and the object's status after it."""
         settings = self.settings
         if self.lost:
-            trusted = presence > settings.found_above
+            trusted = relevance > settings.found_above
             status = LOST if not trusted else FOUND if self.ever_found else STARTED
         else:
-            trusted = presence > settings.lost_below
+            trusted = relevance > settings.lost_below
             self.doubts = 0 if trusted else self.doubts + 1
             status = LOST if self.doubts >= settings.patience else TRACKED
         self.lost = status == LOST

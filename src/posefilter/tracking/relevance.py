@@ -11,7 +11,7 @@ from posefilter.types import Batch
 _POINTS = 256  # of the surface, that are looked at
 
 
-def measure_presence(relevance: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
+def measure_relevance(relevance: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
     """Return the mean relevance of the pixels that a pose's object covers.
 
     The score of a pose cannot tell this: scores are log-likelihoods up to a constant of the image,
