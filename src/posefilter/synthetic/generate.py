@@ -272,6 +272,6 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
-    scenes = {"absent_share": 0.0, **settings["scenes"]}
+    scenes = {"absent_share": 0.0, **settings.get("scenes", {})}
     out = {"mesh_scale": 1.0, **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out
