@@ -53,7 +53,10 @@ BRIGHT = 3  # which of them is animated: well lit, and nothing stands before the
 # network proposes
 SEARCH = {
     "filter": {
-        "initialize": {"_target_": "posefilter.filters.initialize.FromDepth", "behind": [0.1, 0.9]},
+        "initialize": {
+            "_target_": "posefilter.filters.initialize.FromDepth",
+            "depth_offset": [0.1, 0.9],
+        },
         "steps": 20,
         "first_particles": 3000,
     },

@@ -89,7 +89,9 @@ def _take(folder: Path) -> int | None:
     Raises OSError where another process holds it, or the file cannot be made.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    number = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    # a folder of somebody else's may bring a link of that name: it is not followed
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    number = os.open(folder / LOCK, flags, 0o644)
     try:
         fcntl.lockf(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
         own, there = os.fstat(number), _state(folder / LOCK)
@@ -107,7 +109,7 @@ def _take(folder: Path) -> int | None:
 
 def _state(path: Path) -> os.stat_result | None:
     try:
-        return path.stat()
+        return path.lstat()
     except OSError:
         return None
 

@@ -38,7 +38,7 @@ _ALWAYS = (  # that no loading of a file has to do with
     "webbrowser.open",
 )
 
-_OWN = ("os.remove",)  # allowed in a run's own folder
+_OWN = ("os.remove", "os.truncate")  # allowed in a run's own folder
 _armed: list["Watch"] = []
 
 
@@ -71,7 +71,7 @@ class Watch:
             event in _ALWAYS
             and "__pycache__" not in str(arguments[:1])
             and arguments[:1] != (None,)
-            and not (event in _OWN and self._is_own(arguments[0]))
+            and not (event in _OWN and self._is_own_entry(arguments[0]))
         ):
             self.seen.append(f"{event} {arguments!r:.120}")
         elif event == "import" and str(arguments[0]).startswith("hostile"):
@@ -87,6 +87,14 @@ class Watch:
     def _is_own(self, path: Any) -> bool:
         """Tell whether a path, links resolved, lies in the folder that may be written to."""
         return self.own is not None and Path(str(path)).resolve().is_relative_to(self.own)
+
+    def _is_own_entry(self, path: Any) -> bool:
+        """Tell whether a file lies in that folder: a link in it is removed, not what it names, and
+        an open file is what it was opened as.
+        """
+        if isinstance(path, int):
+            return self._is_own(f"/proc/self/fd/{path}")
+        return self._is_own(Path(str(path)).parent)
 
     def __enter__(self) -> "Watch":
         _armed.append(self)

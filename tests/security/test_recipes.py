@@ -301,6 +301,20 @@ def test_a_run_whose_files_are_links_is_not_written_to(
         assert run_command("report", HOME, [f"run={run}", "console=json"]) == 2
 
 
+def test_a_lock_that_is_a_link_is_not_written_to(
+    content: dict[str, Any], secret: Path, watch: Any, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / ".lock").symlink_to(secret / "file.txt")
+    torch.save(content, run / "checkpoints" / "best.ckpt")
+    watch.own = run
+    with watch:
+        words = [f"checkpoint={run}/checkpoints/best.ckpt", "console=json"]
+        assert run_command("evaluate", HOME, words) == 2
+    assert (secret / "file.txt").read_text() == "private"
+
+
 @pytest.mark.parametrize("where", ["dirpath told", "dirpath left out"])
 def test_a_resumed_checkpoint_names_no_file_to_delete(
     where: str, tmp_path: Path, secret: Path
