@@ -124,6 +124,36 @@ class Window:
         )
 
 
+def draw_rectangle(
+    mask: np.ndarray, size: tuple[float, float], unit: float, rng: Generator
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+    """Draw a rotated rectangle about some pixel of an object.
+
+    Args:
+        mask: (H, W) the object's pixels, one at least.
+        size: Range of half its sides, in units.
+        unit: [px].
+        rng: Source of randomness.
+
+    Returns:
+        The part of the image (h, w) that it may cover, and there the coordinates a and b (h, w)
+        along its sides, -1 to 1 within it.
+    """
+    rows, cols = np.nonzero(mask)
+    height, width = mask.shape
+    at = rng.integers(len(rows))
+    half_w, half_h = rng.uniform(*size, 2) * unit
+    angle = rng.uniform(0, np.pi)
+    reach = int(np.hypot(half_w, half_h)) + 1  # only so much of the image can change
+    top, left = max(rows[at] - reach, 0), max(cols[at] - reach, 0)
+    cut = np.s_[top : min(rows[at] + reach + 1, height), left : min(cols[at] + reach + 1, width)]
+    down, right = np.mgrid[cut].astype(np.float32)
+    right, down = right - cols[at], down - rows[at]
+    a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
+    b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
+    return cut, a, b
+
+
 @dataclasses.dataclass(frozen=True)
 class PasteOccluder:
     """Put a curved patch, cut from another image, in front of the object.
@@ -139,22 +169,9 @@ class PasteOccluder:
         """Return the sample with the occluder's color and depth pasted in and the mask cut."""
         if rng.random() >= self.probability:
             return sample
-        rows, cols = np.nonzero(sample.mask)
-        if len(rows) == 0:
+        if not sample.mask.any():
             return sample
-        height, width = sample.mask.shape
-        at = rng.integers(len(rows))
-        half_w, half_h = rng.uniform(*self.size, 2) * width
-        angle = rng.uniform(0, np.pi)
-        reach = int(np.hypot(half_w, half_h)) + 1  # only so much of the image can change
-        top, left = max(rows[at] - reach, 0), max(cols[at] - reach, 0)
-        cut = np.s_[
-            top : min(rows[at] + reach + 1, height), left : min(cols[at] + reach + 1, width)
-        ]
-        down, right = np.mgrid[cut].astype(np.float32)
-        right, down = right - cols[at], down - rows[at]
-        a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
-        b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
+        cut, a, b = draw_rectangle(sample.mask, self.size, sample.mask.shape[1], rng)
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
         mask = sample.mask.copy()
         mask[cut] &= ~patch

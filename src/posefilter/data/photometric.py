@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 
-from posefilter.data.augmentation import Draw
+from posefilter.data.augmentation import Draw, draw_rectangle
 from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 from posefilter.synthetic.sensor import motion_kernel
@@ -169,21 +169,9 @@ class Sticker:
         """Return the sample with or without a label."""
         if rng.random() >= self.probability or not sample.mask.any():
             return sample
-        rows, cols = np.nonzero(sample.mask)
-        at, scale = rng.integers(len(rows)), np.sqrt(len(rows))
-        half_w, half_h = rng.uniform(*self.size, 2) * scale / 2
-        angle = rng.uniform(0, np.pi)
-        reach = int(np.hypot(half_w, half_h)) + 1
-        cut = np.s_[
-            max(rows[at] - reach, 0) : rows[at] + reach + 1,
-            max(cols[at] - reach, 0) : cols[at] + reach + 1,
-        ]
-        mask = sample.mask[cut]
-        down, right = np.mgrid[: mask.shape[0], : mask.shape[1]].astype(np.float32)
-        down, right = down + cut[0].start - rows[at], right + cut[1].start - cols[at]
-        a = (right * np.cos(angle) + down * np.sin(angle)) / half_w
-        b = (-right * np.sin(angle) + down * np.cos(angle)) / half_h
-        label = (np.maximum(np.abs(a), np.abs(b)) < 1) & mask
+        scale = np.sqrt(sample.mask.sum())
+        cut, a, b = draw_rectangle(sample.mask, self.size, scale / 2, rng)
+        label = (np.maximum(np.abs(a), np.abs(b)) < 1) & sample.mask[cut]
         paper = rng.uniform(190, 255) + rng.normal(size=3) * 8
         paper = paper if rng.random() < self.white else rng.uniform(0, 255, 3)
         bars = np.sin(a * rng.uniform(6, 20) + rng.uniform(0, 6)) > rng.uniform(-0.5, 0.8)
