@@ -7,6 +7,7 @@ import numpy as np
 
 from posefilter.errors import UserError
 from posefilter.figures.gif import encode_gif
+from posefilter.files import write_whole
 
 _GIF_WIDTH = 480  # [px]
 
@@ -62,4 +63,4 @@ class VideoWriter:
             self._writer.release()
         if self._pictures:
             wait = round(1000 / self.fps)
-            self.path.write_bytes(encode_gif(self._pictures, wait, hold=wait))
+            write_whole(self.path, encode_gif(self._pictures, wait, hold=wait))

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from posefilter.files import open_whole_text
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import summarize
 from posefilter.metrics.tracks import find_gaps, measure_jitter
@@ -145,9 +146,9 @@ def write_rows(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
 
     Numbers that are none are null in the one, and empty in the other.
     """
-    with (folder / "poses.jsonl").open("w", encoding="utf-8") as file:
+    with open_whole_text(folder / "poses.jsonl") as file:
         file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
-    with (folder / "tracks.csv").open("w", newline="", encoding="utf-8") as file:
+    with open_whole_text(folder / "tracks.csv") as file:
         writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
