@@ -85,9 +85,9 @@ def main(arguments: list[str] | None = None) -> int:
             outcome = judge(ended)
             counts[outcome] += 1
             if given.list or outcome in FAILURES:
-                told = ended.err.strip().splitlines()
+                error = ended.err.strip().splitlines()
                 added = [word for word in typed if word not in own]
-                print(f"{number} {command} {added}: {outcome}: {told[-1][:300] if told else ''}")
+                print(f"{number} {command} {added}: {outcome}: {error[-1][:300] if error else ''}")
     for outcome in (ACCEPTED, REFUSED, USAGE, *FAILURES):
         print(f"{counts[outcome]:6d}  {outcome}")
     return 1 if any(counts[outcome] for outcome in FAILURES) else 0

@@ -75,10 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
         for number in range(given.count):
             rng = random.Random(f"{given.seed} {number}")
             base = bases[number % len(bases)]
-            what, outcome, told = try_one(base, Path(folder) / "work", rng)
+            what, outcome, detail = try_one(base, Path(folder) / "work", rng)
             counts[outcome] += 1
             if given.list or outcome in FAILURES:
-                print(f"{number} {base.source} {what}: {outcome}{told}")
+                print(f"{number} {base.source} {what}: {outcome}{detail}")
     for outcome in (*OUTCOMES, *FAILURES):
         print(f"{counts[outcome]:6d}  {outcome}")
     return 1 if any(counts[outcome] for outcome in FAILURES) else 0
@@ -142,7 +142,7 @@ def try_one(base: Base, work: Path, rng: random.Random) -> tuple[str, str, str]:
 def judge(base: Base, work: Path) -> tuple[str, str]:
     """Return what comes of reading a spoiled dataset, and its words."""
     name = _NAMES[base.source]
-    refused, told, samples = "", True, dict[str, Sample]()
+    refused, reported, samples = "", True, dict[str, Sample]()
     try:
         reader = open_reader(base.source, work, name, base.meshes)
         for i, record in enumerate(reader.records()):
@@ -150,14 +150,14 @@ def judge(base: Base, work: Path) -> tuple[str, str]:
             reader.others(i)
     except UserError as error:
         # an object that is hidden has no pixel of the label, which is no problem of the data
-        refused, told = str(error), not isinstance(error, NotShown)
+        refused, reported = str(error), not isinstance(error, NotShown)
     if "\n" in refused:
         return FAILURES[2], f": {refused}"[:300]
     problems = list_problems(base, work)
     if refused:
         counted = count_skipped(base, work)
         words = f": {refused[:200]}"
-        noticed = counted and (problems or not told)
+        noticed = counted and (problems or not reported)
         return (OUTCOMES[0] if noticed else FAILURES[3]), words
     wrong = [
         flaw
@@ -198,9 +198,9 @@ def count_skipped(base: Base, work: Path) -> int:
         return 0
     except UserError:
         return 1
-    told = data.describe()
-    left = told["splits"]["test"]["left_out"]
-    return sum(told["left_out_while_listing"].values()) + sum(left.values())
+    summary = data.describe()
+    left = summary["splits"]["test"]["left_out"]
+    return sum(summary["left_out_while_listing"].values()) + sum(left.values())
 
 
 def find_wrong(sample: Sample, truth: Sample) -> str:

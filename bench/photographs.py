@@ -255,9 +255,9 @@ def _tell_augment(run: Run) -> str:
     if not choice.startswith("camera"):
         return choice
     bare = ".probability=0 " in run.words
-    told = ["far"] if FAR in run.words else []
-    told += [] if bare else ["labels"] if DIM in run.words else ["labels", "bright"]
-    return ", ".join([choice, *told])
+    marks = ["far"] if FAR in run.words else []
+    marks += [] if bare else ["labels"] if DIM in run.words else ["labels", "bright"]
+    return ", ".join([choice, *marks])
 
 
 def _tell_start(checkpoint: str) -> str:

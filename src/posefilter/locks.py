@@ -42,7 +42,7 @@ def hold(folder: Path, wait: bool = False) -> bool:
     place = os.path.realpath(folder)
     if fcntl is None or _held.get(place, (0, 0))[0] == os.getpid():
         return False
-    told = False
+    logged = False
     while True:
         try:
             number = _take(folder)
@@ -57,9 +57,9 @@ def hold(folder: Path, wait: bool = False) -> bool:
                     f"{folder}: is in use by another run ({_owner(folder)}); wait for its end, or "
                     f"choose another folder"
                 ) from error
-            if not told:
+            if not logged:
                 log.info("%s: waiting for another run (%s)", folder, _owner(folder))
-            told = True
+            logged = True
             time.sleep(_PAUSE)
             continue
         if number is not None:
