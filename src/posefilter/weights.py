@@ -36,6 +36,8 @@ def find_weights(weights: str | Path | None) -> Path:
         raise UserError(
             "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
         )
+    if not isinstance(weights, str | os.PathLike):
+        raise UserError(f"checkpoint={weights}: a file, a run's folder or a name is due")
     path, name = Path(weights), str(weights)
     if path.exists():
         return path

@@ -10,6 +10,7 @@ from posefilter.cli import run_command
 from posefilter.cli.build import make_trainer
 from posefilter.cli.command import compose_job
 from posefilter.cli.folders import read_metrics
+from posefilter.cli.instantiate import instantiate
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -21,6 +22,8 @@ LINES = {
     "a file as a folder": ("evaluate", ["out=/dev/null/x", "checkpoint=x"], "/dev/null/x"),
     "a name that is too long": ("train", [f"out={'n' * 300}"], "File name too long"),
     "a number as a choice": ("train", ["loss/aux/likelihood=5"], "likelihood=5: cannot be read"),
+    "a reference of another command": ("generate", ["out=${nope}"], "key 'nope' not found"),
+    "a mapping as a checkpoint": ("export", ["checkpoint={}", "out=a.ckpt"], "a file, a run's"),
     "no model": ("train", ["model=null"], "model=null: cannot be read"),
     "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
     "an umlaut": (
@@ -51,11 +54,17 @@ def test_it_is_one_line(
     assert [*tmp_path.iterdir()] == []
 
 
+def test_what_a_library_refuses_is_one_line() -> None:
+    node = {"_target_": "posefilter.cli.best.Best", "dirpath": "x", "monitor": "a", "mode": "/"}
+    with pytest.raises(UserError, match=r"^callbacks.best: cannot be built \(`mode` can be min"):
+        instantiate(node, "callbacks.best")
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     job = compose_job("train", HOME / "conf", ["trainer.accelerator=gpu"], tmp_path)
     job.cfg.folder = str(tmp_path)
-    with pytest.raises(UserError, match=r"^trainer: cannot be set up \(accelerator=gpu") as caught:
+    with pytest.raises(UserError, match=r"^trainer: cannot be built \(.*gpu") as caught:
         make_trainer(job.cfg.trainer, [])
     assert "\n" not in str(caught.value)
 

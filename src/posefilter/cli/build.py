@@ -5,7 +5,6 @@ import warnings
 
 import torch
 from lightning import Callback, Trainer
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from omegaconf import DictConfig, OmegaConf
 
@@ -89,19 +88,14 @@ def make_trainer(
             "leave it at 32-true (networks take bfloat16 by themselves where that is fast and "
             "safe)"
         )
-    try:
-        trainer = instantiate(
-            node,
-            "trainer",
-            callbacks=[*callbacks, Stop()],
-            logger=loggers or False,
-            plugins=WholeCheckpoints(),
-            enable_progress_bar=False,
-        )
-    except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
-        asked = f"accelerator={node.get('accelerator')}, devices={node.get('devices')}"
-        reason = " ".join(str(error).split())[:300]
-        raise UserError(f"trainer: cannot be set up ({asked}): {reason}") from error
+    trainer = instantiate(
+        node,
+        "trainer",
+        callbacks=[*callbacks, Stop()],
+        logger=loggers or False,
+        plugins=WholeCheckpoints(),
+        enable_progress_bar=False,
+    )
     assert isinstance(trainer, Trainer)
     return trainer
 

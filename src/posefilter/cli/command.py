@@ -130,10 +130,13 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
     """Return the function that Hydra calls for each job, which it adds to those that have begun."""
 
     def task(cfg: DictConfig) -> Any:
-        job = job_of(cfg)
-        begun.append(job)
-        console = job.cfg.get("console", JSON)
-        settle_logging(console)
+        try:
+            job = job_of(cfg)
+            begun.append(job)
+            console = job.cfg.get("console", JSON)
+            settle_logging(console)
+        except EXPECTED as error:  # a setting refers to nothing
+            raise Carrier(error) from error
         try:
             check_settings(cfg, name)
             if name in _OWN_FOLDER:

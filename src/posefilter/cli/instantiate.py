@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 Variant = Callable[[Any], Callable[..., Any]]
+_LIBRARIES = ("torch.", "lightning.")
 _PLAIN = (bool, int, float, str)
 
 
@@ -91,7 +92,18 @@ def _build(
     check_arguments(target, arguments, given, where, partial)
     target = variant(target) if variant is not None else target
     made = functools.partial(target, **arguments, **given)
-    return made if partial else made()
+    if partial:
+        return made
+    try:
+        return made()
+    except Exception as error:  # a library refuses its arguments as it likes
+        refused = type(error).__name__ == "MisconfigurationException"  # Lightning's, not imported
+        if isinstance(error, UserError) or not (
+            refused or target.__module__.startswith(_LIBRARIES)
+        ):
+            raise
+        reason = " ".join(str(error).split())[:300]
+        raise UserError(f"{where}: cannot be built ({reason})") from error
 
 
 def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., Any]:
