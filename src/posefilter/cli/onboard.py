@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import collect_frames, learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -229,6 +230,9 @@ def train(work: Onboarding) -> None:
         duration = format_duration(steps * speed.step)
         sentence = f"{steps} steps of {speed.step:.2f} s each: {duration}"
         say(console, "steps", sentence, steps=steps, seconds_per_step=speed.step)
+    if work.cfg.steps is None:  # the machine may turn out slower than it was measured
+        seconds = values["steps"] * values["seconds_per_step"]
+        work.run.trainer.callbacks.append(TimeBudget(seconds))
     work.stages.keep(training=fit(work.run))
 
 

@@ -1,0 +1,57 @@
+"""End a training on time, with its learning rate fully decayed."""
+
+import time
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from posefilter.errors import UserError
+
+
+class TimeBudget(Callback):
+    """Let the learning-rate schedule keep pace with the clock, and stop when the time is up.
+
+    The number of steps is chosen from a measured speed. On a machine that turns out slower, the
+    schedule is advanced by more than one step at a time, so that it ends when the time does; a
+    validation follows, as after the last step. Time of earlier sittings counts.
+
+    Args:
+        seconds: For all steps, validations not counted as steps but as time.
+
+    Raises:
+        UserError: `seconds` is not positive.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        if not seconds > 0:
+            raise UserError(f"time budget of {seconds} s: must be positive")
+        self.seconds = seconds
+        self.spent = 0.0  # in earlier sittings [s]
+        self._began = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Time of all sittings [s]."""
+        return self.spent + time.perf_counter() - self._began
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the time that was spent."""
+        return {"spent": self.elapsed}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the time of earlier sittings."""
+        self.spent = float(state_dict["spent"])
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        self._began = time.perf_counter()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Advance the schedule to where the clock is; stop if the time is up."""
+        share = min(1.0, self.elapsed / self.seconds)
+        for config in trainer.lr_scheduler_configs:
+            scheduler: Any = config.scheduler
+            while scheduler.last_epoch < int(share * trainer.max_steps):
+                scheduler.step()
+        if share == 1:
+            trainer.should_stop = True
