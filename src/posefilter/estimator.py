@@ -86,8 +86,8 @@ class Result:
     def draw_overlay(
         self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
     ) -> np.ndarray:
-        """Draw the object's outline and axes on the image that it was found in; none where the
-        verdict is that it is absent.
+        """Draw the object's outline and axes on the image that it was found in: full where it is
+        found, dashed where the verdict is unsure, none where it is absent.
 
         Args:
             rgb: The image (H, W, 3) uint8, RGB.
@@ -101,7 +101,9 @@ class Result:
 
         shape = self.model.hull if shape is None else shape
         pose = None if self.verdict == "absent" else self.pose
-        return draw_overlay(rgb, np.asarray(intrinsics), pose, shape, caption=self.describe())
+        unsure = self.verdict == "unsure"
+        K, said = np.asarray(intrinsics), self.describe()
+        return draw_overlay(rgb, K, pose, shape, caption=said, dashed=unsure)
 
     def describe(self) -> str:
         """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""

@@ -19,7 +19,8 @@ from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator, Result, Run, collect_results
 from posefilter.figures.canvas import save_image
-from posefilter.figures.overlay import draw_overlays
+from posefilter.figures.detections import Drawn, draw_detections
+from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
@@ -111,12 +112,11 @@ def predict_several(job: Job) -> list[Result]:
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
     (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
     seen = [one for one in results if one.verdict != "absent"]
-    shapes = [store.load(one.object) if store else one.model.hull for one in seen]
-    marks = [mark_result(one) for one in seen]
+    absent = [one.object for one in results if one.verdict == "absent"]
+    drawn = [mark_result(one, store.load(one.object) if store else one.model.hull) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
-    picture = draw_overlays(rgb, K, [one.pose for one in seen], shapes, marks)
-    save_image(picture, folder / "overlay.png")
+    save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
     answers = []
     for number, (checkpoint, result) in enumerate(zip(checkpoints, results, strict=True)):
         file = beliefs / f"{number:02d}_{result.object}.npz"
@@ -142,14 +142,16 @@ def read_costs(cfg: DictConfig) -> Costs:
     return Costs(cfg.cost_false_alarm, cfg.cost_miss, cfg.cost_unsure)
 
 
-def mark_result(result: Result) -> str:
-    """Return an object's name in the legend of several."""
-    if result.warnings:
-        return f"{result.object} (implausible)"
+def mark_result(result: Result, shape: Shape) -> Drawn:
+    """Return how a result is drawn among several: its line, its tag, its name in the legend."""
+    unsure = result.verdict == "unsure"
     if result.probability is None:
-        return f"{result.object} ({result.score:.1f})"
-    unsure = "unsure, " if result.verdict == "unsure" else ""
-    return f"{result.object} ({unsure}{result.probability:.2f})"
+        said = f"{result.score:.1f}"
+    else:
+        said = f"unsure, {result.probability:.2f}" if unsure else f"{result.probability:.2f}"
+    known = f"{said}, implausible" if result.warnings else said
+    tag = "" if result.probability is None else f"{result.object} {result.probability:.2f}"
+    return Drawn(f"{result.object} ({known})", result.pose, shape, tag, unsure)
 
 
 def print_result(result: Result) -> None:

@@ -19,7 +19,8 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import FolderVideo, SceneVideo, Video, VideoFrame, list_groups
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
-from posefilter.figures.overlay import Shape, draw_overlays
+from posefilter.figures.detections import Drawn, draw_detections
+from posefilter.figures.overlay import Shape
 from posefilter.figures.video import VideoWriter
 from posefilter.meshes.store import MeshStore
 from posefilter.tracking.motion import RandomWalk
@@ -112,11 +113,9 @@ def draw_frame(
 ) -> np.ndarray:
     """Draw the objects that are found; the legend names those that are lost, too."""
     found = [one for one in results if one.found]
-    labels = [f"{one.object}: {one.status}" for one in found]
+    drawn = [Drawn(f"{one.object}: {one.status}", one.pose, shapes[one.object]) for one in found]
     lost = [one.object for one in results if not one.found]
-    poses = [one.pose for one in found]
-    own = [shapes[one.object] for one in found]
-    return draw_overlays(frame.rgb, frame.intrinsics, poses, own, labels, caption=_name_lost(lost))
+    return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=_name_lost(lost))
 
 
 def _name_lost(lost: Sequence[str]) -> str:

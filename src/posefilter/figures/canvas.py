@@ -128,6 +128,49 @@ def draw_lines(
     cv2.polylines(picture, fixed, closed, color, width, cv2.LINE_AA, _SHIFT)
 
 
+def split_dashes(path: np.ndarray, closed: bool, dash: int = 11, gap: int = 8) -> list[np.ndarray]:
+    """Cut a line into dashes of equal length.
+
+    Args:
+        path: (P, 2) [px].
+        closed: Whether it goes on from its last point to its first.
+        dash: Length of a dash [px].
+        gap: Length between two dashes [px], about.
+
+    Returns:
+        Each (dash + 1, 2) [px], a point each pixel; a line that is shorter is one dash.
+    """
+    points = np.asarray(path, np.float64)
+    points = np.concatenate([points, points[:1]]) if closed else points
+    length = np.r_[0.0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum()]
+    count = max(1, round(float(length[-1]) / (dash + gap)))
+    starts = np.arange(count) * (length[-1] / count)
+    at = np.minimum(starts[:, None] + np.arange(dash + 1), length[-1])
+    return [np.stack([np.interp(one, length, points[:, i]) for i in (0, 1)], 1) for one in at]
+
+
+def draw_tag(
+    picture: np.ndarray, text: str, at: tuple[float, float], color: Color, size: int = 14
+) -> None:
+    """Write a short text into a picture, in place, with a dark rim so that it shows on any ground.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        text: What is written.
+        at: Where its lower left corner goes (u, v) [px]; moved so that it stays in the picture.
+        color: Of the letters.
+        size: Of the letters [px].
+    """
+    letters = load_font(size, bold=True)
+    left, top, right, bottom = letters.getbbox(text, anchor="ls", stroke_width=2)
+    u = float(np.clip(at[0], -left, max(picture.shape[1] - right, -left)))
+    v = float(np.clip(at[1], -top, max(picture.shape[0] - bottom, -top)))
+    image = Image.fromarray(picture)
+    pen = ImageDraw.Draw(image)
+    pen.text((u, v), text, color, letters, anchor="ls", stroke_width=2, stroke_fill=_HALO)
+    picture[:] = np.asarray(image)
+
+
 def draw_dots(
     picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radius: float | np.ndarray
 ) -> None:

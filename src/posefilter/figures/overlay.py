@@ -18,6 +18,7 @@ from posefilter.figures.canvas import (
     draw_lines,
     draw_row,
     full_view,
+    split_dashes,
 )
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
@@ -37,17 +38,18 @@ def draw_overlay(
     caption: str = "",
     label: str = "estimate",
     width: int = WIDTH,
+    dashed: bool = False,
 ) -> np.ndarray:
     """Draw where a pose puts the object, and where the truth does; caption and legend are on a row
     below the photograph.
 
     rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m], None where there
-    is none; width: of the result at least [px]. -> (s H + row, s W, 3) uint8, enlarged by
-    s = max(1, width / W).
+    is none; width: of the result at least [px]; dashed: the pose is not sure. -> (s H + row, s W,
+    3) uint8, enlarged by s = max(1, width / W).
     """
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     drawn = np.full((4, 4), np.nan) if pose is None else pose  # which draws nothing
-    picture = draw_poses(rgb, K, drawn, shape, view, color, truth)
+    picture = draw_poses(rgb, K, drawn, shape, view, color, truth, dashed=dashed)
     entries = [] if pose is None else [(label, color), *list_axes()]
     return np.concatenate(
         [
@@ -61,48 +63,6 @@ def draw_overlay(
     )
 
 
-def draw_overlays(
-    rgb: np.ndarray,
-    K: np.ndarray,
-    poses: Sequence[np.ndarray],
-    shapes: Sequence[Shape],
-    labels: Sequence[str],
-    width: int = WIDTH,
-    caption: str = "",
-) -> np.ndarray:
-    """Draw where poses put several objects, each in a color of its own, the nearest last.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        K: (3, 3) [px].
-        poses: (4, 4) camera_from_object [m] an object.
-        shapes: A mesh or hull an object.
-        labels: Its name in the legend.
-        width: Of the result at least [px].
-        caption: What is written below the legend.
-
-    Returns:
-        The picture (h, w, 3) uint8, with the legend below.
-    """
-    view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
-    picture, shown = view.show(rgb), view.camera(K)
-    colors = pick_colors(len(poses))
-    for i in sorted(range(len(poses)), key=lambda i: -poses[i][2, 3]):
-        draw_pose(picture, shown, np.asarray(poses[i], np.float64), shapes[i], colors[i])
-    entries = list(zip(labels, colors, strict=True))
-    rows = [draw_row(picture.shape[1], "", entries[i : i + 2]) for i in range(0, len(entries), 2)]
-    rows += [draw_row(picture.shape[1], caption)] if caption else []
-    return np.concatenate([picture, *rows])
-
-
-def pick_colors(count: int) -> list[Color]:
-    """Return colors that are told apart, of hues that lie apart."""
-    hues = [(150 + 180 * 0.618034 * i) % 180 for i in range(count)]  # OpenCV's, of 180
-    hsv = np.array([[[hue, 190 if i % 2 else 230, 255] for i, hue in enumerate(hues)]], np.uint8)
-    rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if count else np.zeros((0, 3), np.uint8)
-    return [(int(r), int(g), int(b)) for r, g, b in rgb]
-
-
 def draw_poses(
     rgb: np.ndarray,
     K: np.ndarray,
@@ -112,6 +72,7 @@ def draw_poses(
     color: Color = ESTIMATE,
     truth: np.ndarray | None = None,
     coarse: int = 1,
+    dashed: bool = False,
 ) -> np.ndarray:
     """Return the same without writing, of the part of the photograph that `view` shows.
 
@@ -122,7 +83,8 @@ def draw_poses(
     shown = view.camera(K)
     if truth is not None:
         draw_pose(picture, shown, np.asarray(truth, np.float64), shape, TRUTH, coarse=coarse)
-    draw_pose(picture, shown, np.asarray(pose, np.float64), shape, color, coarse=coarse)
+    own = np.asarray(pose, np.float64)
+    draw_pose(picture, shown, own, shape, color, coarse=coarse, dashed=dashed)
     return picture
 
 
@@ -161,21 +123,19 @@ def draw_pose(
     color: Color,
     width: int = 2,
     coarse: int = 1,
+    dashed: bool = False,
 ) -> None:
-    """Draw a pose's outline and axes into a picture, in place.
+    """Draw a pose's outline and axes into a picture, in place; of a dashed one the axes are thin.
 
     Poses that are not finite draw nothing.
     """
     if not np.isfinite(pose).all():
         return
-    draw_lines(
-        picture,
-        outline_object(pose, shape, K, picture.shape[0], picture.shape[1], coarse),
-        color,
-        width,
-        closed=True,
-    )
-    draw_axes(picture, K, pose, shape, color, width)
+    lines = outline_object(pose, shape, K, picture.shape[0], picture.shape[1], coarse)
+    if dashed:
+        lines = [one for line in lines for one in split_dashes(line, closed=True)]
+    draw_lines(picture, lines, color, width, closed=not dashed)
+    draw_axes(picture, K, pose, shape, color, 1 if dashed else width)
 
 
 def draw_axes(
