@@ -66,10 +66,12 @@ def metrics(auc: float, instances: int) -> dict[str, Any]:
 def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     tmp_path: Path,
 ) -> None:
-    run = photographs.plan()[0]
+    run, gone = photographs.plan()[:2]
     page = tmp_path / "page.md"
-    marks = [photographs.MARK.format(where) for where in ("renders", "photographs")]
-    page.write_text("Above.\n" + "".join(f"{m}\nold\n{photographs.END}\nBelow.\n" for m in marks))
+    marks = [photographs.MARK.format(title) for title, _, _ in photographs.TABLES]
+    kept = f"| `{gone.name}` | a run that is no longer there |"
+    old = f"old\n| `{run.name}` | old |\n{kept}\n"
+    page.write_text("Above.\n" + "".join(f"{m}\n{old}{photographs.END}\nBelow.\n" for m in marks))
     values = {
         f"runs/{run.name}": metrics(99.0, 2),
         f"evals/{run.name}/renders": metrics(88.0, 60),
@@ -81,11 +83,12 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     photographs.write_tables(tmp_path, page)
     text = page.read_text()
     assert text.startswith("Above.\n")
-    assert text.count("\nBelow.\n") == 2
-    assert "old" not in text
+    assert text.count("\nBelow.\n") == 3
+    assert text.count(kept) == 3
+    assert text.count("old") == 1  # no run of few images
     rows = [line for line in text.splitlines() if line.startswith(f"| `{run.name}`")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
-    assert [each[5:7] for each in cells] == [[str(run.steps), "5.0"]] * 2
+    assert [each[5:7] for each in cells[:2]] == [[str(run.steps), "5.0"]] * 2
     assert cells[0][7:] == ["60", "88.0", "89.0", "90.0", "90.0", "4.2", "25"]
     assert cells[1][7:] == ["20", "77.0", "78.0", "90.0", "90.0", "4.2", "25"]
     page_in_docs = photographs.PAGE.read_text()
