@@ -36,7 +36,7 @@ class BadData(UserError):  # noqa: N818
 
 
 class Carrier(BaseException):
-    """Carries a mistake, its only argument, past those who catch every exception."""
+    """Wraps a mistake, its only argument, on its way through a library that catches `Exception`."""
 
 
 class Stopped(BaseException):

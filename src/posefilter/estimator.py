@@ -33,8 +33,8 @@ class Result:
         pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
             OpenCV's (x right, y down, z ahead), the object's that of its mesh file.  It is the best
             guess, also where the object is not there: see `verdict`.
-        score: The estimate's log-likelihood, up to a constant of the method.  It ranks images of
-            one camera under one method; it is no probability, and says nothing of a wrong scale.
+        score: The estimate's log-likelihood.  It ranks poses of one image; between images its level
+            is arbitrary, so it is no measure of confidence: `probability` is.
         probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
             object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
             not calibrated; `uncalibrated` says why.

@@ -34,7 +34,10 @@ class Space(Protocol):
         ...
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
-        """Displace states.  (*, *S), (*, D) -> (*, *S)."""
+        """Return states shifted by tangent vectors, the exponential map of the space.
+
+        (*, *S), (*, D) -> (*, *S).
+        """
         ...
 
     def noise_scale(self, sigma: Tensor) -> Tensor:

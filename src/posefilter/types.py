@@ -96,7 +96,9 @@ class Belief(NamedTuple):
     poses: Tensor  # (B, N, 4, 4) camera_from_object
     log_weights: Tensor  # (B, N), normalized
     best: Tensor  # (B, 4, 4) the estimate
-    score: Tensor  # (B,) confidence in the estimate, comparable between images of one method
+    # (B,) log-likelihood of the estimate, up to a constant of each image: it ranks poses of one
+    # image, and is no confidence
+    score: Tensor
 
 
 class Trace(NamedTuple):

@@ -20,7 +20,7 @@ class PixelSpace:
     dimensions: int = 2
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
-        """Shift pixels.  (*, 2), (*, 2) [px] -> (*, 2)."""
+        """Return pixels shifted by offsets.  (*, 2), (*, 2) [px] -> (*, 2)."""
         return state + tangent
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
@@ -69,7 +69,10 @@ class PoseSpace:
         return box_axes(self.points).T
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
-        """Move poses about the object's center.  (*, 4, 4), (*, 6) [m, rad] -> (*, 4, 4)."""
+        """Return poses shifted, and turned about the object's center, by tangent vectors.
+
+        (*, 4, 4), (*, 6) translation [m] and rotation vector [rad] -> (*, 4, 4).
+        """
         return move_about(state, tangent, state.new_tensor(self.center))
 
     def noise_scale(self, sigma: Tensor) -> Tensor:

@@ -94,8 +94,9 @@ class SurfacePointLoss:
     """Error of the predicted object point of each particle's own measured point.
 
     A single predicted point is compared by its distance, in radii. For fragments (EPOS, Hodan et
-    al. 2020) the loss is `fragment_weight` x (cross-entropy of the fragments + `within` x L1 error
-    of the position in the true fragment). Only particles on the mask and with valid depth count.
+    al. 2020) the loss is `fragment_weight` x (cross-entropy of the fragments + `offset_weight` x
+    L1 error of the position in the true fragment). Only particles on the mask and with valid depth
+    count.
 
     Args:
         fragment_weight: Weight of the loss of fragments.
