@@ -1,6 +1,6 @@
 """Tracks against single images on YCB-Video's photographs, and losses that are planted.
 
-    python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--threads 1]
+    python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--losses]
 
 For each object whose weights ship and that is in the scenes: every frame by itself, then the same
 frames tracked, in one process. Times are the processor's of this process, so that other work on the
@@ -12,7 +12,7 @@ how many frames it is found again. Writes the tables of docs/results/tracking.md
 import argparse
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +37,10 @@ HEAD = (
     "tracked: ADD AUC", "ADD-S AUC", "jitter mm", "degrees", "lost", "single s", "tracked ms",
     "ratio",
 )  # fmt: skip
-LOSSES = ("object", "scene", "away", "said to be there", "of these in the first", "found after")
+LOSSES = (
+    "object", "scene", "away", "said to be there", "of these in the first", "found after",
+    "presence with it", "without",
+)  # fmt: skip
 
 
 class Outcome(NamedTuple):
@@ -105,7 +108,23 @@ def measure_loss(
             back = str(n - AWAY.stop + 1)
             break
     early = sum(said[: posefilter.TrackerSettings().patience - 1])
-    return [name, "", str(len(AWAY)), str(sum(said)), str(early), back]
+    there = min(r.presence for n, r in enumerate(results) if r.found and n not in AWAY)
+    away = max(results[n].presence for n in AWAY)
+    row = [str(len(AWAY)), str(sum(said)), str(early), back, f"{there:.2f}", f"{away:.2f}"]
+    return [name, "", *row]
+
+
+def compare(
+    estimator: posefilter.Estimator, scene: str, frames: Sequence[VideoFrame], strides: list[int]
+) -> Iterator[str]:
+    """Yield the row of single images against tracks at each stride."""
+    name = estimator.objects[0]
+    estimator.predict(frames[0].rgb, frames[0].depth, frames[0].intrinsics)  # warm
+    results, seconds = run_single(estimator, frames)
+    for stride in strides:
+        single = judge(results[::stride], frames[::stride], seconds[::stride])
+        tracked = judge(*_tracked(estimator, frames[::stride]))
+        yield make_row(name, scene, stride, single, tracked, len(frames[::stride]))
 
 
 def make_row(name: str, scene: str, stride: int, single: Outcome, tracked: Outcome, n: int) -> str:
@@ -138,6 +157,7 @@ def main() -> None:
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
+    parser.add_argument("--losses", action="store_true", help="the planted losses alone")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     keep_freed_memory()
@@ -158,19 +178,17 @@ def main() -> None:
         other = [frame for one in groups if one != group for frame in every[one]]
         for name in video.objects or ():
             estimator = posefilter.load(name, device="cpu")
-            estimator.predict(frames[0].rgb, frames[0].depth, frames[0].intrinsics)  # warm
-            results, seconds = run_single(estimator, frames)
-            for stride in options.stride or [1, 4]:
-                single = judge(results[::stride], frames[::stride], seconds[::stride])
-                tracked = judge(*_tracked(estimator, frames[::stride]))
-                rows.append(make_row(name, group, stride, single, tracked, len(frames[::stride])))
-                print(rows[-1], flush=True)
+            if not options.losses:
+                for row in compare(estimator, group, frames, options.stride or [1, 4]):
+                    rows.append(row)
+                    print(row, flush=True)
             if other:
                 cells = measure_loss(estimator, frames, other)
                 cells[1] = group
                 losses.append(f"| {' | '.join(cells)} |")
                 print(losses[-1], flush=True)
-    write_table("tracks", HEAD, rows)
+    if rows:
+        write_table("tracks", HEAD, rows)
     write_table("losses", LOSSES, losses)
 
 

@@ -283,7 +283,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
 def explain_missing(method: PoseEstimator) -> str:
     """Return why an estimate has no probability."""
     known = method.calibration is not None
-    return "the calibration is of single images, not of a track" if known else method.uncalibrated
+    return "no pixel of the frame has depth" if known else method.uncalibrated
 
 
 def get_trained_size(settings: dict[str, Any]) -> tuple[int | None, int | None]:

@@ -5,7 +5,7 @@ pixel, (4, 4) a pose. Units: meters, radians, pixels.  `a_from_b` maps b into a,
 cancel: camera_from_world @ world_from_object.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -110,3 +110,5 @@ class Trace(NamedTuple):
     belief: Belief
     # (B, T) log of the summed weights at each step; None if no filter made the trace
     log_evidence: Tensor | None = None
+    # the encoded images, as the method's `encode` returned them; None if it is not kept
+    scene: Any = None

@@ -8,8 +8,10 @@ import torch
 from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
+from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.errors import UserError
 from posefilter.tracking.settings import Effort, TrackerSettings
+from posefilter.tracking.watch import Watch
 
 NONE = np.zeros_like(DEPTH)
 
@@ -70,6 +72,51 @@ def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
     assert set(statuses[again + 1 :]) == {"tracked"}
 
 
+def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object() -> None:
+    """The calibrated presence tells what the relevance of the pixels does not."""
+    toy, estimator = make_toy()
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 0, "absent": 20}, "toy", {},
+    )  # fmt: skip
+    tracker = posefilter.Tracker(estimator)
+    pose = toy.ghost = walk_pose(1)[0]
+    results = []
+    for number in range(20):
+        toy.truth = None if 6 <= number < 12 else pose
+        results.append(tracker.update(RGB, DEPTH, K))
+    assert min(one.relevance for one in results[:8]) > 0.8
+    assert [one.found for one in results[6:12]] == [True] + 5 * [False]
+    assert all(one.presence < 0.1 and one.probability < one.presence for one in results[6:12])
+    assert any(one.found for one in results[12:15])
+    assert results[-1].presence > 0.9
+    assert off(results[-1], pose) < 0.008
+
+
+def test_in_doubt_the_network_sees_the_whole_image() -> None:
+    toy, estimator = make_toy()
+    tracker, sizes = posefilter.Tracker(estimator, TrackerSettings(side=64, look_around=0)), []
+    toy.truth = walk_pose(1)[0]
+    tracker.update(RGB, DEPTH, K)
+    for depth in (DEPTH, NONE, DEPTH, DEPTH):
+        toy.encoded.clear()
+        tracker.update(RGB, depth, K)
+        sizes.append(max(toy.encoded, default=None))
+    assert max(*sizes[0], *sizes[3]) <= 64
+    assert sizes[1:3] == [None, (120, 160)]
+
+
+@pytest.mark.parametrize("patience", [1, 3])
+def test_a_watch_counts_frames_in_a_row(patience: int) -> None:
+    watch = Watch(TrackerSettings(patience=patience, lost_below=0.2, found_above=0.6))
+    assert [watch.judge(p)[1] for p in (0.1, 0.5, 0.7)] == ["lost", "lost", "started"]
+    for _ in range(3):  # what is between the bounds, or good, starts the count anew
+        assert [watch.judge(0.1)[1] for _ in range(patience - 1)] == ["tracked"] * (patience - 1)
+        assert watch.judge(0.3) == (True, "tracked")
+    assert [watch.judge(0.1)[1] for _ in range(patience)][-1] == "lost"
+    assert [watch.judge(p) for p in (0.5, 0.7)] == [(False, "lost"), (True, "found")]
+
+
 def test_one_bad_frame_is_no_loss() -> None:
     """The belief is moved on without a measurement; a frame without depth is such a frame."""
     toy, estimator = make_toy()
@@ -124,7 +171,7 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
     ("wrong", "told"),
     [
         ({"patience": 0}, "patience=0 must be a whole number, 1 or more"),
-        ({"lost_below": 0.9}, "found_above=0.3 must lie in"),
+        ({"lost_below": 0.9}, "found_above=0.5 must lie in"),
         ({"reach": 0.5}, "reach 1 or more"),
         ({"quantile": 1.0}, "quantile between 0 and 1"),
     ],

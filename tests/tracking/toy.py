@@ -26,7 +26,8 @@ from posefilter.types import Batch, ObjectModel
 CENTER = (0.02, 0.0, -0.01)
 SPACE = PoseSpace(CENTER, 0.08)
 K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
-RGB, DEPTH = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), np.float32)
+RGB = np.zeros((120, 160, 3), np.uint8)
+DEPTH = np.full((120, 160), 0.7, np.float32)  # nearer than the object: nothing is seen through
 
 
 class ToyScene(NamedTuple):
@@ -54,6 +55,7 @@ class Toy(PoseEstimator):
         )  # fmt: skip
         super().__init__(filter, loss=lambda *_: torch.zeros(1), optimizer=lambda _: None)  # type: ignore[arg-type,return-value]
         self.truth: Tensor | None = None
+        self.ghost: Tensor | None = None  # what the network takes for the object where it is not
         self.encoded: list[tuple[int, ...]] = []  # sizes of the images that were encoded
         line = torch.linspace(-0.05, 0.05, 3)
         points = torch.cartesian_prod(line, line, line) + torch.tensor(CENTER)
@@ -69,9 +71,10 @@ class Toy(PoseEstimator):
         self.encoded.append(tuple(batch.rgb.shape[-2:]))
         height, width = batch.rgb.shape[-2:]
         cells = pixel_grid(height, width, 4).reshape(-1, 2)
-        if self.truth is None:
+        shown = self.ghost if self.truth is None else self.truth
+        if shown is None:
             return ToyScene(None, torch.zeros(1, 1, height // 4, width // 4))
-        middle = origin_of(self.truth.float(), torch.tensor(CENTER))
+        middle = origin_of(shown.float(), torch.tensor(CENTER))
         reach = SPACE.radius * batch.intrinsics[0, 0, 0] / middle[2]
         near = (cells - project(middle[None], batch.intrinsics[0])).norm(dim=1) < reach
         return ToyScene(self.truth, near.float().view(1, 1, height // 4, width // 4))

@@ -136,7 +136,7 @@ class ParticleFilter(nn.Module):
         check_finite(log_evidence)
         belief = self.estimate(history[-1], outputs[-1], scene, method, generator)
         belief = self.refine(belief, scene, method, generator)
-        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence)
+        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence, scene)
 
     def make_steps(self, like: Tensor) -> tuple[Step, ...]:
         """Return the steps with their noise levels, in the dtype and on the device of `like`."""

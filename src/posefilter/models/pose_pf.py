@@ -192,9 +192,10 @@ class PosePF(PoseEstimator):
         evidence = super().collect_evidence(trace, batch)
         if self.proposals is None:
             return evidence
-        coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
-        cells = measure_cells(batch.depth, batch.intrinsics)
-        return evidence | measure_coordinates(trace.belief.best, coordinates, cells, self.model)
+        scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
+        assert scene.coordinates is not None and scene.cells is not None
+        best = trace.belief.best
+        return evidence | measure_coordinates(best, scene.coordinates, scene.cells, self.model)
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the proposal network too."""

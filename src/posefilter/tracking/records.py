@@ -19,8 +19,8 @@ from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
 _COLUMNS = (
-    "video", "frame", "object", "status", "score", "relevance", "probability", "particles",
-    "add_mm", "add_s_mm", "seconds",
+    "video", "frame", "object", "status", "score", "relevance", "presence", "probability",
+    "particles", "add_mm", "add_s_mm", "seconds",
 )  # fmt: skip
 
 
@@ -132,6 +132,7 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
         "camera_from_object": result.pose.tolist(),
         "score": result.score,
         "relevance": result.relevance,
+        "presence": result.presence,
         "probability": result.probability,
         "particles": len(result.belief.weights),
         "standard_deviations": np.sqrt(np.diag(result.covariance)).tolist(),

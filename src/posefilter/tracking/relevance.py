@@ -1,12 +1,15 @@
-"""Is the object where a pose puts it? What the network says of the pixels there."""
+"""Is the object where a pose puts it? What the frame says of that."""
 
 import torch
 from torch import Tensor
 
+from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.evidence import measure_depth
 from posefilter.filters.guided import gather_relevance
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
-from posefilter.types import Batch
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Trace
 
 _POINTS = 256  # of the surface, that are looked at
 
@@ -38,3 +41,29 @@ def measure_relevance(relevance: Tensor, batch: Batch, pose: Tensor, points: Ten
         return 0.0
     found = gather_relevance(relevance, pixels[inside][None], height, width)
     return float(torch.mean(found))
+
+
+def measure_presence(
+    method: PoseEstimator, trace: Trace, batch: Batch, relevance: float
+) -> tuple[float, Assessment | None]:
+    """Return how probable it is that the object is where an estimate puts it.
+
+    Of a calibrated method it is its calibrated presence. That is fitted to estimates on single
+    images; a track's evidence is of the same kind, but its particles are fewer, and the network may
+    have seen a window only. Of another method it is the relevance, lowered where the depth sees
+    through more of the surface than it finds there; that is no probability.
+
+    Args:
+        method: The object's filter.
+        trace: The estimate, with the encoded image.
+        batch: The image.
+        relevance: As returned by `measure_relevance`.
+
+    Returns:
+        The presence in [0, 1], and the calibrated probabilities where there are any.
+    """
+    found = method.assess(trace, batch)
+    if found is not None:
+        return float(found.presence), found
+    solid = measure_depth(trace.belief.best, batch, method.model)["solid"]
+    return relevance * min(1.0, 2 * float(solid)), None

@@ -72,8 +72,9 @@ class TrackerSettings:
         side: Largest side of the window about the object that it sees otherwise [px].
         reach: Half the window's side, in projected radii of the object.
         noise: Standard deviation of the estimate of a single frame, for smoothing [m]; 0: none.
-        lost_below: A frame counts against the object where its relevance is below, in [0, 1].
-        found_above: What a search finds is taken up where its relevance is above.
+        lost_below: A frame counts against the object where its presence is below, in [0, 1].
+        found_above: What a search finds is taken up where its presence is above. While a track's is
+            not, the network sees the whole image.
         patience: Frames in a row that count against an object that is lost.
         full_every: While it is lost, every so many frames the estimator's own filter searches;
             0: never.
@@ -95,8 +96,8 @@ class TrackerSettings:
     side: int = 128
     reach: float = 1.6
     noise: float = 0.003
-    lost_below: float = 0.05
-    found_above: float = 0.3
+    lost_below: float = 0.1
+    found_above: float = 0.5
     patience: int = 2
     full_every: int = 5
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from posefilter.confidence.calibration import Assessment
 from posefilter.data.resize import network_size
 from posefilter.estimator import Result, Run, make_result
 from posefilter.filters.loop import ParticleFilter, make_particles
@@ -19,16 +20,15 @@ from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images, make_batch
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import Scene
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
-from posefilter.tracking.relevance import measure_relevance
+from posefilter.tracking.relevance import measure_presence, measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import Effort, TrackerSettings
+from posefilter.tracking.watch import LOST, TRACKED, Watch
 from posefilter.tracking.window import clean_depth, cut_window, place_window
 from posefilter.types import Batch, Belief, Particles, Trace
 
-STARTED, TRACKED, FOUND, LOST = "started", "tracked", "found", "lost"
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 
 
@@ -41,6 +41,9 @@ class TrackResult(Result):
             "found" again after a loss, or "lost": then the pose is no more than a guess.
         relevance: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
+
+    `presence` and `probability` are those of an estimate on a single image with the same evidence;
+    a track is judged lost or found by the presence.
     """
 
     status: str
@@ -66,6 +69,8 @@ class Sight(NamedTuple):
     batch: Batch  # the image, or the window of it that was looked at
     belief: Belief | None  # None where nothing has depth
     relevance: float  # the mean relevance of the pixels that the estimate covers
+    presence: float  # what the track is judged by
+    found: Assessment | None  # the calibrated probabilities
 
 
 class Track:
@@ -99,8 +104,8 @@ class Track:
         """Forget the object: the next frame is the first."""
         self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
         self.state: State | None = None
-        self.lost, self.ever_found = True, False
-        self.frames = self.doubts = self.lost_for = 0
+        self.watch = Watch(self.settings)
+        self.frames = 0
 
     @torch.no_grad()
     def update(self, images: Images) -> TrackResult:
@@ -111,11 +116,11 @@ class Track:
         """
         start = time.perf_counter()
         predicted = None if self.state is None else self._predict(self.state)
-        if predicted is None or self._is_due():
+        if predicted is None or self.watch.search_is_due:
             sight = self._estimate(images)
         else:
             sight = self._follow(images, predicted)
-        trusted, status = self._judge(sight.relevance)
+        trusted, status = self.watch.judge(sight.presence)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
@@ -148,20 +153,18 @@ class Track:
         """Run the estimator's own filter on the whole image."""
         batch = self._take(make_batch(clean_depth(images), *self.size))
         if not bool(batch.depth.any()):
-            return Sight(batch, None, 0.0)
+            return Sight(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
-        trace = self.method.predict_step(batch, 0)
-        scene = self.method.encode(batch)
-        return self._weigh(batch, scene, trace.belief)
+        return self._weigh(batch, self.method.predict_step(batch, 0))
 
     def _follow(self, images: Images, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
         batch = self._take(self._look(images, predicted.best[0]))
         if not bool(batch.depth.any()):
-            return Sight(batch, None, 0.0)
+            return Sight(batch, None, 0.0, 0.0, None)
         effort, settings = self._effort, self.settings
         scene = self.method.encode(batch)
-        against = 0.0 if self.lost else settings.jump
+        against = 0.0 if self.watch.lost else settings.jump
         glance = Glance(self.method, scene, effort.points, effort.proposals, against)
         refine = MeanShift(settings.rounds, 16) if settings.rounds else NoRefine()
         filter = ParticleFilter(
@@ -175,8 +178,7 @@ class Track:
             estimate=ModeMean(_MODE),
             refine=refine,
         )
-        trace = filter(batch, glance, self.generator)
-        return self._weigh(batch, glance.scene, trace.belief)
+        return self._weigh(batch, filter(batch, glance, self.generator))
 
     def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State:
         """Return the state after a frame; `belief` is None where what it shows is not trusted."""
@@ -195,18 +197,14 @@ class Track:
 
     @property
     def _effort(self) -> Effort:
-        return self.settings.search if self.lost else self.settings.follow
-
-    def _is_due(self) -> bool:
-        """Return whether the estimator's own filter is to search in this frame."""
-        every = self.settings.full_every
-        return self.lost and every > 0 and self.lost_for % every == every - 1
+        return self.settings.search if self.watch.lost else self.settings.follow
 
     def _look(self, images: Images, pose: Tensor) -> Batch:
         """Return the window about the object, or the whole image where it is time for that."""
         settings, every = self.settings, self.settings.look_around
         height, width = images.depth.shape[1:]
-        if self.lost or (every and self.frames % every == 0):
+        # what a window leaves in doubt the whole image may tell
+        if not self.watch.sure or (every and self.frames % every == 0):
             return make_batch(clean_depth(images), *self.size)
         window = place_window(
             pose.double().cpu().numpy(),
@@ -226,28 +224,12 @@ class Track:
     def _take(self, batch: Batch) -> Batch:
         return Batch(*(x.to(self.method.device) for x in batch))
 
-    def _weigh(self, batch: Batch, scene: Scene, belief: Belief) -> Sight:
+    def _weigh(self, batch: Batch, trace: Trace) -> Sight:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
-        points = self.method.model.points
-        relevance = measure_relevance(scene.relevance, batch, belief.best[0], points)
-        return Sight(batch, belief, relevance)
-
-    def _judge(self, relevance: float) -> tuple[bool, str]:
-        """Return whether a frame's estimate is to be trusted, and the object's status after it."""
-        settings = self.settings
-        if self.lost:
-            trusted = relevance > settings.found_above
-            status = LOST if not trusted else FOUND if self.ever_found else STARTED
-        else:
-            trusted = relevance > settings.lost_below
-            self.doubts = 0 if trusted else self.doubts + 1
-            status = LOST if self.doubts >= settings.patience else TRACKED
-        self.lost = status == LOST
-        self.lost_for = self.lost_for + 1 if self.lost else 0
-        self.ever_found |= not self.lost
-        if self.lost:
-            self.doubts = 0
-        return trusted, status
+        belief, points = trace.belief, self.method.model.points
+        relevance = measure_relevance(trace.scene.relevance, batch, belief.best[0], points)
+        presence, found = measure_presence(self.method, trace, batch, relevance)
+        return Sight(batch, belief, relevance, presence, found)
 
     def _describe(self, sight: Sight) -> Run:
         """Return the state as an estimator's run on what was looked at."""
@@ -256,7 +238,7 @@ class Track:
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
         belief = Belief(state.belief.state, state.belief.log_weights, state.best, score)
-        return Run(self.method, sight.batch, Trace((), (), (), belief), 0.0)
+        return Run(self.method, sight.batch, Trace((), (), (), belief), 0.0, sight.found)
 
 
 def begin(belief: Belief) -> State:

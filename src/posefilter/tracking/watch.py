@@ -1,0 +1,51 @@
+"""Whether a track is lost: what becomes of it by the probability that the object is there."""
+
+from posefilter.tracking.settings import TrackerSettings
+
+STARTED, TRACKED, FOUND, LOST = "started", "tracked", "found", "lost"
+
+
+class Watch:
+    """Judge a track by the presence of its object, frame after frame.
+
+    A track is lost after `patience` frames in a row whose presence is below `lost_below`; a lost
+    one is found by a frame whose presence is above `found_above`. Between the two it stays what it
+    is. What is lost at first has never been found.
+
+    Args:
+        settings: Of the tracker.
+    """
+
+    def __init__(self, settings: TrackerSettings) -> None:
+        self.settings = settings
+        self.lost, self.ever_found = True, False
+        self.doubts = self.lost_for = 0
+        self.sure = False  # of the last frame
+
+    def judge(self, presence: float) -> tuple[bool, str]:
+        """Return whether a frame's estimate is to be trusted, and the object's status after it.
+
+        Args:
+            presence: The probability that the object is where the estimate puts it, in [0, 1].
+        """
+        settings = self.settings
+        self.sure = presence > settings.found_above
+        if self.lost:
+            trusted = self.sure
+            status = LOST if not trusted else FOUND if self.ever_found else STARTED
+        else:
+            trusted = presence > settings.lost_below
+            self.doubts = 0 if trusted else self.doubts + 1
+            status = LOST if self.doubts >= settings.patience else TRACKED
+        self.lost = status == LOST
+        self.lost_for = self.lost_for + 1 if self.lost else 0
+        self.ever_found |= not self.lost
+        if self.lost:
+            self.doubts = 0
+        return trusted, status
+
+    @property
+    def search_is_due(self) -> bool:
+        """Whether the estimator's own filter is to search in the next frame."""
+        every = self.settings.full_every
+        return self.lost and every > 0 and self.lost_for % every == every - 1
