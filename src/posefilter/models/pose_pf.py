@@ -193,7 +193,8 @@ class PosePF(PoseEstimator):
         if self.proposals is None:
             return evidence
         scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
-        assert scene.coordinates is not None and scene.cells is not None
+        assert scene.coordinates is not None
+        assert scene.cells is not None
         best = trace.belief.best
         return evidence | measure_coordinates(best, scene.coordinates, scene.cells, self.model)
 
