@@ -34,6 +34,8 @@ class ObjectModel(NamedTuple):
     # (S, 4, 4) object_from_object symmetry transforms, the identity first
     symmetries: Tensor
     hull: Tensor  # (V, 3) vertices of a convex hull [m], for outlines
+    # (P, 3) by part: the vertices of its hull, and points of its surface [m]; see meshes/parts.py
+    parts: dict[str, Tensor] | None = None
 
 
 class Particles(NamedTuple):

@@ -128,7 +128,7 @@ def find_shape(trainer: Trainer, method: PoseEstimator) -> Shape:
     method carries.
     """
     store = getattr(getattr(trainer, "datamodule", None), "meshes", None)
-    if isinstance(store, MeshStore) and method.model.name in store.names():
+    if isinstance(store, MeshStore) and store.has(method.model.name):
         return store.load(method.model.name)
     return method.model.hull
 

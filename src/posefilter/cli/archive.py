@@ -22,6 +22,7 @@ _MOST_FILES = 50_000  # in an archive
 _MOST_NODES, _DEEPEST = 500_000, 64
 _PART = re.compile(r"[\w.\-]{1,100}(/[\w.\-]{1,100}){0,4}")
 _POINTS = 1_000_000  # of an object's surface
+_PARTS = 100
 
 
 def check_archive(file: Path, said: str) -> None:
@@ -108,7 +109,13 @@ def check_tensor(value: Tensor, size: int, said: str) -> None:
 
 def _check_object(model: Any, said: str) -> None:
     shapes = {"points": (-1, 3), "center": (3,), "symmetries": (-1, 4, 4), "hull": (-1, 3)}
-    if not isinstance(model, dict) or set(model) != {"name", "radius", "diameter", *shapes}:
+    # checkpoints of before there were parts have none
+    if not isinstance(model, dict) or set(model) - {"parts"} != {
+        "name",
+        "radius",
+        "diameter",
+        *shapes,
+    }:
         raise UserError(
             f"{said}: its object should have name, points, center, radius, diameter, "
             f"symmetries and hull"
@@ -116,8 +123,12 @@ def _check_object(model: Any, said: str) -> None:
     name = model["name"]
     if not (isinstance(name, str) and is_plain_name(name)):
         raise UserError(f"{said}: its object's name {str(name)[:40]!r} is not a plain one")
-    for key, shape in shapes.items():
-        value = model[key]
+    parts = {} if model.get("parts") is None else model["parts"]
+    if not (isinstance(parts, dict) and len(parts) <= _PARTS and all(map(_is_part_name, parts))):
+        raise UserError(f"{said}: its object's parts should be points by plain names")
+    named = {key: (model[key], shape) for key, shape in shapes.items()}
+    named |= {f"part {part}": (points, (-1, 3)) for part, points in parts.items()}
+    for key, (value, shape) in named.items():
         fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.is_floating_point()
         if not fits or any(
             want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
@@ -131,6 +142,10 @@ def _check_object(model: Any, said: str) -> None:
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")
+
+
+def _is_part_name(name: Any) -> bool:
+    return isinstance(name, str) and is_plain_name(name)
 
 
 def _leaves(node: Any, said: str) -> Iterator[Any]:

@@ -257,7 +257,7 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
 
     Raises UserError where its mesh there is another one: poses of the two could not be compared.
     """
-    if own.name not in data.meshes.names():
+    if not data.meshes.has(own.name):
         return own
     theirs = data.object_model(0)
     shift = float((theirs.center - own.center).norm())

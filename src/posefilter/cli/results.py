@@ -13,7 +13,7 @@ from posefilter.metrics.registry import find_metric, read_number
 
 _ROWS = (
     "add/auc", "add/recall_01d", "add/recall_2cm", "add/median_mm", "add_s/auc", "add_s/median_mm",
-    "iou", "particles_on_object", "seconds_per_image",
+    "iou", "parts/box_iou", "parts/mask_iou", "particles_on_object", "seconds_per_image",
 )  # fmt: skip
 _TOLD = (
     "instances",
@@ -23,6 +23,7 @@ _TOLD = (
     "mssd",
     "mspd",
     "iou",
+    "parts",
     "particles_on_object",
     "seconds_per_image",
     "belief",

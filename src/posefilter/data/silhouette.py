@@ -28,9 +28,7 @@ class Geometry:
     def mesh(self, name: str) -> Mesh | None:
         """Return a class's mesh, None where there is none that fits."""
         return (
-            self.meshes.load(name)
-            if name in self.meshes.names() and name not in self.without
-            else None
+            self.meshes.load(name) if self.meshes.has(name) and name not in self.without else None
         )
 
     def render(

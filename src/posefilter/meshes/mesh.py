@@ -1,6 +1,7 @@
 """Triangle meshes and pure functions on them, in numpy."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -15,6 +16,7 @@ _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet at more than this share no
 _HULL_VERTICES = 128
 _HULL_DIRECTIONS = 5000  # some 2.9 degrees apart
 _HULL_ERROR = 2.5e-4  # [m] stop refining the outline hull here
+_PART_POINTS = 300  # of a part's surface, beside the vertices of its hull
 
 
 def _identity() -> np.ndarray:
@@ -39,6 +41,8 @@ class Mesh:
     corner_normals: np.ndarray  # (F, 3, 3) float32, unit
     # (S, 4, 4) object_from_object, the identity first
     symmetries: np.ndarray = field(default_factory=_identity)
+    # (F,) bool by part: the faces of each, disjoint; see meshes/parts.py
+    parts: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @cached_property
     def bounds(self) -> np.ndarray:
@@ -235,7 +239,16 @@ def object_model(
         diameter=diameter(mesh.vertices),
         symmetries=torch.from_numpy(mesh.symmetries.astype(np.float32)),
         hull=torch.from_numpy(outline_hull(mesh.vertices).astype(np.float32)),
+        parts={part: _part_points(mesh, faces, seed) for part, faces in mesh.parts.items()} or None,
     )
+
+
+def _part_points(mesh: Mesh, faces: np.ndarray, seed: int) -> torch.Tensor:
+    """Return the vertices of a part's hull, and points of its surface.  (F,) bool -> (P, 3) [m]."""
+    own = replace(mesh, faces=mesh.faces[faces], parts={})
+    hull = outline_hull(mesh.vertices[np.unique(own.faces)])
+    surface = surface_points(own, *sample_surface(own, _PART_POINTS, seed))
+    return torch.from_numpy(np.concatenate([hull, surface]).astype(np.float32))
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:

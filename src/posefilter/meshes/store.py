@@ -13,6 +13,7 @@ from posefilter.meshes import ycb
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.files import SUFFIXES, read_mesh
 from posefilter.meshes.mesh import Mesh, diameter, object_model
+from posefilter.meshes.parts import FILE, cut_part, read_parts, split_part
 from posefilter.meshes.symmetries import identity_first, read_symmetries, symmetry_group
 
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
@@ -60,7 +61,7 @@ class MeshStore:
         return builtin.names() if str(self.root) == BUILTIN else sorted(self._files)
 
     def load(self, name: str) -> Mesh:
-        """Return a mesh, read on first use.
+        """Return a mesh, read on first use; of a part, `OBJECT.PART`, its faces alone.
 
         Raises:
             UserError: There is none of that name, its file is damaged, or its unit is wrong.
@@ -72,6 +73,8 @@ class MeshStore:
     def _load(self, name: str) -> Mesh:
         if name in self._ambiguous:
             raise UserError(self._ambiguous[name])
+        if self.is_part(name):
+            return self._load_part(name)
         if name not in self.names():
             near = difflib.get_close_matches(name, self.names(), n=1, cutoff=0.3)
             hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -84,8 +87,40 @@ class MeshStore:
         else:
             mesh = read_mesh(self._files[name], name, self.scale)
             _check_unit(mesh, self._files[name], self.scale)
+            mesh = replace(mesh, parts=self._parts(name, mesh))
         symmetries = self._symmetries(name)
         return mesh if symmetries is None else replace(mesh, symmetries=symmetries)
+
+    def has(self, name: str) -> bool:
+        """Return whether there is a mesh, or a part, of this name."""
+        if self.is_part(name):
+            base, part = split_part(name)
+            return part in self.load(base).parts
+        return name in self.names()
+
+    def is_part(self, name: str) -> bool:
+        """Return whether a name is `OBJECT.PART`, of an object that there is."""
+        return name not in self.names() and split_part(name)[0] in self.names()
+
+    def _load_part(self, name: str) -> Mesh:
+        base, part = split_part(name)
+        mesh = self.load(base)
+        if part not in mesh.parts:
+            declared = ", ".join(mesh.parts) or f"none (they would be in {FILE} beside the mesh)"
+            raise UserError(f"no part '{part}' of {base} in {self.root}; there are: {declared}")
+        return cut_part(mesh, part)
+
+    def _parts(self, name: str, mesh: Mesh) -> dict[str, np.ndarray]:
+        """Return the declared parts of an object of a folder."""
+        for folder in self._folders_of(name):
+            if (folder / FILE).is_file():
+                return read_parts(folder / FILE, name, self.scale, mesh)
+        return ycb.parts(name, mesh)
+
+    def _folders_of(self, name: str) -> list[Path]:
+        """Return where files beside a mesh are looked for, nearest first."""
+        file = self._files[name]
+        return list(dict.fromkeys([file.parent, Path(self.root) / name, Path(self.root)]))
 
     def _symmetries(self, name: str) -> np.ndarray | None:
         """Return the declared symmetries, None where there are none but the mesh's own."""
@@ -95,8 +130,7 @@ class MeshStore:
             )
         if str(self.root) == BUILTIN:
             return None
-        file = self._files[name]
-        for folder in dict.fromkeys([file.parent, Path(self.root) / name, Path(self.root)]):
+        for folder in self._folders_of(name):
             for info in (folder / "symmetries.json", folder / "models_info.json"):
                 if info.is_file():
                     return read_symmetries(info, name, self.scale, self.symmetry_steps)

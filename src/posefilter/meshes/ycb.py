@@ -6,6 +6,7 @@ object settings).
 
 import numpy as np
 
+from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.symmetries import rotation_about, symmetry_group
 
 # YCB-Video's order; label images and cls_indexes count from 1, FAT's segmentation ids in steps of
@@ -105,6 +106,41 @@ _HALF_TURNS = {
     "061_foam_brick": ((-0.0047, 0.0029, -1.0), (-0.0184, 0.0169, 0.0253)),
 }
 _ANY_TURN = {"024_bowl": ((0.0010, 0.0070, 1.0), (-0.0148, -0.0436, 0.0270))}
+
+
+# Parts of YCB's tools, each a slice of the google_16k mesh along an axis of its frame: (axis, from
+# [m], to [m]). Where one ends and the next begins was read from the mesh's profile along the axis.
+_PARTS = {
+    "035_power_drill": {
+        "battery": (1, -1.0, -0.048),
+        "grip": (1, -0.048, 0.046),
+        "body": (1, 0.046, 1.0),
+    },
+    "037_scissors": {"handles": (1, -1.0, 0.055), "blades": (1, 0.055, 1.0)},
+    "042_adjustable_wrench": {"head": (1, -1.0, -0.035), "handle": (1, -0.035, 1.0)},
+    "043_phillips_screwdriver": {"shaft": (0, -1.0, -0.055), "handle": (0, -0.055, 1.0)},
+    "044_flat_screwdriver": {"shaft": (0, -1.0, -0.033), "handle": (0, -0.033, 1.0)},
+    "048_hammer": {"handle": (1, -1.0, 0.04), "head": (1, 0.04, 1.0)},
+    "051_large_clamp": {"jaws": (1, -1.0, -0.013), "handles": (1, -0.013, 1.0)},
+    "052_extra_large_clamp": {"jaws": (0, -1.0, -0.027), "handles": (0, -0.027, 1.0)},
+}
+
+
+def parts(name: str, mesh: Mesh) -> dict[str, np.ndarray]:
+    """Return the parts of a tool.
+
+    Args:
+        name: The class.
+        mesh: Its google_16k mesh [m].
+
+    Returns:
+        (F,) bool by part, disjoint; empty for what is no tool.
+    """
+    out = {}
+    for part, (axis, low, high) in _PARTS.get(name, {}).items():
+        along = mesh.vertices[mesh.faces][..., axis].mean(axis=1)
+        out[part] = (along >= low) & (along < high)
+    return {part: faces for part, faces in out.items() if faces.any()}
 
 
 def ycbvideo_index(name: str) -> int:

@@ -102,6 +102,22 @@ _METRICS = (
     *_describe_bop("mspd", "px", "5 to 50 pixels in an image 640 wide"),
     MetricInfo("iou", "box IoU", form=".3f", direction=HIGHER, limits=(-0.03, 1.03)),
     MetricInfo(
+        "parts/box_iou",
+        "part box IoU",
+        form=".3f",
+        direction=HIGHER,
+        limits=(-0.03, 1.03),
+        meaning="mean over the object's parts, each at the estimated and at the true pose",
+    ),
+    MetricInfo(
+        "parts/mask_iou",
+        "part mask IoU",
+        form=".3f",
+        direction=HIGHER,
+        limits=(-0.03, 1.03),
+        meaning="the same of visible pixels, each of which belongs to the nearest part",
+    ),
+    MetricInfo(
         "particles_on_object",
         "particles on the object",
         "%",
@@ -408,13 +424,14 @@ def find_metric(key: str) -> MetricInfo:
 
     Args:
         key: Its key.  That of a logged scalar (`val/add/auc`), of a range of visibility
-            (`by_visibility/0.3-0.5/add/auc`) and of one end of a list
-            (`diagnostics/off_frame/last`) lead to the same number.
+            (`by_visibility/0.3-0.5/add/auc`), of a part (`parts/by_part/head/box_iou`) and of one
+            end of a list (`diagnostics/off_frame/last`) lead to the same number.
 
     Raises:
         UserError: Where there is no such number.
     """
     bare = re.sub(r"^(?:(?:val|test)/)?(?:by_visibility/[\d.]+-[\d.]+/)?", "", key)
+    bare = re.sub(r"^parts/by_part/[^/]+/", "parts/", bare)
     for name in (bare, re.sub(r"/(?:first|last)$", "", bare), re.sub(r"/step_\d+$", "", bare)):
         if name in METRICS:
             return METRICS[name]

@@ -152,6 +152,7 @@ class PoseEstimator(Module):
         from posefilter.metrics.bop import BopErrors  # torchmetrics: prediction needs none
         from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
         from posefilter.metrics.confidence import Confidence
+        from posefilter.metrics.parts import PartIoU
         from posefilter.metrics.visibility import ErrorsByVisibility
 
         metrics: dict[str, nn.Module] = {
@@ -164,6 +165,8 @@ class PoseEstimator(Module):
             metrics["by_visibility"] = ErrorsByVisibility([self.model])
             metrics["belief"] = BeliefQuality([self.model])
             metrics["confidence"] = Confidence()
+            if self.model.parts:
+                metrics["parts"] = PartIoU(self.model)
         return metrics
 
     def set_object(self, model: ObjectModel) -> None:
@@ -327,6 +330,8 @@ class PoseEstimator(Module):
             )
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
             self.judge_confidence(trace, batch, there=True)
+        if "parts" in self.scores:
+            self.scores["parts"].update(trace.belief.best, batch)
 
     def last_assessment(self, count: int) -> Assessment:
         """Return the probabilities of the batch that the metrics took in last, of `count` images;
@@ -387,9 +392,8 @@ class PoseEstimator(Module):
         out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
         known = self.calibration is not None and "confidence" in self.scores
         out["confidence"] = self.scores["confidence"].compute() if known else None
-        out["by_visibility"] = (
-            self.scores["by_visibility"].compute() if "poses" in self.scores else None
-        )
+        for name, needed in (("by_visibility", "poses"), ("parts", "parts")):
+            out[name] = self.scores[name].compute() if needed in self.scores else None
         return out
 
     def _reset(self) -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from posefilter.errors import UserError
 from posefilter.files import remove_parts
 from posefilter.locks import LOCK, hold, release
+from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.ranges import check_ranges
 from posefilter.synthetic import fat_format as fat
@@ -224,6 +225,12 @@ def check_meshes(job: Job, store: MeshStore, frames: Sequence[int]) -> None:
     Raises:
         UserError: One is missing, cannot be read, or is in another unit.
     """
+    if store.is_part(job.object):
+        base = split_part(job.object)[0]
+        raise UserError(
+            f"object={job.object}: is a part; render the whole, object={base}, and train with "
+            f"data.object={job.object}"
+        )
     if job.object not in store.names() or frames:
         store.load(job.object)
     if job.meshes == BUILTIN:

@@ -81,6 +81,7 @@ class BopReader(BaseReader):
         meshes: MeshStore | None = None,
         part: str | None = None,
         mesh_frame: str | None = None,
+        inverted: bool = False,
         on_error: str = "raise",
     ) -> None:
         """List the frames.
@@ -93,12 +94,17 @@ class BopReader(BaseReader):
             mesh_frame: "bop" where meshes are the dataset's own (the default for obj_...; the mesh
                 store wants scale=0.001), "original" where they are google_16k (the default for
                 YCB's names).
+            inverted: `cam_R_m2c` and `cam_t_m2c` hold the camera's pose in the object's frame, and
+                not the object's in the camera's, as datasets of BOP's layout exist that do.
             on_error: "raise", or "skip" broken frames and count them.
 
         Raises:
             UserError: There are no scenes, no such class, or a file is broken.
         """
         super().__init__(root, meshes, on_error)
+        if not isinstance(inverted, bool):
+            raise UserError(f"data.options.inverted={inverted}: choose true or false")
+        self._inverted = inverted
         base = self.root / part if part else self.root
         folders = sorted(_scene_folders(base))
         if not folders:
@@ -238,6 +244,7 @@ class BopReader(BaseReader):
             pose[:3, 3] = numbers(one, "cam_t_m2c", gt_path, (3,), where) * MM
             if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
                 raise BadData(gt_path, f"'{where}cam_R_m2c' is no rotation")
+            camera_from_object = np.linalg.inv(pose) if self._inverted else pose
             files = (
                 _color(folder, stem),
                 folder / "depth" / f"{stem}.png",
@@ -249,7 +256,11 @@ class BopReader(BaseReader):
                 f"{group}/{stem}", group, int(folder.name), int(image), number, name, k, files
             )
             siblings = tuple(mask for j, mask in enumerate(masks) if j != k)
-            entries.append(_Entry(record, K, 1 / (scale * MM), pose @ self._native[name], siblings))
+            entries.append(
+                _Entry(
+                    record, K, 1 / (scale * MM), camera_from_object @ self._native[name], siblings
+                )
+            )
         return entries
 
 

@@ -7,8 +7,10 @@ from typing import Any
 from posefilter.data.frames import Reader
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
+from posefilter.data.readers.part import PartReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import UserError
+from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import MeshStore
 
 READERS: dict[str, Callable[..., Reader]] = {
@@ -45,13 +47,20 @@ def open_reader(
 ) -> Reader:
     """Return the reader of a dataset: source "scenes" (rendered here), "fat", "ycb_video" or "bop".
 
-    options: the format's own, see the readers. Raises UserError for a source, class, folder or
+    An object may be a part, `hammer.head`: see `PartReader`. options: the format's own, see the
+    readers. Raises UserError for a source, class, folder or
     option that there is not.
     """
     if source not in READERS:
         raise UserError(f"data.source={source}: unknown; choose from {', '.join(READERS)}")
     if on_error not in ("raise", "skip"):
         raise UserError(f"data.on_error={on_error}: choose raise or skip")
+    part = _asked_part(objects, meshes)
+    if part is not None and meshes is not None:
+        meshes.load(part)  # it may be no part of the object
+        base = split_part(part)[0]
+        whole = open_reader(source, root, base, meshes, on_error, **options)
+        return PartReader(whole, part, meshes)
     if "eyes" in options:
         raise UserError("data.options.eyes: is now called data.options.cameras")
     try:
@@ -64,6 +73,18 @@ def open_reader(
         raise UserError(
             f"data.options: {str(error).split('() ')[-1]} of the {source} reader"
         ) from error
+
+
+def _asked_part(objects: str | Sequence[str] | None, meshes: MeshStore | None) -> str | None:
+    """Return the part of an object (`hammer.head`) that is asked for; None for whole objects.
+
+    Raises UserError for a part beside other objects.
+    """
+    names = [objects] if isinstance(objects, str) else list(objects or [])
+    parts = [] if meshes is None else [name for name in names if meshes.is_part(name)]
+    if parts and len(names) > 1:
+        raise UserError(f"data.object: '{parts[0]}' is a part, which is read by itself")
+    return parts[0] if parts else None
 
 
 def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> float:

@@ -1,0 +1,138 @@
+"""Parts of objects, such as a hammer's head and handle: declared beside the mesh, in parts.json.
+
+A part is a set of the mesh's faces. It is used in two ways: metrics compare each part of an object
+with that part at the estimated pose, and a part can be an object of its own, named `OBJECT.PART`.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh
+
+FILE = "parts.json"
+SEPARATOR = "."
+_KINDS = "a part is {'box': [[x, y, z], [x, y, z]]} or {'vertices': [numbers]}"
+
+
+def split_part(name: str) -> tuple[str, str]:
+    """Return the object and the part that a name may mean: `hammer.head` is (hammer, head)."""
+    base, _, part = name.rpartition(SEPARATOR)
+    return (base, part) if base else (name, "")
+
+
+def read_parts(file: Path, name: str, scale: float, mesh: Mesh) -> dict[str, np.ndarray]:
+    """Read an object's parts.
+
+    The file maps objects to parts, `{"hammer": {"head": {"box": [[...], [...]]}}}`; a file in the
+    object's own folder may hold its parts alone. A part is an axis-aligned box (two corners, in the
+    unit of the mesh file), which has the faces whose center is in it, or a list of vertices, which
+    has the faces with at least two corners in it. A face belongs to the first part that has it.
+
+    Args:
+        file: The file.
+        name: The object.
+        scale: Meters in the mesh file's unit.
+        mesh: The object's mesh [m].
+
+    Returns:
+        (F,) bool by part, disjoint.
+
+    Raises:
+        UserError: The file cannot be read, or a part is none.
+    """
+    try:
+        table = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{file}: cannot be read as JSON ({error})") from error
+    if not isinstance(table, dict):
+        raise UserError(f"{file}: should map names to parts; {_KINDS}")
+    alone = any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())
+    entry = table if alone else table.get(name, {})
+    if not isinstance(entry, dict):
+        raise UserError(f"{file}: '{name}' should map names of parts to parts; {_KINDS}")
+    wholes = {part: _select(one, scale, mesh, f"{file}: {part}") for part, one in entry.items()}
+    return assign(wholes, str(file))
+
+
+def assign(wholes: Mapping[str, np.ndarray], said: str) -> dict[str, np.ndarray]:
+    """Return disjoint parts: a face belongs to the first that has it.
+
+    Args:
+        wholes: (F,) bool by part.
+        said: Where they were declared, for messages.
+
+    Raises:
+        UserError: A part has no face, or its name does not do.
+    """
+    taken: np.ndarray | None = None
+    out = {}
+    for part, faces in wholes.items():
+        if not part.replace("_", "").replace("-", "").isalnum():
+            raise UserError(f"{said}: part '{part}': a name is of letters, digits, - and _")
+        own = faces if taken is None else faces & ~taken
+        if not own.any():
+            raise UserError(f"{said}: part '{part}' has no face of the mesh; mind the unit")
+        taken = own if taken is None else taken | own
+        out[part] = own
+    return out
+
+
+def select_box(mesh: Mesh, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the faces whose center is in a box.  (3,), (3,) [m] -> (F,) bool."""
+    center = mesh.vertices[mesh.faces].mean(axis=1)
+    inside: np.ndarray = ((center >= low) & (center <= high)).all(axis=1)
+    return inside
+
+
+def cut_part(mesh: Mesh, part: str) -> Mesh:
+    """Return a part as a mesh of its own, in the frame of the whole; it has no symmetries.
+
+    Args:
+        mesh: The whole.
+        part: One of its parts.
+    """
+    return take_faces(mesh, mesh.parts[part], f"{mesh.name}{SEPARATOR}{part}")
+
+
+def take_faces(mesh: Mesh, keep: np.ndarray, name: str) -> Mesh:
+    """Return some faces of a mesh as a mesh.  keep: (F,) bool."""
+    used, faces = np.unique(mesh.faces[keep], return_inverse=True)
+    return replace(
+        mesh,
+        name=name,
+        vertices=mesh.vertices[used],
+        faces=faces.reshape(-1, 3),
+        corner_uv=None if mesh.corner_uv is None else mesh.corner_uv[keep],
+        corner_colors=None if mesh.corner_colors is None else mesh.corner_colors[keep],
+        corner_normals=mesh.corner_normals[keep],
+        symmetries=np.eye(4)[None],
+        parts={},
+    )
+
+
+def _select(one: Any, scale: float, mesh: Mesh, said: str) -> np.ndarray:
+    try:
+        if set(one) == {"box"}:
+            corners = np.array(one["box"], dtype=np.float64).reshape(2, 3) * scale
+            if not np.isfinite(corners).all():
+                raise ValueError("a corner is not finite")
+            return select_box(mesh, corners.min(axis=0), corners.max(axis=0))
+        if set(one) == {"vertices"}:
+            listed = np.array(one["vertices"])
+            if listed.ndim != 1 or listed.dtype.kind not in "iu":
+                raise ValueError("vertices are counted from 0")
+            if len(listed) == 0 or listed.min() < 0 or listed.max() >= len(mesh.vertices):
+                raise ValueError(f"the mesh has vertices 0 to {len(mesh.vertices) - 1}")
+            has = np.zeros(len(mesh.vertices), dtype=bool)
+            has[listed] = True
+            corners_in: np.ndarray = has[mesh.faces].sum(axis=1) >= 2
+            return corners_in
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise UserError(f"{said}: cannot be read ({error}); {_KINDS}") from error
+    raise UserError(f"{said}: {_KINDS}")
