@@ -252,8 +252,8 @@ def data_settings(
 
 
 def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
-    """Return the method's object with the points that the dataset defines ADD on, where the
-    dataset's meshes have it.
+    """Return the method's object with the points that the dataset defines ADD on, its symmetries
+    and its parts, where the dataset's meshes have it.
 
     Raises UserError where its mesh there is another one: poses of the two could not be compared.
     """
@@ -269,7 +269,10 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
             f"{1000 * own.radius:.1f} mm)"
         )
     return own._replace(
-        points=theirs.points, diameter=theirs.diameter, symmetries=theirs.symmetries
+        points=theirs.points,
+        diameter=theirs.diameter,
+        symmetries=theirs.symmetries,
+        parts=theirs.parts,
     )
 
 
