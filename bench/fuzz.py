@@ -138,7 +138,12 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
     cv2.imwrite(str(depth), np.full((120, 160), 7000, np.uint16))
     quiet = ["console=json", "threads=1"]
     small = ["debug=smoke", *quiet, "logger=none", "data.progress=false", f"data.root={data}"]
-    small += ["data.limit_train=4", "data.limit_val=1", "data.limit_test=2", "callbacks=none"]
+    small += [
+        "data.limit_train=4",
+        "data.limit_val=1",
+        "data.limit_test=2",
+        "callbacks=checkpoints",
+    ]
     small += ["trainer.max_steps=2", "trainer.val_check_interval=2"]
     run_folder = folder / "run"
     done = run("train", [*small, f"out={run_folder}"], folder / "log", before=limit)

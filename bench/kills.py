@@ -31,7 +31,7 @@ from forking import prepare, run, start, wait  # noqa: E402
 
 MODELS = ("pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized")
 _SMALL = (
-    "debug=smoke", "console=json", "threads=1", "logger=none", "callbacks=none",
+    "debug=smoke", "console=json", "threads=1", "logger=none", "callbacks=checkpoints",
     "data.progress=false", "callbacks.last.minutes=0", "trainer.max_steps=6",
     "trainer.val_check_interval=3", "data.limit_test=4", "data.limit_val=2",
 )  # fmt: skip

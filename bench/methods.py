@@ -148,9 +148,9 @@ def list_units() -> list[Line]:
     then memorizing: the filter with a pose at the size of the ablations (a narrower network, ten
     steps), detectors with 8 particles and 16 channels, for time, and the paper's 30 steps.
     """
-    untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=none"
+    untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=checkpoints"
     lines = [Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2")]
-    paper = "experiment=memorize ablation=paper callbacks=none"
+    paper = "experiment=memorize ablation=paper callbacks=checkpoints"
     for model in ("patch_pf", "downsized", "cnn_patch"):
         size = (
             "sweep=ablation_detect filter.particles=8 model.net.width=16"

@@ -227,7 +227,7 @@ RANGES: dict[str, Range] = {
     "likelihood_batch_size": _whole(1, 100_000),
     "proposal_weight": WEIGHT,
     "truncate": COUNT,
-    "relevance": WEIGHT,
+    "relevance_weight": WEIGHT,
     "width": WIDTH,
     "widths": WIDTH,
     "hidden": _whole(0, 65_536),

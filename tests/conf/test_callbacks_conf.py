@@ -31,8 +31,8 @@ def kinds(job: Job) -> list[type]:
     return [type(callback) for callback in trainer.callbacks]  # type: ignore[attr-defined]
 
 
-def test_none_leaves_only_the_checkpoints(tmp_path: Path) -> None:
-    usual, none = kinds(compose(tmp_path)), kinds(compose(tmp_path, "callbacks=none"))
+def test_no_callbacks_are_left_but_the_checkpoints(tmp_path: Path) -> None:
+    usual, none = kinds(compose(tmp_path)), kinds(compose(tmp_path, "callbacks=checkpoints"))
     assert Figures in usual
     assert [kind for kind in none if issubclass(kind, Checkpoint)] == [Best, Last]
     assert none.count(Best) == usual.count(Best) == 1

@@ -194,7 +194,7 @@ def test_what_is_required_is_asked_for(tmp_path: Path, capfd: pytest.CaptureFixt
 def test_a_trace_is_shown_only_when_asked_for(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_command("train", HOME, [f"out={tmp_path}", "loss=add", "debug=trace"]) == 2
+    assert run_command("train", HOME, [f"out={tmp_path}", "loss=add", "debug=traceback"]) == 2
     assert "Traceback" in capfd.readouterr().err
 
 

@@ -328,7 +328,7 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(
     folder.mkdir(parents=True)
     (folder / "old.ckpt").write_text("")
     conf = HOME / "conf" / "callbacks" / "none.yaml"
-    job = compose_job("train", HOME / "conf", ["callbacks=none"], tmp_path / "run")
+    job = compose_job("train", HOME / "conf", ["callbacks=checkpoints"], tmp_path / "run")
     job.cfg.folder = str(tmp_path / "run")
     victims = [f"{folder}/../../secret/file.txt", str(secret / "file.txt"), "memory://x/y.ckpt"]
     for callback in instantiate(job.cfg.callbacks, "callbacks").values():

@@ -271,7 +271,7 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
             "model=cnn_patch",
             "trainer.max_steps=2",
             "trainer.val_check_interval=100",
-            "callbacks=none",
+            "callbacks=checkpoints",
         )
     )
     assert read(tmp_path)["training"]["steps"] == 2
@@ -281,7 +281,12 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
 def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     found = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        settings = ("model=cnn_patch", f"seed={seed}", "trainer.max_steps=4", "callbacks=none")
+        settings = (
+            "model=cnn_patch",
+            f"seed={seed}",
+            "trainer.max_steps=4",
+            "callbacks=checkpoints",
+        )
         train(tiny_job(tmp_path / name, *settings))
         found.append(numbers(read(tmp_path / name)))
     assert found[0] == found[1]
@@ -353,6 +358,6 @@ def test_components_that_do_not_fit_are_refused_before_any_training(
 def test_particles_are_resampled_by_optimal_transport(
     resample: str, tiny_job, tmp_path: Path
 ) -> None:
-    settings = ("model=patch_pf", "trainer.max_steps=2", "callbacks=none")
+    settings = ("model=patch_pf", "trainer.max_steps=2", "callbacks=checkpoints")
     train(tiny_job(tmp_path, f"filter/resample={resample}", *settings))
     assert 0 <= read(tmp_path)["particles_on_object"] <= 1

@@ -105,7 +105,7 @@ def uninterrupted(
     tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[str], Path]:
     """Return a run that nothing stopped: what was typed, and its folder."""
-    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=none"]
+    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
     settings += ["trainer.val_check_interval=3", "trainer.max_steps=6", "data.batch_size_test=2"]
     whole = tmp_path_factory.mktemp("runs") / "whole"
     assert run_command("train", HOME, [*settings, f"out={whole}"]) == 0

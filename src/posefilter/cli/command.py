@@ -75,14 +75,14 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     the exit status.
 
     The work is the function `name` of the module `posefilter.cli.<name>`, imported only when the
-    settings have stood up. A mistake ends in one line on stderr and status 2; `debug=trace` shows
-    where it came from.
+    settings have stood up. A mistake ends in one line on stderr and status 2; `debug=traceback`
+    shows where it came from.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     arguments = spelled(arguments) if name == "report" else arguments
     # Hydra's parser wants it before or after all the rest
     arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)
-    trace = "debug=trace" in arguments
+    trace = "debug=traceback" in arguments
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()

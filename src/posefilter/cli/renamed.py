@@ -55,6 +55,7 @@ KEYS = {
     "callbacks.figures.every": "callbacks.figures.every_n_validations",
     "callbacks.figures.without": "callbacks.figures.exclude",
     "most_mb": "max_mb",
+    "model.relevance": "model.relevance_weight",
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
 _CHOICES = {
@@ -88,6 +89,8 @@ _CHOICES = {
     },
     "experiment": {"memorise": "memorize"},
     "console": {"plain": "json"},
+    "callbacks": {"none": "checkpoints"},
+    "debug": {"trace": "traceback"},
     "sweep": {"ladder": "ablation", "ladder_detect": "ablation_detect"},
     "ablation": {
         "s4_lesson": "s4_displacement_loss",
@@ -109,6 +112,7 @@ _CHOICES = {
         "m13_rate": "m13_scheduler",
     },
 }
+_RELEVANCE = {"relevance": "relevance_weight"}
 # arguments of classes, by the class's place below posefilter
 ARGUMENTS = {
     "filters.propagate.Chain": {"pieces": "components"},
@@ -136,6 +140,10 @@ ARGUMENTS = {
     },
     "models.candidate_samplers.LabeledRays": {"past": "margin_behind"},
     "models.box_heads.SpreadBox": {"beyond": "quantile"},
+    "models.cnn_patch.CnnPatch": _RELEVANCE,
+    "models.downsized.Downsized": _RELEVANCE,
+    "models.patch_pf.PatchPF": _RELEVANCE,
+    "models.pixel_pf.PixelPF": _RELEVANCE,
     "models.muon.Muon": {"spared": "adam_layers"},
     "nets.paper_likelihood.PaperLikelihood": {"about": "anchor"},
     "losses.displacement.Chamfer": {"most": "max_pixels"},

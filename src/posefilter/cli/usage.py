@@ -98,7 +98,7 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
     if name in ("train", "evaluate"):
         lines += _entry("-m key=a,b,c", "sweep: a run for each value", width)
     if name != "train":  # where it is one of the choices
-        lines += _entry("debug=trace", "show where a mistake came from", width)
+        lines += _entry("debug=traceback", "show where a mistake came from", width)
     return "\n".join(lines)
 
 

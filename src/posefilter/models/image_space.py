@@ -55,7 +55,7 @@ class ImageSpace(PoseEstimator):
         box_head: Computes the object's bounding box from the particles.
         aux_losses: Losses that are added to the chosen one, by name; None: switched off.
         loss_schedule: Factors on the losses as training proceeds; None: 1 throughout.
-        relevance: Weight of the loss on the encoder's relevance map, where it has one.
+        relevance_weight: Weight of the loss on the encoder's relevance map, where it has one.
         detach_position: Block the gradient of what is seen at a position with respect to the
             displacement that led there.
         truncate: Truncate backpropagation through positions and latents at every so many steps;
@@ -90,7 +90,7 @@ class ImageSpace(PoseEstimator):
         box_head: BoxHead,
         aux_losses: Mapping[str, Auxiliary | None] | None = None,
         loss_schedule: Sequence[Stage] | None = None,
-        relevance: float = 1.0,
+        relevance_weight: float = 1.0,
         detach_position: bool = False,
         truncate: int | None = None,
         object_model: ObjectModel | None = None,
@@ -115,7 +115,7 @@ class ImageSpace(PoseEstimator):
         for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
             check_latent_width(self.latent_width, getattr(component, "latent_width", None))
         self.relevance_weight, self.detach_position, self.truncate = (
-            relevance,
+            relevance_weight,
             detach_position,
             truncate,
         )
