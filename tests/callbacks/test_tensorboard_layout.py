@@ -125,7 +125,7 @@ def test_every_chart_finds_what_methods_log() -> None:
     logged = [
         "val/score", "val/add/auc", "val/add_s/auc", "val/add/median_mm", "val/add/recall_01d",
         "val/iou",
-        "val/particles_on_object", "train/total", "train/likelihood", "train/learning_rate",
+        "val/particles_on_object", "train/loss", "train/loss_likelihood", "train/learning_rate",
         "train/coordinate_error_mm",
         "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00",
         "filter/spread_px/step_00",
@@ -139,6 +139,6 @@ def test_every_chart_finds_what_methods_log() -> None:
             assert any(re.match(tag, name) for tag in tags for name in logged), title
     losses = LAYOUT["2  Does it learn?"]["losses"][1][0]
     assert [name for name in logged if re.match(losses, name)] == [
-        "train/total",
-        "train/likelihood",
+        "train/loss",
+        "train/loss_likelihood",
     ]

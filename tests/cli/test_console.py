@@ -18,7 +18,7 @@ from posefilter.cli.progress_bar import Bars, Lines, briefly, progress, told
 from posefilter.progress import bars, watched
 
 METRICS = {
-    "train/total": torch.tensor(1.25),
+    "train/loss": torch.tensor(1.25),
     "val/add/auc": torch.tensor(71.0),
     "val/by_visibility/0.3-0.5/iou": torch.tensor(1.0),
 }
@@ -147,7 +147,7 @@ def test_commands_can_be_typed_as_they_stand(value: str) -> None:
 def test_words_and_hydras_own_log() -> None:
     assert told(METRICS) == "loss 1.25, ADD AUC 71.0"
     assert (
-        briefly({"train/total": 2.0, "val/particles_on_object": 0.5, "val/iou": 1.0})
+        briefly({"train/loss": 2.0, "val/particles_on_object": 0.5, "val/iou": 1.0})
         == "loss 2, on object 50.0 %"
     )
     assert logging_for(["console=rich"]) == []

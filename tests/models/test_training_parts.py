@@ -215,8 +215,9 @@ class Watch(Callback):
         self, trainer: Trainer, method: LightningModule, out: Any, batch: Any, number: int
     ) -> None:
         logged = trainer.callback_metrics
-        names = ("loss", "displacement", "likelihood", "sides", "relevance")
-        self.seen.append((self.share, {name for name in names if not logged[f"train/{name}"]}))
+        names = ("chosen", "displacement", "likelihood", "sides", "relevance")
+        off = {name for name in names if not logged[f"train/loss_{name}"]}
+        self.seen.append((self.share, off))
 
 
 @pytest.mark.filterwarnings("ignore:You defined a `validation_step`")  # none is wanted here
@@ -236,7 +237,7 @@ def test_a_training_walks_through_its_stages() -> None:
     )
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
     trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement")), data)
-    first, second = {"loss", "displacement"}, {"likelihood", "sides", "relevance"}
+    first, second = {"chosen", "displacement"}, {"likelihood", "sides", "relevance"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]
     assert watch.seen == [one for one in want for _ in range(2)]
 

@@ -67,7 +67,7 @@ def run(tmp_path: Path) -> Path:
     (folder / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(hydra))
     with SummaryWriter(str(folder)) as log:
         for step in range(0, 100, 10):
-            log.add_scalar("train/total", 5 / (1 + step), step, walltime=1000.0 + step / 2)
+            log.add_scalar("train/loss", 5 / (1 + step), step, walltime=1000.0 + step / 2)
         for step, score in ((49, 60.0), (99, 40.0)):
             log.add_scalar("val/score", score, step, walltime=1000.0 + step / 2)
             log.add_scalar("val/add/auc", score, step, walltime=1000.0 + step / 2)

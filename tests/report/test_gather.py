@@ -12,10 +12,26 @@ from posefilter.report.diagnostics import (
     diagnose,
     format_duration,
 )
-from posefilter.report.events import drop_repeats
+from posefilter.report.events import Curve, drop_repeats, rename_losses
 from posefilter.report.gather import read_run
 from posefilter.report.images import group_by_section, sort_by_number
 from posefilter.report.settings import Change, compare_settings
+
+
+def test_losses_of_earlier_runs_get_todays_names() -> None:
+    one, two, three, four, five = (Curve((i,), (float(i),), (0.0,)) for i in range(5))
+    old = {"train/total": one, "train/loss": two, "train/pose": three, "val/score": four}
+    old |= {"train/coordinate_error_mm": five, "train/learning_rate": one}
+    new = rename_losses(old)
+    assert new == {
+        "train/loss": one,
+        "train/loss_chosen": two,
+        "train/loss_pose": three,
+        "val/score": four,
+        "train/coordinate_error_mm": five,
+        "train/learning_rate": one,
+    }
+    assert rename_losses(new) == new
 
 
 def test_scalars_and_pictures_are_read(run: Path) -> None:
@@ -23,7 +39,7 @@ def test_scalars_and_pictures_are_read(run: Path) -> None:
     record = read_run(run)
     assert record.curves["val/score"].steps == (49, 99)
     assert record.curves["val/score"].values == (60.0, 40.0)
-    assert len(record.curves["train/total"].values) == 10
+    assert len(record.curves["train/loss"].values) == 10
     shown = group_by_section(record.pictures)
     assert [p.name for p in shown["worst"]] == ["worst_2", "worst_10"]
     assert [p.name for p in shown["overlays"]] == ["validation_overlays"]

@@ -82,7 +82,10 @@ def test_the_page_has_the_run_s_numbers(run: Path) -> None:
     parts = outside(page)
     assert parts.fetched == []
     assert parts.pictures == 5 + len(files)  # four files, one logged picture, and the charts
-    assert {"training-loss-training-step.png", "effective-particles-iteration.png"} <= set(files)
+    assert {
+        "training-loss-training-step.png",
+        "relative-effective-sample-size-iteration.png",
+    } <= set(files)
     assert outside('<img src="https://x.y/z.png"><script></script>').fetched  # the check can fail
 
 

@@ -32,7 +32,7 @@ def test_two_images_are_memorized(tiny_scenes: Path, tmp_path: Path) -> None:
     assert metrics["tags"] == ["first", "two words"]
     assert metrics["instances"] == 2
     rows = read_csv(tmp_path / "csv" / "version_0" / "metrics.csv")
-    losses = [float(row["train/total"]) for row in rows if row["train/total"]]
+    losses = [float(row["train/loss"]) for row in rows if row["train/loss"]]
     assert len(losses) == 25
     assert sum(losses[-8:]) < 0.95 * sum(losses[:8])
     told = (tmp_path / "csv" / "version_0" / "hparams.yaml").read_text()

@@ -1,4 +1,4 @@
-"""The filter's health by iteration: effective particles, spread, noise level, log-likelihood."""
+"""The filter's health by iteration: effective sample size, spread, noise level, log-likelihood."""
 
 from pathlib import Path
 

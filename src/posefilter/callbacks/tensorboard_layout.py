@@ -50,12 +50,15 @@ LAYOUT: dict[str, dict[str, Chart]] = {
         ),
     },
     "2  Does it learn?": {
-        "losses": ("Multiline", [r"train/(?!learning_rate|coordinate).*"]),
+        "losses": ("Multiline", [r"train/loss(_.*)?$"]),
         "error of the proposed coordinates [mm]": ("Multiline", [r"train/coordinate_error_mm$"]),
         "learning rate": ("Multiline", [r"train/learning_rate$"]),
     },
     "3  What do the particles do?": {
-        "effective particles, by iteration": ("Multiline", [r"filter/ess/step_\d+$"]),
+        "effective sample size over the number of particles, by iteration": (
+            "Multiline",
+            [r"filter/ess/step_\d+$"],
+        ),
         "spread of the centers [m], by iteration": ("Multiline", [r"filter/spread_m/step_\d+$"]),
         "spread of the rotations [rad], by iteration": (
             "Multiline",
@@ -65,7 +68,7 @@ LAYOUT: dict[str, dict[str, Chart]] = {
         "noise level [m] or [px], by iteration": ("Multiline", [r"filter/sigma_(m|px)/step_\d+$"]),
         "where they end": ("Multiline", [r"diagnostics/.*/last$"]),
     },
-    "4  Is the belief honest?": {
+    "4  Is the belief calibrated?": {
         "truths within the region that holds 50 % and 90 % of the belief [%]": (
             "Multiline",
             [r"val/belief/coverage_\d+$"],

@@ -19,7 +19,7 @@ from posefilter.cli.console import JSON, say
 from posefilter.metrics.registry import find_metric
 from posefilter.report.diagnostics import format_duration
 
-SHOWN = ("train/total", "val/add/auc", "val/add/median_mm", "val/iou", "val/particles_on_object")
+SHOWN = ("train/loss", "val/add/auc", "val/add/median_mm", "val/iou", "val/particles_on_object")
 
 
 def progress(console: str) -> Callback:
@@ -36,7 +36,7 @@ def told(metrics: dict[str, Any]) -> str:
 def briefly(metrics: dict[str, Any]) -> str:
     """Return the two that fit beside a bar: the loss, and how well it finds the object."""
     finds = "val/add/auc" if "val/add/auc" in metrics else "val/particles_on_object"
-    return told({name: metrics[name] for name in ("train/total", finds) if name in metrics})
+    return told({name: metrics[name] for name in ("train/loss", finds) if name in metrics})
 
 
 def is_whole(name: str) -> bool:
@@ -64,7 +64,7 @@ class Lines(Callback):
             self._tell(
                 "training",
                 trainer,
-                {k: v for k, v in trainer.callback_metrics.items() if k == "train/total"},
+                {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss"},
             )
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -101,7 +101,7 @@ class Lines(Callback):
         numbers = {
             name: float(value)
             for name, value in seen.items()
-            if name == "train/total" or is_whole(name)
+            if name == "train/loss" or is_whole(name)
         }
         numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}
         say(self.console, event, f"step {step} of {steps}: {words}", **numbers)

@@ -68,7 +68,7 @@ def show(
     """Print the table, where everything was written, and what may be typed next; for machines, all
     of it as one line.
     """
-    rows = [("images", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
+    rows = [("instances", str(metrics["instances"])), ("missed", str(metrics["missed"]))]
     numbers = {key: read_number(metrics, key) for key in _ROWS}
     rows += [
         (find_metric(key).label, find_metric(key).describe(value))

@@ -81,7 +81,7 @@ def _log_scene(rr: Any, stream: Any, shown: ViewData) -> None:
     stream.log("estimate_box", _placed(rr, shown.estimate.pose), box, static=True)
     stream.log("about", rr.TextDocument(describe(shown), media_type="text/markdown"), static=True)
     stream.log("filter/noise", rr.SeriesLines(names=[f"noise level [{shown.unit}]"]), static=True)
-    stream.log("filter/effective", rr.SeriesLines(names=["effective particles [%]"]), static=True)
+    stream.log("filter/effective", rr.SeriesLines(names=["effective sample size [%]"]), static=True)
 
 
 def _log_particles(rr: Any, stream: Any, shown: ViewData, moment: Moment) -> None:
@@ -240,7 +240,7 @@ def _layout(shown: ViewData) -> Any:
         origin="/photograph", name="Particles on the photograph", visual_bounds=bounds
     )
     noise = rrb.TimeSeriesView(origin="/filter/noise", name="Noise level")
-    effective = rrb.TimeSeriesView(origin="/filter/effective", name="Effective particles")
+    effective = rrb.TimeSeriesView(origin="/filter/effective", name="Effective sample size")
     words = rrb.TextDocumentView(origin="/about", name="What is shown")
     side = rrb.Vertical(image, rrb.Horizontal(noise, effective), words, row_shares=[6, 3, 4])
     time = rrb.TimePanel(timeline=TIMELINE, fps=2.0, state="collapsed")

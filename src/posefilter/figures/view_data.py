@@ -34,7 +34,7 @@ class Moment(NamedTuple):
     centers: np.ndarray  # (N, 3) where these put the object's center [m]
     pixels: np.ndarray  # (N, 2) where the particles are in the image [px]
     weights: np.ndarray  # (N,), summing to 1
-    effective: float  # effective particles, as a share of all
+    effective: float  # effective sample size over the number of particles
     sigma: float | None  # noise level of the step; None at the end
 
 

@@ -92,7 +92,9 @@ def _describe_bop(name: str, unit: str, thresholds: str) -> tuple[MetricInfo, ..
 
 
 _METRICS = (
-    MetricInfo("instances", "images", form=".0f"),
+    MetricInfo(
+        "instances", "instances", form=".0f", meaning="objects in images, tested one by one"
+    ),
     MetricInfo(
         "missed", "missed", form=".0f", direction=LOWER, meaning="images without a finite pose"
     ),
@@ -131,8 +133,9 @@ _METRICS = (
     # the belief, means over the images
     MetricInfo(
         "belief/effective_particles",
-        "effective particles",
-        form=".1f",
+        "effective sample size",
+        "particles",
+        ".1f",
         meaning="1 / Σw²: how many particles carry the weight",
     ),
     MetricInfo(
@@ -181,7 +184,7 @@ _METRICS = (
     ),
     MetricInfo(
         "belief/rank",
-        "depth of the truth in the belief",
+        "credibility rank of the truth",
         form=".2f",
         meaning="0.5 where calibrated; near 1: the truth lies outside",
     ),
@@ -340,7 +343,7 @@ _METRICS = (
     ),
     MetricInfo(
         "diagnostics/line_share",
-        "variance along one line",
+        "variance along a line",
         "%",
         ".1f",
         factor=100.0,
@@ -350,7 +353,7 @@ _METRICS = (
     ),
     MetricInfo(
         "diagnostics/line_share/first",
-        "variance along one line at the start",
+        "variance along a line at the start",
         "%",
         ".1f",
         factor=100.0,
@@ -359,7 +362,7 @@ _METRICS = (
     ),
     MetricInfo(
         "diagnostics/pairwise_cosine",
-        "agreement of the displacements",
+        "same direction (pairwise cosine)",
         form=".2f",
         direction=LOWER,
         limits=(-1.05, 1.05),
@@ -396,11 +399,19 @@ _METRICS = (
     MetricInfo(
         "training/cpu_seconds_per_step", "processor time per training step", "s", ".3g", LOWER
     ),
-    MetricInfo("train/total", "loss", form=".3g", direction=LOWER),
+    MetricInfo("train/loss", "loss", form=".3g", direction=LOWER),
     MetricInfo("score", "score", form=".1f", direction=HIGHER, limits=PERCENT),
     MetricInfo("best_score", "best score", form=".1f", direction=HIGHER, limits=PERCENT),
     # the filter, iteration by iteration
-    MetricInfo("filter/ess", "effective particles", "%", ".0f", factor=100.0, limits=PERCENT),
+    MetricInfo(
+        "filter/ess",
+        "relative effective sample size",
+        "%",
+        ".0f",
+        factor=100.0,
+        limits=PERCENT,
+        meaning="1 / Σw² over the number of particles",
+    ),
     MetricInfo("filter/spread_m", "spread of the centers", "mm", ".1f", factor=1000.0),
     MetricInfo(
         "filter/spread_rad", "spread of the rotations", "degrees", ".1f", factor=180 / math.pi

@@ -221,7 +221,10 @@ class PoseEstimator(Module):
         return {"loss": self.loss(self.train_filter(batch, self, generator), batch, self.model)}
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
-        """Return the sum of the losses' means.
+        """Return the sum of the losses' means, the loss that is minimized.
+
+        It is logged as `train/loss`, its terms as `train/loss_<name>`: `train/loss_chosen` is that
+        of the group `loss`.
 
         Raises:
             FloatingPointError: It is not finite.
@@ -234,9 +237,9 @@ class PoseEstimator(Module):
                 f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
             )
         for name, value in means.items():
-            self.log_scalar(name, value.detach())
+            self.log_scalar(f"loss_{'chosen' if name == 'loss' else name}", value.detach())
         if self._trainer is not None:
-            self.log("train/total", total.detach(), prog_bar=True)
+            self.log("train/loss", total.detach(), prog_bar=True)
             self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
         return total
 

@@ -114,7 +114,7 @@ def flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
 
 def collect_timings(run: Run) -> list[tuple[str, str]]:
     """Return how long things took, in words."""
-    train = run.curves.get("train/total")
+    train = run.curves.get("train/loss")
     out = []
     if train and len(train.steps) > 1:
         pace = sorted(

@@ -35,11 +35,31 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
     curves = {}
     for tag in tags["scalars"]:
         curves[tag] = drop_repeats([(e.step, e.value, e.wall_time) for e in log.Scalars(tag)])
+    curves = rename_losses(curves)
     pictures = []
     for tag in tags["images"]:
         latest = log.Images(tag)[-1]
         pictures.append(StoredImage(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
     return curves, pictures
+
+
+def rename_losses(curves: dict[str, Curve]) -> dict[str, Curve]:
+    """Return curves whose losses have today's names.
+
+    Earlier runs logged the sum as `train/total` and its terms as `train/<name>`.
+    """
+    if "train/total" not in curves or any(tag.startswith("train/loss_") for tag in curves):
+        return curves
+    out = {}
+    for tag, curve in curves.items():
+        name = tag.removeprefix("train/")
+        if name == "total":
+            out["train/loss"] = curve
+        elif name == tag or name == "learning_rate" or name.endswith("_mm"):
+            out[tag] = curve
+        else:
+            out[f"train/loss_{'chosen' if name == 'loss' else name}"] = curve
+    return out
 
 
 def drop_repeats(events: list[tuple[int, float, float]]) -> Curve:

@@ -19,7 +19,7 @@ BELIEF = {
     "Belief near the truth": ("val/belief/mass_01d", "val/belief/mass_2cm"),
     "Coverage of the truth": ("val/belief/coverage_50", "val/belief/coverage_90"),
     "Truth outscored": ("val/belief/truth_outscored", "val/belief/truth_outscored_by_wrong"),
-    "Effective particles": ("val/belief/effective_particles",),
+    "Effective sample size": ("val/belief/effective_particles",),
     "Spread of the centers": ("val/belief/spread_m",),
     "Spread of the rotations": ("val/belief/spread_rad",),
 }
@@ -68,10 +68,13 @@ def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     units = {
         name: name.rpartition("_")[2] for name in own if name.endswith(("_mm", "_px", "_m", "_rad"))
     }
-    names = [name for name in sorted(own, key=lambda name: name != "total") if name not in units]
-    if len(names) == 2:  # the total of one loss is that loss
+    names = [name for name in sorted(own, key=lambda name: name != "loss") if name not in units]
+    if len(names) == 2:  # the sum of one term is that term
         names = names[:1]
-    losses = [Line(name.replace("_", " "), own[name].steps, own[name].values) for name in names]
+    losses = [
+        Line(name.removeprefix("loss_").replace("_", " "), own[name].steps, own[name].values)
+        for name in names
+    ]
     out = [Panel("Training loss", "training step", "", losses)] if losses else []
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)

@@ -88,7 +88,7 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
 def head_lines(run: Run) -> list[Paragraph]:
     """Return what stands below the heading: how far the run is, what it is, where it is."""
     step, _ = read_last_validation(run.curves)
-    train = run.curves.get("train/total")
+    train = run.curves.get("train/loss")
     most = (run.config.get("trainer") or {}).get("max_steps")
     if run.metrics:
         badge, state = Text("tested", "done"), f"on {int(run.metrics.get('instances') or 0)} images"
