@@ -102,7 +102,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line(
             "detach_position",
             f"{short} loss/schedule=none,displacement_only,likelihood_only seed=0,1,2",
-        )
+        ),
     ]
     for models, sweep, ablations in (
         (WITH_POSE, "ablation", TELLING),
@@ -145,12 +145,21 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
 
 def list_units() -> list[Line]:
     """Return the runs of the paper's variant over the unit of its displacement: without training,
-    then memorizing: the filter with a pose at the size of the ablations (a narrower network, ten
-    steps), detectors with 8 particles and 16 channels, for time, and the paper's 30 steps.
+    at the paper's size and at that of the ablations; then memorizing: the filter with a pose at
+    the size of the ablations (a narrower network, ten steps), detectors with 8 particles and 16
+    channels, for time, and the paper's 30 steps.
     """
     untrained = f"experiment=memorize variant=paper {UNTRAINED} callbacks=checkpoints"
     lines = [Line("unit_untrained", f"{FOUR} {untrained} {UNITS} seed=0,1,2")]
     paper = "experiment=memorize ablation=paper callbacks=checkpoints"
+    # what to hold the trained filter with a pose against
+    lines.append(
+        Line(
+            "untrained_small",
+            f"model=patch_pf {paper} sweep=ablation {UNTRAINED} "
+            "model.displacement.unit=half_frame,10,1 seed=0,1,2",
+        )
+    )
     for model in ("patch_pf", "downsized", "cnn_patch"):
         size = (
             "sweep=ablation_detect filter.particles=8 model.net.width=16"
