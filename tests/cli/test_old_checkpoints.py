@@ -4,9 +4,9 @@ import importlib
 
 import pytest
 
-from posefilter.cli.instantiate import accepted
+from posefilter.cli.instantiate import accepted, locate
 from posefilter.cli.recipe import check_recipe
-from posefilter.cli.renamed import ARGUMENTS
+from posefilter.cli.renamed import ARGUMENTS, CLASSES
 from posefilter.errors import UserError
 
 CHAIN = {
@@ -17,6 +17,8 @@ CHAIN = {
     ],
 }
 
+TRANSPORT = "posefilter.filters.transport.OptimalTransport"
+
 
 @pytest.mark.parametrize(
     ("recipe", "told"),
@@ -25,6 +27,10 @@ CHAIN = {
         ({"choices": {}, "settings": {"rung": "c2_glimpse"}}, "rung is now ablation"),
         ({"choices": {"deviation": "pose_pf/ours"}, "settings": {}}, "deviation is now preset"),
         ({"choices": {"place_gradient": "flows"}, "settings": {}}, "is now model.detach_position"),
+        (
+            {"choices": {}, "settings": {"filter": {"resample": {"_target_": TRANSPORT}}}},
+            f"({TRANSPORT} is now posefilter.filters.transport.SampledTransport)",
+        ),
         (
             {"choices": {}, "settings": {"filter": {"refine": CHAIN}}},
             "(filter.refine.components[1].rounds is now iterations)",
@@ -52,3 +58,13 @@ def test_a_class_takes_its_arguments_by_todays_names_alone(place: str) -> None:
     known, _ = accepted(getattr(importlib.import_module(f"posefilter.{module}"), name))
     assert set(ARGUMENTS[place].values()) <= set(known)
     assert not set(ARGUMENTS[place]) & set(known)
+
+
+@pytest.mark.parametrize("old", sorted(CLASSES))
+def test_an_old_class_is_answered_by_the_new_one_which_is_there(old: str) -> None:
+    with pytest.raises(UserError) as refusal:
+        locate(f"posefilter.{old}", "filter.resample")
+    assert str(refusal.value).endswith(
+        f"_target_=posefilter.{old}: is now posefilter.{CLASSES[old]}"
+    )
+    assert locate(f"posefilter.{CLASSES[old]}", "filter.resample").__name__ in CLASSES[old]

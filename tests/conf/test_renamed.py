@@ -13,7 +13,10 @@ HOME = Path(__file__).parents[2]
 RENAMED = {
     "initialise=uniform": "filter/initialize=uniform",
     "initialize=informed": "filter/initialize=informed",
-    "reweigh=annealed": "filter/reweight=annealed",
+    "reweigh=annealed": "filter/reweight=current_likelihood",
+    "filter/reweight=tempered,sequential": "filter/reweight=likelihood_ratio,sequential_bayes",
+    "filter/resample=transport": "filter/resample=optimal_transport_sampled",
+    "filter/resample=ensemble": "filter/resample=optimal_transport",
     "propose=still": "filter/propagate=identity",
     "schedule=pixels": "filter/schedule=pixels",
     "resample=never": "filter/resample=none",

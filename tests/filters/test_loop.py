@@ -14,7 +14,7 @@ from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import BelowESS, NoResampling, Soft, Systematic
 from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
 from posefilter.filters.schedule import Constant, Geometric
-from posefilter.filters.transport import Ensemble, OptimalTransport
+from posefilter.filters.transport import EnsembleTransform, SampledTransport
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import distinct
 from posefilter.protocols import Resample
@@ -72,7 +72,7 @@ def build(
 GOALS = torch.tensor([[1.0, 2.0], [-1.0, 0.5], [0.0, 0.0]])
 every = pytest.mark.parametrize(
     "resample",
-    [Systematic(), Soft(), BelowESS(Systematic()), OptimalTransport(), Ensemble()],
+    [Systematic(), Soft(), BelowESS(Systematic()), SampledTransport(), EnsembleTransform()],
     ids=lambda x: type(x).__name__,
 )
 
@@ -189,7 +189,7 @@ def test_gradients_flow_as_far_as_the_pieces_let_them() -> None:
         error = (trace.belief.best[:, :2, 3] - GOALS - 1).square().sum()
         return torch.autograd.grad(error, method.pull)[0]
 
-    for resample in (Systematic(), Soft(), OptimalTransport(), Ensemble(), NoResampling()):
+    for resample in (Systematic(), Soft(), SampledTransport(), EnsembleTransform(), NoResampling()):
         found = slope(resample)
         assert found.isfinite()
         assert found.abs() > 1e-4

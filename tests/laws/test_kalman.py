@@ -22,7 +22,7 @@ from posefilter.filters.resample import (
 )
 from posefilter.filters.reweight import Annealed, Sequential
 from posefilter.filters.schedule import Constant
-from posefilter.filters.transport import Ensemble, OptimalTransport
+from posefilter.filters.transport import EnsembleTransform, SampledTransport
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.protocols import Propagate, Resample, Reweight
 from posefilter.types import ParticleOutput, Particles, Resampled, Step, Trace
@@ -132,7 +132,7 @@ def errors(trace: Trace) -> Tensor:
         (BelowESS(Systematic(), 0.5), 1500, 32),
         (BelowESS(Soft(0.5), 0.5), 3000, 32),
         (NoResampling(), 20000, 8),
-        (OptimalTransport(0.02, 25), 80, 16),
+        (SampledTransport(0.02, 25), 80, 16),
     ],
     ids=lambda x: type(x).__name__ if not isinstance(x, int) else str(x),
 )
@@ -143,7 +143,7 @@ def test_mean_spread_and_evidence_are_kalmans(
 
 
 def test_a_transported_ensemble_follows_kalman_a_little_too_sure() -> None:
-    particles = run(Ensemble(0.01, 25), 150, 8).particles[-1]
+    particles = run(EnsembleTransform(0.01, 25), 150, 8).particles[-1]
     m, s, _ = kalman()
     weights = particles.log_weights.exp()[..., None]
     mean = (weights * particles.state).sum(1, keepdim=True)

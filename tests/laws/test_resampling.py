@@ -19,7 +19,7 @@ from posefilter.filters.resample import (
     effective_sample_size,
     inverse_cdf,
 )
-from posefilter.filters.transport import Ensemble, OptimalTransport, sinkhorn
+from posefilter.filters.transport import EnsembleTransform, SampledTransport, sinkhorn
 from posefilter.geometry.pose import is_rigid, make_pose
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
@@ -33,8 +33,8 @@ RESAMPLERS = {
     "multinomial": Multinomial(),
     "soft": Soft(0.5),
     "below ess": BelowESS(Systematic(), 0.5),
-    "transport": OptimalTransport(),
-    "ensemble": Ensemble(),
+    "sampled transport": SampledTransport(),
+    "ensemble transform": EnsembleTransform(),
 }
 every = pytest.mark.parametrize("resampler", RESAMPLERS.values(), ids=RESAMPLERS.keys())
 
@@ -57,7 +57,7 @@ def parents_share(resampled: Resampled, count: int) -> Tensor:
 @every
 @pytest.mark.parametrize("count", [40, 25, 90])
 def test_weights_are_kept_in_expectation(resampler: Resample, count: int) -> None:
-    rows, noise = (200, 0.015) if isinstance(resampler, OptimalTransport) else (4000, 0.004)
+    rows, noise = (200, 0.015) if isinstance(resampler, SampledTransport) else (4000, 0.004)
     particles = cloud_of(rows, 40)
     resampled = resampler(particles, count, SPACE, Generator().manual_seed(1))
     assert resampled.ancestors.shape == resampled.log_weights.shape == (rows, count)
@@ -139,7 +139,7 @@ def test_below_ess_decides_for_each_image() -> None:
     particles = cloud_of(2, 20)._replace(
         log_weights=torch.log_softmax(torch.cat([rich, poor]) + 0.1 * torch.randn(2, 20), 1)
     )
-    for inner in (Systematic(), Ensemble()):
+    for inner in (Systematic(), EnsembleTransform()):
         resampled = BelowESS(inner, 0.5)(particles, 20, SPACE, Generator().manual_seed(0))
         assert torch.equal(resampled.ancestors[0], torch.arange(20))
         assert torch.equal(resampled.log_weights[0], particles.log_weights[0])
@@ -199,7 +199,7 @@ def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
     logits = particles.log_weights.clone().requires_grad_()
     state = particles.state.clone().requires_grad_()
     log_w = torch.log_softmax(logits, 1)
-    resampled = Ensemble(0.1, 5)(
+    resampled = EnsembleTransform(0.1, 5)(
         particles._replace(log_weights=log_w, state=state), 30, SPACE, Generator()
     )
     moved = inherit(state, resampled, SPACE)
@@ -214,10 +214,10 @@ def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
 def test_transport_moves_particles_less_than_a_shuffle() -> None:
     particles = cloud_of(8, 100)
     moved = {}
-    for name in ("multinomial", "transport"):
+    for name in ("multinomial", "sampled transport"):
         resampled = RESAMPLERS[name](particles, 100, SPACE, Generator().manual_seed(0))
         moved[name] = (inherit(particles.state, resampled) - particles.state).norm(dim=-1).mean()
-    assert moved["transport"] < 0.6 * moved["multinomial"]
+    assert moved["sampled transport"] < 0.6 * moved["multinomial"]
 
 
 @every

@@ -354,7 +354,7 @@ def test_components_that_do_not_fit_are_refused_before_any_training(
     assert not (tmp_path / "checkpoints").exists()
 
 
-@pytest.mark.parametrize("resample", ["transport", "ensemble"])
+@pytest.mark.parametrize("resample", ["optimal_transport_sampled", "optimal_transport"])
 def test_particles_are_resampled_by_optimal_transport(
     resample: str, tiny_job, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from posefilter.cli.renamed import rename_argument
+from posefilter.cli.renamed import rename_argument, rename_class
 from posefilter.cli.trust import (
     Scope,
     check_name,
@@ -113,6 +113,9 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
     Raises UserError where it may not, or cannot, be imported. Nothing is imported for a name that
     is not allowed.
     """
+    new = rename_class(name)
+    if new is not None:
+        raise UserError(f"{where}._target_={name}: is now {new}")
     check_name(name, where, scope)
     module, _, attribute = name.rpartition(".")
     try:

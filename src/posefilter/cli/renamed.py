@@ -61,7 +61,16 @@ _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.l
 _CHOICES = {
     "filter": {"pose_paper": "pose filter.particles=1000 filter.steps=100"},
     "filter/estimate": {"best": "argmax"},
-    "filter/resample": {"never": "none"},
+    "filter/resample": {
+        "never": "none",
+        "transport": "optimal_transport_sampled",
+        "ensemble": "optimal_transport",
+    },
+    "filter/reweight": {
+        "annealed": "current_likelihood",
+        "tempered": "likelihood_ratio",
+        "sequential": "sequential_bayes",
+    },
     "filter/propagate": {"still": "identity"},
     "model/displacement": {"held": "gated"},
     "model/encoder": {
@@ -111,6 +120,11 @@ _CHOICES = {
         "m12_held": "m12_gated",
         "m13_rate": "m13_scheduler",
     },
+}
+# classes, by their place below posefilter
+CLASSES = {
+    "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
+    "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
 }
 _RELEVANCE = {"relevance": "relevance_weight"}
 # arguments of classes, by the class's place below posefilter
@@ -222,11 +236,24 @@ def rename_argument(target: object, name: str) -> str | None:
     return ARGUMENTS.get(str(target).removeprefix("posefilter."), {}).get(name)
 
 
+def rename_class(target: object) -> str | None:
+    """Return what a class is called today; None where its name has not changed.
+
+    Args:
+        target: The class, as `_target_` named it.
+    """
+    new = CLASSES.get(str(target).removeprefix("posefilter."))
+    return new and f"posefilter.{new}"
+
+
 def _find_argument(node: Any, place: str) -> tuple[str, str] | None:
-    """Return the first argument with a name of before in settings, and today's."""
+    """Return the first class or argument with a name of before in settings, and today's."""
     if isinstance(node, list):
         pairs = [(f"{place}[{i}]", value) for i, value in enumerate(node)]
     elif isinstance(node, Mapping):
+        known = rename_class(node.get("_target_"))
+        if known is not None:
+            return str(node["_target_"]), known
         for name in map(str, node):
             new = rename_argument(node.get("_target_"), name)
             if new is not None:

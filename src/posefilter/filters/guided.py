@@ -40,8 +40,8 @@ class Guided:
 
     The first stage of an auxiliary particle filter (Pitt and Shephard 1999). The weighted
     distribution is unchanged: relevant regions get more children, each of less weight. This holds
-    where weights are carried on (filter/reweight=tempered, sequential). The choice annealed
-    discards them, so there it only concentrates the search.
+    where weights are carried on (filter/reweight=likelihood_ratio, sequential_bayes). The choice
+    current_likelihood discards them, so there it only concentrates the search.
 
     Args:
         resampler: The scheme that draws the ancestors.

@@ -8,6 +8,8 @@ from torch import Tensor
 class Sequential:
     """Bayes' rule: multiply the weights by the likelihood (Gordon et al. 1993).
 
+    The choice `filter/reweight=sequential_bayes`.
+
     Each step counts as an independent observation, as in a sequence of images. If all T steps
     measure one image, its evidence counts T times: the mode is kept, but the belief is too narrow
     (by sqrt(T) for a Gaussian).
@@ -21,6 +23,9 @@ class Sequential:
 class Annealed:
     """Weights from this step's likelihood alone; earlier weights are discarded.
 
+    The choice `filter/reweight=current_likelihood`. There is no temperature: what falls over the
+    steps is the schedule's noise level.
+
     As in the annealed particle filter (Deutscher, Blake and Reid 2000). It is a search: particles
     concentrate where the likelihood was high, and the likelihood counts there again. Weights rank
     particles and are no estimate of posterior mass.
@@ -33,6 +38,8 @@ class Annealed:
 
 class TemperedSMC:
     """Multiply the weights by the *ratio* of the likelihoods of a particle and of its ancestor.
+
+    The choice `filter/reweight=likelihood_ratio`.
 
     A sequential Monte Carlo sampler (Del Moral, Doucet and Jasra 2006) in which each move serves as
     its own backward kernel. The image's evidence counts once, however many steps and noise levels

@@ -34,12 +34,13 @@ def sinkhorn(cost: Tensor, log_a: Tensor, log_b: Tensor, epsilon: float, iterati
     return kernel + f[..., None] + g[:, None]
 
 
-class OptimalTransport:
+class SampledTransport:
     """Draw each child's ancestor from its row of the plan that carries the weights to equal ones.
 
-    Children's targets are an even selection of the particles, so an ancestor is mostly the particle
-    itself or a neighbor. The plan is the coupling of Reich (2013), regularized by its entropy
-    (Cuturi 2013).
+    The choice `filter/resample=optimal_transport_sampled`. It copies particles, where the ensemble
+    transform mixes them. Children's targets are an even selection of the particles, so an ancestor
+    is mostly the particle itself or a neighbor. The plan is the coupling of Reich (2013),
+    regularized by its entropy (Cuturi 2013).
 
     Args:
         epsilon: Regularization, over the mean squared distance.
@@ -79,10 +80,11 @@ class OptimalTransport:
         return sinkhorn(cost, log_a, log_b, self.epsilon, self.iterations)
 
 
-class Ensemble(OptimalTransport):
+class EnsembleTransform(SampledTransport):
     """The ensemble transform: each child is the mean of its row of the plan (Reich 2013).
 
-    With the entropic plan it is differentiable (Corenflos et al. 2021). The weighted mean is exact
+    With the entropic plan it is differentiable: the optimal-transport resampling of Corenflos et
+    al. (2021), the choice `filter/resample=optimal_transport`. The weighted mean is exact
     (on poses, that of the space). The covariance shrinks with epsilon, so the filter lags behind a
     moving target.
     """
