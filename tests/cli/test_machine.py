@@ -1,11 +1,15 @@
 """What is settled before a run: memory that stays where it is."""
 
+import multiprocessing
 import os
 import platform
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
+
+from posefilter.cli.machine import settle_processes
 
 TEN_LARGE = """
 import resource, sys, torch
@@ -38,3 +42,17 @@ def faults(how: str) -> int:
 )
 def test_freed_memory_is_kept_for_the_next_tensor() -> None:
     assert faults("keep") < faults("plain") / 5
+
+
+def test_a_job_in_a_worker_of_joblib_can_start_processes_of_its_own() -> None:
+    """As jobs of `hydra/launcher=joblib` do that render their scenes."""
+    loky = pytest.importorskip("joblib.externals.loky", reason="pip install 'posefilter[sweep]'")
+    with loky.ProcessPoolExecutor(1) as pool:
+        assert pool.submit(_run_settled).result() == ("loky", 7)
+
+
+def _run_settled() -> tuple[str, int]:
+    before = multiprocessing.get_start_method()
+    settle_processes()
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return before, pool.submit(abs, -7).result()

@@ -1,6 +1,7 @@
 """Threads, seeds, and what to remember of the machine and the code that made a result."""
 
 import ctypes
+import multiprocessing
 import platform
 import subprocess
 from importlib import metadata
@@ -31,9 +32,20 @@ def settle(threads: int | None, seed: int) -> None:
     what is not explicit.
     """
     keep_freed_memory()
+    settle_processes()
     torch.set_num_threads(threads or min(8, torch.get_num_threads()))
     cv2.setNumThreads(1)
     lightning.seed_everything(seed, workers=True, verbose=False)
+
+
+def settle_processes() -> None:
+    """Start processes in the system's usual way where a launcher has put another in its place.
+
+    joblib's workers make `loky` the default, by name; processes that they spawn do not know it.
+    """
+    usual = multiprocessing.get_all_start_methods()
+    if multiprocessing.get_start_method(allow_none=True) not in (None, *usual):
+        multiprocessing.set_start_method(usual[0], force=True)
 
 
 def keep_freed_memory() -> bool:
