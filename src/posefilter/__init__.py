@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from posefilter import figures
     from posefilter.api import build, build_data, compose, load
-    from posefilter.belief import Belief, Mode
+    from posefilter.belief import Belief, Mode, PoseSet
     from posefilter.cli.trust import trust
     from posefilter.confidence.verdicts import Costs
     from posefilter.errors import UserError
@@ -35,6 +35,7 @@ __all__ = [
     "Costs",
     "Estimator",
     "Mode",
+    "PoseSet",
     "Result",
     "TrackResult",
     "Tracker",
@@ -54,6 +55,7 @@ _HOMES = {
     "Costs": "confidence.verdicts",
     "Estimator": "estimator",
     "Mode": "belief",
+    "PoseSet": "belief",
     "Result": "estimator",
     "TrackResult": "tracking.track",
     "Tracker": "tracking.tracker",

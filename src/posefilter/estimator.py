@@ -1,5 +1,6 @@
 """From images to poses in one call: what `posefilter.load` returns."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,8 +10,11 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from posefilter.belief import Belief, Mode
+from posefilter.belief import Belief, Mode, PoseSet
+from posefilter.belief.summaries import check_share
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.evidence import measure_depth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
@@ -45,6 +49,9 @@ class Result:
         model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
         uncalibrated: Why there is no probability; empty where there is one.
+        conformal: What `conformal_set` goes by; None where the calibration has none.
+        surface: The share of the object's surface points at which the depth shows a surface, by
+            which the group of a conformal set is chosen.
     """
 
     object: str
@@ -58,6 +65,8 @@ class Result:
     model: ObjectModel
     costs: Costs = field(default_factory=Costs, kw_only=True)
     uncalibrated: str = field(default="", kw_only=True)
+    conformal: Conformal | None = field(default=None, kw_only=True)
+    surface: float = field(default=math.nan, kw_only=True)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -82,6 +91,26 @@ class Result:
     def modes(self) -> tuple[Mode, ...]:
         """The belief's modes, the heaviest first; see `Belief.modes`."""
         return self.belief.modes
+
+    def conformal_set(self, level: float = 0.9) -> PoseSet:
+        """Return a set of poses that holds the truth with a guaranteed probability.
+
+        Of frames like the calibration's that show the object, at least `level` have the truth in
+        this set, whatever the belief is worth; see `posefilter.confidence.conformal`.  It is the
+        set of all poses where calibration frames are too few for the level.
+
+        Args:
+            level: Least probability, in [0, 1].
+
+        Raises:
+            UserError: The checkpoint was not calibrated for sets.
+        """
+        if self.conformal is None:
+            why = self.uncalibrated or "it was calibrated by an earlier version, without sets"
+            raise UserError(f"{self.object}: has no conformal sets ({why})")
+        check_share(level)
+        limit = self.conformal.find_limit(level, self.surface)
+        return self.belief.level_set(level, -self.belief.differential_entropy - limit)
 
     def draw_overlay(
         self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
@@ -142,6 +171,7 @@ class Run(NamedTuple):
     trace: Trace
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
+    surface: torch.Tensor | None = None  # (B,) evidence; None where there is no probability
 
 
 class Estimator:
@@ -232,7 +262,10 @@ class Estimator:
                 found = method.assess(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found))
+            surface = None
+            if found is not None:
+                surface = measure_depth(trace.belief.best, batch, method.model)["surface"]
+            runs.append(Run(method, batch, trace, seconds, found, surface))
         return runs
 
 
@@ -250,6 +283,7 @@ def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[lis
 def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
     """Return what a run amounts to for one image of its batch."""
     model, belief, found = run.method.model, run.trace.belief, run.found
+    calibration = run.method.calibration
     weights = belief.log_weights[image].double().cpu().exp().numpy()
     center = model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
@@ -266,6 +300,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
             float(model.radius),
             float(model.diameter),
             model.name,
+            model.symmetries.detach().cpu().double().numpy(),
         ),
         warnings=find_warnings(
             pose,
@@ -277,6 +312,8 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         model=model,
         costs=costs or Costs(),
         uncalibrated="" if found is not None else explain_missing(run.method),
+        conformal=None if found is None or calibration is None else calibration.conformal,
+        surface=math.nan if run.surface is None else float(run.surface[image]),
     )
 
 

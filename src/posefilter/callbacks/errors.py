@@ -87,6 +87,9 @@ def measure_batch(
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
     scores, times = trace.belief.score.tolist(), [seconds] * count
     found = [values.tolist() for values in method.last_assessment(count)]
+    if "pose" in method.capabilities:
+        at_truth = method.scores["credibility"].last()
+        found += [at_truth.log_density.tolist(), at_truth.rank.tolist()]
     return make_rows(records, batch, errors, shares, scores, times, found)
 
 
@@ -101,8 +104,8 @@ def make_rows(
 ) -> list[ImageError]:
     """Return a row an image.
 
-    errors: ADD, ADD-S and the diameters, B numbers each [mm]; found: presence and probability
-    likewise, or nothing.
+    errors: ADD, ADD-S and the diameters, B numbers each [mm]; found: presence, probability, and the
+    belief's log density and rank at the truth likewise, or the first of these, or nothing.
     """
     seen = batch.visibility.tolist()
     return [

@@ -26,6 +26,7 @@ from posefilter.data.dataset import FrameDataset
 from posefilter.data.loaders import make_loader
 from posefilter.errors import UserError
 from posefilter.metrics.confidence import Confidence
+from posefilter.metrics.credibility import score_truth
 from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator
@@ -104,7 +105,7 @@ def collect_frames(
         absent: Frames without.
         shown: Draw a bar.
     """
-    evidence, there, right = [], [], []
+    evidence, there, right, surprise = [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     batches = [
         (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
@@ -117,7 +118,9 @@ def collect_frames(
             evidence.append(method.collect_evidence(trace, seen))
         there.append(np.full(len(truth), is_there))
         right.append(is_there & is_right(method, trace.belief.best.cpu(), truth).numpy())
-    return make_frames(evidence, there, right)
+        own = score_truth(trace.belief, truth, method.model).surprise.numpy() if is_there else None
+        surprise.append(np.full(len(truth), np.nan) if own is None else own)
+    return make_frames(evidence, there, right, surprise)
 
 
 def is_right(method: PoseEstimator, best: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -152,6 +155,9 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
         ("of these, the pose is right", str(counts["right"])),
         ("frames without", str(counts["absent"])),
     ]
+    if calibration.conformal is not None:
+        shown = " and ".join(str(len(own)) for own in calibration.conformal.surprises)
+        rows.append(("of those with it, little of it and much of it seen", shown))
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
     if job.cfg.console != JSON:

@@ -1,5 +1,6 @@
 """Find the object, or several, in one photograph: poses, a picture, and beliefs."""
 
+import math
 import shlex
 from dataclasses import asdict
 from pathlib import Path
@@ -164,8 +165,22 @@ def print_result(result: Result) -> None:
         print(f"{result.describe()}, {result.seconds:.2f} s")
     else:
         print(f"{result.describe()}, at {place} mm, {result.seconds:.2f} s")
+    if result.verdict != "absent":
+        print(f"the belief: {result.belief.uncertainty().describe()}")
     for warning in result.warnings:
         print(f"warning: {warning}")
+
+
+def describe_uncertainty(result: Result) -> dict[str, Any]:
+    """Return how far the truth may be, in numbers and words."""
+    sure = result.belief.uncertainty()
+    return {
+        "in_words": sure.describe(),
+        "level": sure.level,
+        "shift_mm": 1000 * sure.shift,
+        "turn_degrees": math.degrees(sure.turn),
+        "of_mode_with_mass": sure.mass,
+    }
 
 
 def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]:
@@ -192,8 +207,13 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
             "mean": belief.mean.tolist(),
             "covariance": belief.covariance.tolist(),
             "covariance_is": _COVARIANCE,
+            "uncertainty": describe_uncertainty(result),
             "modes": [
-                {"camera_from_object": mode.pose.tolist(), "mass": mode.mass}
+                {
+                    "camera_from_object": mode.pose.tolist(),
+                    "mass": mode.mass,
+                    "equivalent_to": mode.equivalent,
+                }
                 for mode in belief.modes
             ],
         },

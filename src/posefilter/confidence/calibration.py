@@ -17,11 +17,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
 
 LIMIT = 3.0  # standard deviations
 COUNTS = ("right", "wrong", "absent")
 _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
+_MOST_GROUPS, _MOST_SURPRISES = 16, 100_000
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
@@ -52,6 +54,7 @@ class Calibration:
         counts: Calibration frames: right, wrong, absent.
         source: The kind of data that they are of, such as `fat`.
         quality: Of held-out predictions on those frames, by cross-validation.
+        conformal: What sets of poses with a guaranteed coverage go by; None: of an earlier version.
     """
 
     features: tuple[str, ...]
@@ -62,6 +65,7 @@ class Calibration:
     counts: Mapping[str, int]
     source: str
     quality: Mapping[str, float]
+    conformal: Conformal | None = None
 
     def assess(self, evidence: Mapping[str, Tensor]) -> Assessment:
         """Return the probabilities of estimates.
@@ -100,6 +104,9 @@ class Calibration:
         for name in ("presence", "success"):
             one: Logistic = getattr(self, name)
             plain[name] = {"weights": list(one.weights), "bias": one.bias}
+        if self.conformal is not None:
+            surprises = [list(own) for own in self.conformal.surprises]
+            plain["conformal"] = {"edges": list(self.conformal.edges), "surprises": surprises}
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
@@ -124,7 +131,7 @@ def read_calibration(content: Any, said: str) -> Calibration:
 
 def _read(content: Any) -> Calibration:
     names = {field.name for field in fields(Calibration)}
-    if not isinstance(content, dict) or set(content) != names:
+    if not isinstance(content, dict) or set(content) | {"conformal"} != names:
         raise ValueError(f"should hold {', '.join(sorted(names))}, nothing else")
     features = content["features"]
     good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
@@ -156,6 +163,7 @@ def _read(content: Any) -> Calibration:
         dict(counts),
         source,
         dict(zip(quality, numbers, strict=True)),
+        _conformal(content.get("conformal")),
     )
 
 
@@ -164,6 +172,25 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
         raise ValueError(f"should have weights and bias in {name}")
     weights = _numbers(content["weights"], count, f"{name}'s weights", least=0.0)
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
+
+
+def _conformal(content: Any) -> Conformal | None:
+    if content is None:
+        return None
+    if not isinstance(content, dict) or set(content) != {"edges", "surprises"}:
+        raise ValueError("should have edges and surprises in conformal")
+    groups = content["surprises"]
+    if not isinstance(groups, list) or not 1 <= len(groups) <= _MOST_GROUPS:
+        raise ValueError(f"should have 1 to {_MOST_GROUPS} groups in conformal")
+    edges = _numbers(content["edges"], len(groups) - 1, "conformal's edges")
+    read = []
+    for one in groups:
+        if not isinstance(one, list) or len(one) > _MOST_SURPRISES:
+            raise ValueError("has a group of conformal that is none")
+        read.append(_numbers(one, len(one), "conformal's surprises"))
+    if any(list(one) != sorted(one) for one in [edges, *read]):
+        raise ValueError("has numbers of conformal that do not rise")
+    return Conformal(edges, tuple(read))
 
 
 def _numbers(values: Any, count: int, name: str, least: float = -_LARGEST) -> tuple[float, ...]:

@@ -10,12 +10,14 @@ References:
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from posefilter.confidence.calibration import LIMIT, Assessment, Calibration, Logistic
+from posefilter.confidence.conformal import fit_conformal
 from posefilter.errors import UserError
 
 FEWEST = 10  # frames with the object, and without
@@ -29,21 +31,27 @@ class Frames(NamedTuple):
     evidence: np.ndarray  # (n, F)
     there: np.ndarray  # (n,) bool: the object is in the image
     right: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
+    # (n,) of the true pose, NaN where the object is not in the image [nat]; None: not measured
+    surprise: np.ndarray | None = None
 
     def select(self, index: np.ndarray) -> "Frames":
         """Return some of the frames."""
-        return Frames(self.features, self.evidence[index], self.there[index], self.right[index])
+        surprise = None if self.surprise is None else self.surprise[index]
+        own = (self.evidence[index], self.there[index], self.right[index])
+        return Frames(self.features, *own, surprise)
 
 
 def make_frames(
     evidence: Sequence[Mapping[str, torch.Tensor]],
     there: Sequence[np.ndarray],
     right: Sequence[np.ndarray],
+    surprise: Sequence[np.ndarray],
 ) -> Frames:
     """Return the frames of batches of evidence, each (B,) by name."""
     names = tuple(evidence[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in evidence]
-    return Frames(names, np.concatenate(rows), np.concatenate(there), np.concatenate(right))
+    parts = (np.concatenate(one) for one in (rows, there, right, surprise))
+    return Frames(names, *parts)
 
 
 def fit_calibration(
@@ -70,7 +78,12 @@ def fit_calibration(
             raise UserError(
                 f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
             )
-    return _fit(frames, source, quality or {})
+    fitted = _fit(frames, source, quality or {})
+    if frames.surprise is None or "surface" not in frames.features:
+        return fitted
+    surface = frames.evidence[:, frames.features.index("surface")]
+    own = frames.there
+    return replace(fitted, conformal=fit_conformal(frames.surprise[own], surface[own]))
 
 
 def _fit(frames: Frames, source: str, quality: Mapping[str, float]) -> Calibration:

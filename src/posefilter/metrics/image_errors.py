@@ -31,6 +31,8 @@ class ImageError(NamedTuple):
     seconds: float
     presence: float = math.nan  # probability that the object is there
     probability: float = math.nan  # that it is there and the pose right
+    log_density: float = math.nan  # of the belief at the truth [nat]
+    credible_rank: float = math.nan  # share of the belief that is denser than the truth
 
 
 def write_errors(path: Path, rows: Sequence[ImageError]) -> None:

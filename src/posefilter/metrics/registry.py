@@ -91,6 +91,21 @@ def _describe_bop(name: str, unit: str, thresholds: str) -> tuple[MetricInfo, ..
     )
 
 
+def _describe_credible() -> tuple[MetricInfo, ...]:
+    return tuple(
+        MetricInfo(
+            f"credibility/coverage_{level}",
+            f"truths within the {level} % credible set",
+            "%",
+            ".0f",
+            limits=PERCENT,
+            short=f"{level} % set",
+            meaning=f"{level} where calibrated; fewer: too sure; a set of highest density",
+        )
+        for level in (50, 80, 90, 95)
+    )
+
+
 _METRICS = (
     MetricInfo(
         "instances", "instances", form=".0f", meaning="objects in images, tested one by one"
@@ -207,6 +222,24 @@ _METRICS = (
         short="90 % region",
         meaning="90 where calibrated; fewer: too sure",
     ),
+    MetricInfo(
+        "credibility/log_density",
+        "log density of the truth, mean",
+        "nat",
+        ".2f",
+        HIGHER,
+        short="log density",
+        meaning="per cubic meter, and per unit of rotation where SO(3) has the volume pi²",
+    ),
+    MetricInfo(
+        "credibility/log_density_p50",
+        "log density of the truth, middle image",
+        "nat",
+        ".2f",
+        HIGHER,
+        meaning="the same, at half of the images or more",
+    ),
+    *_describe_credible(),
     MetricInfo(
         "belief/truth_outscored",
         "images in which a particle outscores the truth",

@@ -152,6 +152,7 @@ class PoseEstimator(Module):
         from posefilter.metrics.bop import BopErrors  # torchmetrics: prediction needs none
         from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
         from posefilter.metrics.confidence import Confidence
+        from posefilter.metrics.credibility import Credibility
         from posefilter.metrics.parts import PartIoU
         from posefilter.metrics.visibility import ErrorsByVisibility
 
@@ -164,6 +165,7 @@ class PoseEstimator(Module):
             metrics["bop"] = BopErrors([self.model])
             metrics["by_visibility"] = ErrorsByVisibility([self.model])
             metrics["belief"] = BeliefQuality([self.model])
+            metrics["credibility"] = Credibility()
             metrics["confidence"] = Confidence()
             if self.model.parts:
                 metrics["parts"] = PartIoU(self.model)
@@ -315,6 +317,8 @@ class PoseEstimator(Module):
 
     def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors to the metrics."""
+        from posefilter.metrics.credibility import score_truth  # torchmetrics
+
         height, width = batch.rgb.shape[-2:]
         truth = box_of_pose(
             batch.camera_from_object, self.model.hull, batch.intrinsics, height, width
@@ -332,6 +336,8 @@ class PoseEstimator(Module):
                 trace.belief.best, batch.camera_from_object, batch.visibility
             )
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
+            seen = score_truth(trace.belief, batch.camera_from_object, self.model)
+            self.scores["credibility"].update(seen, batch.visibility)
             self.judge_confidence(trace, batch, there=True)
         if "parts" in self.scores:
             self.scores["parts"].update(trace.belief.best, batch)
@@ -395,7 +401,8 @@ class PoseEstimator(Module):
         out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
         known = self.calibration is not None and "confidence" in self.scores
         out["confidence"] = self.scores["confidence"].compute() if known else None
-        for name, needed in (("by_visibility", "poses"), ("parts", "parts")):
+        blocks = ("credibility", "poses"), ("by_visibility", "poses"), ("parts", "parts")
+        for name, needed in blocks:
             out[name] = self.scores[name].compute() if needed in self.scores else None
         return out
 

@@ -23,7 +23,7 @@ ROWS = (
 )  # fmt: skip
 
 
-BELIEF = tuple(key for key in METRICS if key.startswith("belief/"))
+BELIEF = tuple(key for key in METRICS if key.startswith(("belief/", "credibility/")))
 
 
 BY_VISIBILITY = ("add/auc", "add/recall_01d", "add/median_mm", "add_s/auc")

@@ -1,0 +1,292 @@
+"""A belief over one object's pose in one image: weighted poses, and what they amount to."""
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from posefilter.belief.sets import PoseSet, find_least
+from posefilter.belief.storage import read_arrays, write_arrays
+from posefilter.belief.summaries import (
+    AXES,
+    Marginal,
+    Mode,
+    Projection,
+    Uncertainty,
+    check_share,
+    measure_uncertainty,
+    project_belief,
+)
+from posefilter.errors import UserError
+from posefilter.filters.modes import APART, Modes, find_pose_modes
+from posefilter.geometry.pose import is_rigid, origin_of
+from posefilter.geometry.pose_density import (
+    PoseDensity,
+    fit_density,
+    log_density,
+    log_density_held_out,
+)
+from posefilter.geometry.pose_statistics import covariance_about, twist_between
+from posefilter.geometry.spaces import PoseSpace
+
+_MOST_SYMMETRIES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """Weighted poses of one object in one image.
+
+    The batch of tensors that a filter itself returns is `posefilter.types.Belief`.
+
+    Attributes:
+        samples: Poses (N, 4, 4) camera_from_object, float64 [m].
+        weights: Their weights (N,), float64; they sum to 1.
+        center: The object's center (3,) in its own frame [m], about which poses turn.
+        radius: Half the diagonal of the object's bounding box [m]; a turn counts as the shift that
+            it gives at this distance.
+        diameter: The largest distance between two points of the object [m].
+        object: The object's name.
+        symmetries: Its symmetries (S, 4, 4) object_from_object, a group, the identity first. Poses
+            that they make of one another are equivalent, and share the density equally.
+    """
+
+    samples: np.ndarray
+    weights: np.ndarray
+    center: np.ndarray
+    radius: float
+    diameter: float
+    object: str = ""
+    symmetries: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
+
+    def __post_init__(self) -> None:
+        """Check shapes.
+
+        Raises:
+            UserError: The arrays do not fit each other, or hold no poses and weights.
+        """
+        count = len(self.weights)
+        if self.samples.shape != (count, 4, 4) or self.weights.shape != (count,) or not count:
+            raise UserError(
+                f"belief: samples {self.samples.shape} and weights {self.weights.shape} should be "
+                f"(N, 4, 4) and (N,)"
+            )
+        total = float(self.weights.sum())
+        if not (np.isfinite(total) and abs(total - 1) < 1e-3 and (self.weights >= 0).all()):
+            raise UserError(f"belief: the weights should be positive and sum to 1, not {total:.6g}")
+        if not np.isfinite(self.samples).all() or not is_rigid(torch.from_numpy(self.samples)):
+            raise UserError("belief: the samples should be rigid transforms")
+        group = self.symmetries
+        if group.shape[1:] != (4, 4) or not 1 <= len(group) <= _MOST_SYMMETRIES:
+            raise UserError(
+                f"belief: symmetries {group.shape} should be (S, 4, 4), {_MOST_SYMMETRIES} at most"
+            )
+        if not np.isfinite(group).all() or not is_rigid(torch.from_numpy(group)):
+            raise UserError("belief: the symmetries should be rigid transforms")
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """The mean pose (4, 4): the mean of the centers, and the chordal mean of the rotations.
+
+        Between two modes it is a pose that no particle holds; see `modes`.
+        """
+        return self._mean(*self._tensors).numpy()
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """The covariance (6, 6) of the particles' twists about the mean pose.
+
+        Rows and columns are [x, y, z, rx, ry, rz]: the shift of the object's center in the camera's
+        axes [m], then the rotation vector about that center in the object's own axes [rad].  Square
+        roots of the diagonal are standard deviations.
+        """
+        samples, weights = self._tensors
+        mean = torch.from_numpy(self.mean)
+        return covariance_about(mean, samples, weights, torch.from_numpy(self.center)).numpy()
+
+    @cached_property
+    def modes(self) -> tuple[Mode, ...]:
+        """The poses round which the weight gathers, the heaviest first; their masses sum to 1.
+
+        Found by quick shift (Vedaldi & Soatto 2008): two particles belong to one mode where a chain
+        of ever denser neighbors, each within a tenth of the diameter, leads from one to the other.
+        """
+        samples, weights = self._tensors
+        center, found = torch.from_numpy(self.center), self._found
+        modes: list[Mode] = []
+        for number, (pose, mass) in enumerate(zip(found.states, found.weights, strict=True)):
+            own = found.member == number
+            poses, share = samples[own], weights[own] / weights[own].sum()
+            spread = covariance_about(self._mean(poses, share), poses, share, center)
+            same = next((i for i in range(number) if self._is_equivalent(found, i, pose)), None)
+            modes.append(Mode(pose.numpy(), float(mass), spread.numpy(), same))
+        return tuple(modes)
+
+    @property
+    def entropy(self) -> float:
+        """The entropy of the weights [nat]: 0 where one particle has them all, log N where all are
+        alike.  It says nothing of where the particles are: see `differential_entropy`.
+        """
+        weights = self._tensors[1]
+        return -float(torch.special.xlogy(weights, weights).sum())
+
+    @property
+    def effective_samples(self) -> float:
+        """The effective sample size (Kong 1992): 1 where one particle has all the weight, N where
+        all are alike.
+        """
+        return float(1 / np.square(self.weights).sum())
+
+    def log_density(self, poses: np.ndarray) -> np.ndarray:
+        """Return the log of the belief's density at poses.
+
+        Per cubic meter of position, and per unit of rotation where SO(3) has the volume pi^2, as in
+        Implicit-PDF (Murphy et al. 2021).  A kernel density estimate whose kernels follow the
+        particles and know the symmetries: see `posefilter.geometry.pose_density`.  It integrates to
+        1 and is never 0.
+
+        Args:
+            poses: (*, 4, 4) camera_from_object [m].
+
+        Returns:
+            (*) float64 [nat].
+        """
+        given = torch.from_numpy(np.asarray(poses, dtype=np.float64))
+        found = log_density(self._density, given.reshape(-1, 4, 4))
+        return found.reshape(given.shape[:-2]).numpy()
+
+    @cached_property
+    def differential_entropy(self) -> float:
+        """The entropy of the density [nat], in the measure of `log_density`: minus the mean log
+        density of the particles, each without its own kernel.
+        """
+        return -float(self._density.log_weights.exp() @ torch.from_numpy(self._held_out))
+
+    def credible_set(self, level: float = 0.9) -> PoseSet:
+        """Return the smallest set of poses that has this share of the belief.
+
+        It holds every pose whose density is at least that of `level` of the particles: the highest
+        density region (Hyndman 1996).  If the belief is right, it holds the truth so often.
+
+        Raises:
+            UserError: The level is not in [0, 1].
+        """
+        check_share(level)
+        weights = self._density.log_weights.exp().numpy()
+        return self.level_set(level, find_least(self._held_out, weights, level))
+
+    def level_set(self, level: float, least: float) -> PoseSet:
+        """Return the set of the poses whose log density is at least `least`; `level` is its name's.
+
+        Minus infinity gives the set of all poses.
+        """
+        inside = self._density.chosen.numpy()[self._held_out >= least]
+        return PoseSet(level, least, self.samples[inside], self.weights[inside], self.log_density)
+
+    def contains(self, poses: np.ndarray, level: float = 0.9) -> np.ndarray:
+        """Tell which poses are in the credible set of a level.  (*, 4, 4) -> (*) bool."""
+        return self.credible_set(level).contains(poses)
+
+    def marginal(self, axis: str) -> Marginal:
+        """Return the distribution of one axis, with its quantiles.
+
+        Args:
+            axis: `x`, `y`, `z`: the object's center in the camera's axes [m]; `rx`, `ry`, `rz`: the
+                rotation vector from the mean pose, in the object's own axes [rad].
+
+        Raises:
+            UserError: There is no such axis.
+        """
+        if axis not in AXES:
+            raise UserError(f"belief: has no axis {axis}; there are {', '.join(AXES)}")
+        samples, center = self._tensors[0], torch.from_numpy(self.center)
+        place = origin_of(samples, center)
+        turn = twist_between(torch.from_numpy(self.mean), samples, center)[:, 3:]
+        column = torch.cat([place, turn], dim=1)[:, AXES.index(axis)]
+        return Marginal(axis, column.numpy(), self.weights)
+
+    def uncertainty(self, level: float = 0.95) -> Uncertainty:
+        """Return how far the heaviest mode's particles are from their mean, equivalent poses taken
+        for one; `describe()` of it says so in words.
+
+        Raises:
+            UserError: The level is not in [0, 1].
+        """
+        samples, weights = self._tensors
+        own, center = self._found.member == 0, torch.from_numpy(self.center)
+        poses, share = samples[own], weights[own] / weights[own].sum()
+        pose, mass = self._mean(poses, share), float(weights[own].sum())
+        group = torch.from_numpy(self.symmetries)
+        return measure_uncertainty(poses, share, pose, mass, center, group, level)
+
+    def project(
+        self, intrinsics: np.ndarray, points: np.ndarray | None = None, level: float = 0.95
+    ) -> Projection:
+        """Return where the belief puts points of the object in an image, and how surely.
+
+        Args:
+            intrinsics: Camera matrix (3, 3) [px].
+            points: (P, 3) in the object's frame [m]; None: its center.
+            level: Share of the weight within the radius.
+        """
+        at = self.center[None] if points is None else np.asarray(points, dtype=np.float64)
+        K = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
+        return project_belief(*self._tensors, torch.from_numpy(at), K, level)
+
+    def save(self, path: str | Path) -> None:
+        """Write the belief as an .npz file; `Belief.load` reads it.
+
+        Its arrays are `poses` (N, 4, 4) and `weights` (N,) in float32, and `center`, `radius`,
+        `diameter`, `object` and `symmetries`.
+
+        Raises:
+            UserError: It cannot be written.
+        """
+        named = {one.name: getattr(self, one.name) for one in fields(self)}
+        write_arrays(path, named.pop("samples"), named.pop("weights"), **named)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Belief":
+        """Read what `save` wrote.
+
+        Raises:
+            UserError: The file is missing, or holds no belief.
+        """
+        try:
+            return cls(**read_arrays(path))
+        except UserError as error:
+            said = str(error)
+            raise UserError(said if said.startswith(f"{path}:") else f"{path}: {said}") from error
+
+    @property
+    def _tensors(self) -> tuple[Tensor, Tensor]:
+        return torch.from_numpy(self.samples), torch.from_numpy(self.weights)
+
+    @cached_property
+    def _density(self) -> PoseDensity:
+        samples, weights = self._tensors
+        own, group = torch.from_numpy(self.center), torch.from_numpy(self.symmetries)
+        return fit_density(samples, weights.log(), own, self.radius, self.diameter, group)
+
+    @cached_property
+    def _held_out(self) -> np.ndarray:
+        return log_density_held_out(self._density).numpy()
+
+    @cached_property
+    def _found(self) -> Modes:
+        samples, weights = self._tensors
+        return find_pose_modes(samples, weights.log(), self._space, self.diameter)
+
+    def _is_equivalent(self, found: Modes, heavier: int, pose: Tensor) -> bool:
+        copies = found.states[heavier] @ torch.from_numpy(self.symmetries)
+        return bool(self._space.distance(copies, pose).min() < APART * self.diameter)
+
+    @property
+    def _space(self) -> PoseSpace:
+        x, y, z = self.center.tolist()
+        return PoseSpace((x, y, z), self.radius)
+
+    def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
+        return self._space.mean(samples, weights)

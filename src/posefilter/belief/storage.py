@@ -1,0 +1,54 @@
+"""A belief's file: arrays in an .npz, without pickle, whole or not there."""
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.files import open_whole
+from posefilter.limits import MOST_BYTES
+
+
+def write_arrays(path: str | Path, poses: np.ndarray, weights: np.ndarray, **others: Any) -> None:
+    """Write poses (N, 4, 4) and weights (N,) in float32, and others as they are.
+
+    Raises:
+        UserError: The file cannot be written.
+    """
+    file = Path(path)
+    file = file if file.suffix == ".npz" else file.with_name(f"{file.name}.npz")
+    poses, weights = poses.astype(np.float32), weights.astype(np.float32)
+    with open_whole(file, sync=False) as stream:
+        np.savez_compressed(stream, poses=poses, weights=weights, **others)
+
+
+def read_arrays(path: str | Path) -> dict[str, Any]:
+    """Return what `write_arrays` wrote, as the arguments of `Belief`.
+
+    Raises:
+        UserError: The file is missing, or holds no belief.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise UserError(f"{path}: no such file")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if sum(part.file_size for part in archive.infolist()) > MOST_BYTES:
+                raise UserError(f"{path}: is larger than a belief can be")
+        with np.load(file, allow_pickle=False) as stored:
+            read: dict[str, Any] = {name: stored[name] for name in stored.files}
+        weights = read["weights"].astype(np.float64)
+        return {
+            "samples": np.ascontiguousarray(read["poses"], dtype=np.float64),
+            "weights": weights / weights.sum(),
+            "center": read["center"].astype(np.float64).reshape(3),
+            "radius": float(read["radius"]),
+            "diameter": float(read["diameter"]),
+            "object": str(read["object"]),
+            # of later files alone
+            "symmetries": np.array(read.get("symmetries", np.eye(4)[None]), dtype=np.float64),
+        }
+    except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: holds no belief as posefilter writes it ({error})") from error

@@ -1,0 +1,279 @@
+"""The density of weighted poses on SE(3): a kernel density estimate whose kernels follow the poses.
+
+Measure: a density is per cubic meter of position, and per unit of rotation where all of SO(3) has
+the volume pi^2 (Murphy et al. 2021), so that the uniform rotation has density 1 / pi^2.  Which
+point of the object is positioned does not matter.  Logarithms are natural.
+
+Kernel of pose i: a Gaussian of twists, T = move_about(T_i, xi), xi ~ N(0, s^2 C_i), where C_i is
+the covariance of the twists to its nearest neighbors (manifold Parzen windows, Vincent and Bengio
+2003).  So kernels are long along a ring of poses, and narrow across it.  The number of neighbors
+and the factor s are those of highest leave-one-out likelihood (Habbema et al. 1974).  A hundredth
+of the mass is a background: any rotation, and a position that is Cauchy about the mean with the
+object's diameter as its scale.  The density is positive everywhere, and integrates to 1.
+
+References:
+    Habbema, Hermans, van den Broek: A stepwise discriminant analysis program using density
+        estimation. COMPSTAT (1974).
+    Vincent, Bengio: Manifold Parzen windows. NIPS 15 (2003).
+    Murphy et al.: Implicit-PDF. ICML (2021).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
+
+BACKGROUND = 0.01  # of the mass
+_SHARES = (0.1, 0.3, 1.0)  # of the poses that are neighbors
+_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0)
+_FEWEST = 40  # neighbors
+_ISOTROPIC = 0.05  # share of a kernel's covariance that has no direction
+_NARROWEST = 5e-4  # [diameters] standard deviation
+_WIDEST = 0.6  # [rad] so that five standard deviations end before half a turn
+_LOG_UNITS = math.log(8.0)  # from rotation vectors, in which SO(3) has the volume 8 pi^2
+_MOST = 1000  # kernels
+_LOG_NONE = math.log(1e-12)  # where one pose has all the weight
+_JUDGED = 250  # heaviest poses, that the kernels' widths are chosen by
+_CHUNK = 1 << 17  # pairs of poses held at once
+
+
+class PoseDensity(NamedTuple):
+    """A density over poses; made by `fit_density`, evaluated by `log_density`."""
+
+    chosen: Tensor  # (N,) which of the poses that were given have a kernel
+    matrices: Tensor  # (N, 4, 4) their poses, or copies of them that symmetries make
+    poses: TwistParts  # the same
+    log_weights: Tensor  # (N,), normalized
+    whiten: Tensor  # (N, 6, 6) maps a twist of a kernel to a standard normal vector
+    log_scale: Tensor  # (N,) log of the kernels' normalization
+    symmetries: Tensor  # (S, 4, 4) object_from_object
+    center: Tensor  # (3,) of the object, in its frame [m]
+    mean: Tensor  # (3,) position of the background [m]
+    diameter: float  # its scale [m]
+
+
+def fit_density(
+    poses: Tensor,
+    log_weights: Tensor,
+    center: Tensor,
+    radius: float,
+    diameter: float,
+    symmetries: Tensor | None = None,
+) -> PoseDensity:
+    """Fit a kernel density to weighted poses.
+
+    Args:
+        poses: (N, 4, 4) camera_from_object [m].
+        log_weights: (N,), normalized.
+        center: (3,) the object's center in its frame [m].
+        radius: Distance at which a turn counts as the shift that it causes [m].
+        diameter: Of the object [m].
+        symmetries: (S, 4, 4) object_from_object, a group: a pose and what a symmetry makes of it
+            are one, and share the density equally.  None: the identity alone.
+
+    Returns:
+        The density, in float64.  Of more than 1,000 poses the heaviest have kernels of their own,
+        and an even selection of the others stands for these.
+    """
+    poses, log_weights, center = poses.double(), log_weights.double(), center.to(poses).double()
+    group = torch.eye(4)[None] if symmetries is None else symmetries
+    group = group.to(poses)
+    chosen, log_weights = _thin(log_weights)
+    poses = poses[chosen]
+    canonical = _gather_copies(poses, log_weights, center, radius, group)
+    parts = split_poses(canonical, center)
+    mean = (log_weights.exp()[:, None] * parts.center).sum(0)
+    fixed = (group, center, mean, diameter)
+    unit = poses.new_tensor([1.0] * 3 + [radius] * 3)
+    count = len(poses)
+    judged = log_weights.topk(min(count, _JUDGED)).indices
+    twist = pair_twists(parts, parts.select(judged))
+    share = log_weights[judged].softmax(0)
+    best, highest = None, -math.inf
+    counts = sorted({min(count, max(_FEWEST, round(s * count))) for s in _SHARES})
+    for shape in _measure_shapes(parts, log_weights.exp(), counts, unit):
+        whiten, log_scale = _whiten(shape, unit, diameter)
+        kernels = PoseDensity(chosen, canonical, parts, log_weights, whiten, log_scale, *fixed)
+        square, log_volume = _measure(kernels, twist)
+        for factor in _FACTORS:
+            scale = log_scale - 6 * math.log(factor)
+            log_kernel = scale[:, None] - 0.5 / factor**2 * square - log_volume
+            # the copies that symmetries make are far, or nearly alike: left out of the choice
+            score = float(
+                (share * _mix(kernels, log_kernel, parts.center[judged, None], judged)).sum()
+            )
+            if score > highest:
+                best = kernels._replace(whiten=whiten / factor, log_scale=scale)
+                highest = score
+    assert best is not None
+    return best
+
+
+def log_density(density: PoseDensity, poses: Tensor) -> Tensor:
+    """Return the log density at poses [1 / m^3, and SO(3) of volume pi^2].
+
+    (M, 4, 4) -> (M,) float64.
+    """
+    poses = poses.to(density.center)
+    rows = max(1, _CHUNK // (len(density.log_weights) * len(density.symmetries)))
+    return torch.cat([_evaluate(density, some, None) for some in poses.split(rows)])
+
+
+def log_density_held_out(density: PoseDensity) -> Tensor:
+    """Return the log density at the kernels' own poses, each without its own kernel.
+
+    A kernel is highest at its own pose, so that with it a pose of the fit would seem likelier than
+    a new one of the same distribution.
+
+    -> (N,) float64.
+    """
+    rows = max(1, _CHUNK // (len(density.chosen) * len(density.symmetries)))
+    every = torch.arange(len(density.chosen), device=density.chosen.device)
+    parts = [_evaluate(density, density.matrices[own], own) for own in every.split(rows)]
+    return torch.cat(parts)
+
+
+def _evaluate(density: PoseDensity, poses: Tensor, own: Tensor | None) -> Tensor:
+    """Return the log density at poses (M, 4, 4), without the kernels `own` (M,).  -> (M,)."""
+    copies = poses[:, None] @ density.symmetries
+    at = split_poses(copies.flatten(0, 1), density.center)
+    log_kernel = _log_kernel(density, pair_twists(density.poses, at))
+    copies_of = len(density.symmetries)
+    log_kernel = log_kernel.unflatten(1, (-1, copies_of)).logsumexp(2) - math.log(copies_of)
+    return _mix(density, log_kernel, at.center.unflatten(0, (-1, copies_of)), own)
+
+
+def _mix(density: PoseDensity, log_kernel: Tensor, center: Tensor, own: Tensor | None) -> Tensor:
+    """Return the log density of the mixture at M poses.
+
+    Args:
+        density: The kernels.
+        log_kernel: (N, M) log densities of the kernels there.
+        center: (M, S, 3) positions there, of each copy that symmetries make.
+        own: (M,) the kernel of each pose, which is left out; None: none is.
+
+    Returns:
+        (M,).
+    """
+    joint = density.log_weights[:, None] + log_kernel
+    if own is None:
+        return _with_background(density, joint.logsumexp(0), center - density.mean)
+    joint[own, torch.arange(len(own), device=own.device)] = -torch.inf
+    others = (-density.log_weights[own].exp()).log1p().clamp_min(_LOG_NONE)
+    return _with_background(density, joint.logsumexp(0) - others, center - density.mean)
+
+
+def _with_background(density: PoseDensity, log_mixture: Tensor, offset: Tensor) -> Tensor:
+    """Mix a log density (M,) with the background at offsets (M, S, 3) of the copies.  -> (M,)."""
+    ratio = offset.square().sum(-1) / density.diameter**2
+    # a Cauchy distribution in 3-D, 1 / (pi^2 s^3 (1 + r^2 / s^2)^2), times 1 / pi^2
+    cauchy = -2 * ratio.log1p() - 3 * math.log(density.diameter) - 4 * math.log(math.pi)
+    background = cauchy.logsumexp(1) - math.log(offset.shape[1]) + math.log(BACKGROUND)
+    return torch.logaddexp(log_mixture + math.log1p(-BACKGROUND), background)
+
+
+def _log_kernel(density: PoseDensity, twist: Tensor) -> Tensor:
+    """Return the kernels' log densities at twists from their poses.  (N, M, 6) -> (N, M)."""
+    square, log_volume = _measure(density, twist)
+    return density.log_scale[:, None] - 0.5 * square - log_volume
+
+
+def _measure(density: PoseDensity, twist: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the squared length of whitened twists, and the log volume of a unit of their space.
+
+    (N, M, 6) -> (N, M) x 2.
+    """
+    square = (twist @ density.whiten.mT).square_().sum(-1)
+    angle = twist[..., 3:].norm(dim=-1)
+    # dR = 2 (1 - cos a) / a^2 d(rotation vector) = sinc^2(a / 2) d(rotation vector)
+    half = torch.sinc(angle / (2 * math.pi)).clamp_min(1e-9)
+    return square, 2 * half.log() - _LOG_UNITS
+
+
+def _measure_shapes(
+    parts: TwistParts, weights: Tensor, counts: Sequence[int], unit: Tensor
+) -> list[Tensor]:
+    """Return the covariances of each pose's twists to its nearest neighbors, itself among them.
+
+    Taken about their mean, and partly without a direction, since neighbors are few.
+
+    Args:
+        parts: N poses.
+        weights: (N,).
+        counts: Numbers of neighbors, rising.
+        unit: (6,) that turns twists into meters.
+
+    Returns:
+        (N, 6, 6) for each number of neighbors, in m^2: turns times the radius.
+    """
+    found: list[list[Tensor]] = [[] for _ in counts]
+    rows = torch.arange(len(weights), device=weights.device)
+    # the weights of far tails are too few to give a shape
+    weights = weights + 0.01 * weights.max()
+    for some in rows.split(max(1, _CHUNK // len(weights))):
+        twist = pair_twists(parts.select(some), parts) * unit
+        order = twist.square().sum(-1).argsort(dim=1)
+        for number, neighbors in enumerate(counts):
+            near = order[:, :neighbors]
+            own = twist
+            share = weights.expand(len(some), -1)
+            if neighbors < len(weights):
+                own, share = own.gather(1, near[..., None].expand(-1, -1, 6)), weights[near]
+            share = (share / share.sum(1, keepdim=True))[..., None]
+            own = own - (share * own).sum(1, keepdim=True)
+            covariance = (share * own).mT @ own
+            size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
+            blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
+            found[number].append((1 - _ISOTROPIC) * covariance + blunt)
+    return [torch.cat(one) for one in found]
+
+
+def _whiten(covariance: Tensor, unit: Tensor, diameter: float) -> tuple[Tensor, Tensor]:
+    """Return what maps twists of kernels to standard normal vectors, and the log normalizations.
+
+    (N, 6, 6) [m^2], (6,) -> (N, 6, 6), (N,).
+    """
+    least = (_NARROWEST * diameter) ** 2
+    covariance = covariance + least * torch.eye(6).to(covariance)
+    covariance = covariance / (unit[:, None] * unit)
+    size, axes = torch.linalg.eigh(covariance[:, 3:, 3:])
+    limit = (_WIDEST / size.clamp_min(1e-20).sqrt()).clamp(max=1.0)
+    narrow = torch.eye(6).to(covariance).repeat(len(covariance), 1, 1)
+    narrow[:, 3:, 3:] = (axes * limit[:, None]) @ axes.mT
+    factor = torch.linalg.cholesky(narrow @ covariance @ narrow.mT)
+    log_scale = -factor.diagonal(dim1=1, dim2=2).log().sum(1) - 3 * math.log(2 * math.pi)
+    eye = torch.eye(6).to(factor).expand_as(factor)
+    return torch.linalg.solve_triangular(factor, eye, upper=False), log_scale
+
+
+def _thin(log_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which poses have kernels, and the log weights of these, which sum to 1."""
+    count = len(log_weights)
+    if count <= _MOST:
+        return torch.arange(count, device=log_weights.device), log_weights
+    order = log_weights.argsort(descending=True, stable=True)
+    heavy, rest = order[: _MOST // 2], order[_MOST // 2 :]
+    few = rest[torch.linspace(0, len(rest) - 1, _MOST // 2, device=rest.device).round().long()]
+    stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
+    shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
+    return torch.cat([heavy, few]), shares.log_softmax(0)
+
+
+def _gather_copies(
+    poses: Tensor, log_weights: Tensor, center: Tensor, radius: float, group: Tensor
+) -> Tensor:
+    """Return of each pose the copy that lies nearest to the heaviest pose.  (N, 4, 4) -> same."""
+    if len(group) == 1:
+        return poses
+    copies = poses[:, None] @ group
+    twist = pair_twists(
+        split_poses(poses[log_weights.argmax()][None], center),
+        split_poses(copies.flatten(0, 1), center),
+    )[0]
+    unit = twist.new_tensor([1.0] * 3 + [radius] * 3)
+    nearest = (twist * unit).square().sum(-1).view(len(poses), -1).argmin(1)
+    return copies[torch.arange(len(poses), device=poses.device), nearest]

@@ -1,0 +1,108 @@
+"""How dense a belief is at the truth, and how often credible sets hold it."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
+from posefilter.metrics.collect import concat_state
+from posefilter.types import Belief, ObjectModel
+
+LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
+SHOWN = (50, 80, 90, 95)  # [%] levels with a number of their own
+QUARTERS = ((0.0, 0.25), (0.25, 0.5), (0.5, 0.75), (0.75, 1.0))  # of visibility
+
+
+class TruthScores(NamedTuple):
+    """How beliefs see the truth."""
+
+    log_density: Tensor  # (B,) [nat]; the measure is that of geometry.pose_density
+    rank: Tensor  # (B,) share of the belief that is denser than the truth
+    surprise: Tensor  # (B,) mean log density of the belief, less that at the truth [nat]
+
+
+def score_truth(belief: Belief, truth: Tensor, model: ObjectModel) -> TruthScores:
+    """Return the density of beliefs at the truth, and the share of each that is denser.
+
+    The credible set of a level p holds the truth where the rank is below p.  If truths were drawn
+    from the beliefs, ranks would be uniform on [0, 1].
+
+    Args:
+        belief: B beliefs.
+        truth: (B, 4, 4) true poses.
+        model: The object; its symmetries are known to the density.
+
+    Returns:
+        (B,) float64 each, on the CPU.
+    """
+    rows = []
+    poses, log_weights = belief.poses.detach().cpu(), belief.log_weights.detach().cpu()
+    for own, own_weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
+        normalized = own_weights.double().log_softmax(0)
+        size = (float(model.radius), float(model.diameter))
+        density = fit_density(own, normalized, model.center.cpu(), *size, model.symmetries.cpu())
+        at_truth, at_own = log_density(density, true[None])[0], log_density_held_out(density)
+        weights = density.log_weights.exp()
+        rank, mean = weights @ (at_own > at_truth).double(), weights @ at_own
+        rows.append(torch.stack([at_truth, rank, mean - at_truth]))
+    return TruthScores(*(torch.stack(rows) if rows else torch.zeros(0, 3)).double().T)
+
+
+class Credibility(Metric):
+    """The density of beliefs at the truth, and the coverage of credible sets, by visibility.
+
+    log_density, log_density_p50: of the truth, mean and median [nat].  coverage_50, ...: percentage
+    of the images whose credible set of that level holds the truth.  levels, all, quarters: curves.
+    """
+
+    full_state_update = False
+    rows: list[Tensor]
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_state("rows", default=[], dist_reduce_fx="cat")
+
+    def update(self, scores: TruthScores, visibility: Tensor) -> None:
+        """Accumulate scores (B,) with the objects' visible shares (B,), NaN where unknown."""
+        self.rows.append(torch.stack([*scores, visibility.double().cpu()], dim=1))
+
+    def last(self) -> TruthScores:
+        """Return the scores that were accumulated last."""
+        return TruthScores(*self.rows[-1][:, :3].T)
+
+    def compute(self) -> dict[str, Any]:
+        """Return the numbers; empty without images."""
+        rows = concat_state(self.rows)
+        if not len(rows):
+            return {}
+        density, rank = rows[:, 0], rows[:, 1]
+        out = {"log_density": float(density.mean()), "log_density_p50": float(density.median())}
+        for percent in SHOWN:
+            out[f"coverage_{percent}"] = 100 * measure_coverage(rank, percent / 100)
+        return {**out, **trace_curves(rank, rows[:, 3])}
+
+
+def trace_curves(rank: Tensor, visible: Tensor) -> dict[str, Any]:
+    """Return the shares that the sets of each level cover, of all images and of each quarter of
+    visibility that has any.  (M,) x 2.
+    """
+    quarters = []
+    for low, high in QUARTERS:
+        own = (visible >= low) & ((visible < high) if high < 1 else (visible <= 1))
+        if bool(own.any()):
+            one = {"from": low, "to": high, "instances": int(own.sum())}
+            quarters.append({**one, "coverage": trace_curve(rank[own])})
+    return {"levels": list(LEVELS), "all": trace_curve(rank), "quarters": quarters}
+
+
+def trace_curve(rank: Tensor) -> list[float]:
+    """Return the share of the truths that the sets of each of `LEVELS` hold.  (M,)."""
+    return [measure_coverage(rank, level) for level in LEVELS]
+
+
+def measure_coverage(rank: Tensor, level: float) -> float:
+    """Return the share of the truths that the credible sets of a level hold.  (M,)."""
+    return float((rank < level).double().mean()) if len(rank) else math.nan

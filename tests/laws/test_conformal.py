@@ -1,0 +1,151 @@
+"""Conformal sets hold the truth as often as they guarantee, in each group, whatever the belief."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter.confidence.calibration import read_calibration
+from posefilter.confidence.conformal import Conformal, fit_conformal
+from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.errors import UserError
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.rotation import random_rotation
+from posefilter.metrics.credibility import Credibility, score_truth
+from posefilter.types import Belief, ObjectModel
+
+CENTER = torch.zeros(3)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9])
+def test_coverage_on_exchangeable_frames_is_at_least_the_level_and_hardly_more(
+    level: float,
+) -> None:
+    """Few frames a calibration, thousands of calibrations: the mean coverage is what is meant."""
+    rng, count = np.random.default_rng(0), 19
+    covered: list[list[bool]] = [[], []]
+    for _ in range(3000):
+        surface = rng.random(2 * count + 1)
+        # of the second group a belief is far too sure, of the first too wide
+        surprise = rng.standard_t(3, size=2 * count + 1) * np.where(surface < 0.25, 1, 50)
+        found = fit_conformal(surprise[1:], surface[1:])
+        limit = found.find_limit(level, surface[0])
+        covered[found.find_group(surface[0])].append(bool(surprise[0] <= limit))
+    for own in covered:
+        error = math.sqrt(0.25 / len(own))
+        assert level - 3 * error < np.mean(own)
+    assert np.mean(covered[1]) < level + 0.06
+
+
+def test_the_limit_is_the_order_statistic_of_the_definition() -> None:
+    found = Conformal((0.25,), (tuple(range(1, 10)), tuple(range(101, 120))))
+    assert found.find_limit(0.9, 0.1) == 9  # ceil(0.9 x 10)
+    assert found.find_limit(0.91, 0.1) == math.inf  # the tenth of nine
+    assert found.find_limit(0.95, 0.3) == 119
+    assert found.find_limit(0.96, 0.3) == math.inf
+    assert found.find_limit(0.5, 0.25) == 110  # an edge belongs to the group above
+    assert found.find_limit(0.0, 0.1) == 1
+    assert found.find_group(math.nan) == 0
+    assert Conformal((), ((),)).find_limit(0.1, 0.5) == math.inf
+
+
+def model(symmetries: torch.Tensor | None = None) -> ObjectModel:
+    points = torch.randn(30, 3, generator=torch.Generator().manual_seed(1)) * 0.05
+    group = torch.eye(4)[None] if symmetries is None else symmetries
+    return ObjectModel("thing", points, CENTER, 0.1, 0.2, group, points)
+
+
+def draw_beliefs(believed: float, count: int = 40) -> tuple[Belief, torch.Tensor]:
+    """Return beliefs with a deviation of `believed` times that of their truths."""
+    g = torch.Generator().manual_seed(0)
+    scale = torch.tensor([0.01] * 3 + [0.1] * 3)
+    middle = make_pose(random_rotation(count, generator=g), torch.randn(count, 3, generator=g))
+    noise = torch.randn(count, 100, 6, generator=g) * scale * believed
+    poses = move_about(middle[:, None].expand(-1, 100, -1, -1), noise, CENTER)
+    truth = move_about(middle, torch.randn(count, 6, generator=g) * scale, CENTER)
+    even = torch.full((count, 100), -math.log(100))
+    return Belief(poses, even, middle, torch.zeros(count)), truth
+
+
+def test_ranks_are_uniform_where_beliefs_are_right_and_high_where_they_are_vain() -> None:
+    right, vain = (score_truth(*draw_beliefs(width), model()) for width in (1.0, 0.3))
+    assert float(right.rank.mean()) == pytest.approx(0.5, abs=0.14)
+    assert float((right.rank < 0.8).double().mean()) == pytest.approx(0.8, abs=0.15)
+    assert float(vain.rank.mean()) > 0.9
+    assert float(right.surprise.mean()) == pytest.approx(0, abs=0.8)
+    assert float(vain.surprise.mean()) > 5
+    assert float(right.log_density.mean()) > float(vain.log_density.mean())
+    turn = torch.diag(torch.tensor([-1.0, -1, 1, 1]))
+    belief, truth = draw_beliefs(1.0, 3)
+    known = model(torch.stack([torch.eye(4), turn]))
+    a, b = score_truth(belief, truth, known), score_truth(belief, truth @ turn, known)
+    for one, other in zip(a, b, strict=True):
+        assert torch.allclose(one, other, atol=1e-4)
+
+
+def test_coverage_is_counted_by_quarter_of_visibility() -> None:
+    metric, nan = Credibility(), math.nan
+    ranks = torch.tensor([0.1, 0.7, 0.85, 0.95, 0.3, 0.99]).double()
+    seen = torch.tensor([0.1, 0.2, 0.5, 0.74, 1.0, nan])
+    for part in (slice(0, 2), slice(2, 6)):
+        flat = type(score_truth(*draw_beliefs(1.0, 0), model()))(
+            ranks[part], ranks[part], ranks[part]
+        )
+        metric.update(flat, seen[part])
+    curves = numbers = metric.compute()
+    assert numbers["coverage_50"] == pytest.approx(100 * 2 / 6)
+    assert numbers["coverage_90"] == pytest.approx(100 * 4 / 6)
+    assert [(one["from"], one["instances"]) for one in curves["quarters"]] == [
+        (0, 2),
+        (0.5, 2),
+        (0.75, 1),
+    ]
+    at = curves["levels"].index(0.8)
+    assert curves["all"][at] == pytest.approx(3 / 6)
+    assert [one["coverage"][at] for one in curves["quarters"]] == [1, 0, 1]
+
+
+def frames(count: int = 60) -> Frames:
+    rng = np.random.default_rng(3)
+    there = np.arange(count) < count // 2
+    surprise = np.where(there, rng.normal(size=count), np.nan)
+    return Frames(
+        ("surface", "score"),
+        rng.random((count, 2)),
+        there,
+        there & (rng.random(count) < 0.5),
+        surprise,
+    )
+
+
+def test_a_calibration_carries_the_surprises_of_the_frames_with_the_object() -> None:
+    made = fit_calibration(frames(), "scenes")
+    assert made.conformal is not None
+    own = frames()
+    assert sum(made.conformal.surprises, ()) != ()
+    together = sorted(x for group in made.conformal.surprises for x in group)
+    assert together == sorted(own.surprise[own.there].tolist())  # type: ignore[index]
+    assert read_calibration(made.to_plain(), "x") == made
+    earlier = made.to_plain()
+    del earlier["conformal"]
+    assert read_calibration(earlier, "x").conformal is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        [],
+        {"edges": [0.25]},
+        {"edges": [], "surprises": [[1.0], [2.0]]},
+        {"edges": [0.25], "surprises": [[2.0, 1.0], []]},
+        {"edges": [0.25], "surprises": [[float("nan")], []]},
+        {"edges": [0.25], "surprises": [["1"], []]},
+        {"edges": [0.25, 0.2], "surprises": [[], [], []]},
+        {"edges": [0.1] * 40, "surprises": [[]] * 41},
+    ],
+)
+def test_surprises_that_are_none_are_refused(wrong: object) -> None:
+    content = fit_calibration(frames(), "scenes").to_plain() | {"conformal": wrong}
+    with pytest.raises(UserError, match="checkpoint=x: its calibration"):
+        read_calibration(content, "checkpoint=x")

@@ -1,0 +1,176 @@
+"""Sets of poses, marginals, words and projections of a belief say what the particles say."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from posefilter import Belief, UserError
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.rotation import exp_so3
+
+CENTER = np.array([0.02, -0.01, 0.1])
+RADIUS, DIAMETER = 0.15, 0.28
+SCALE = np.array([0.004, 0.002, 0.008, 0.02, 0.05, 0.03])
+K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
+
+
+def middle() -> torch.Tensor:
+    turn = torch.tensor([0.4, -0.8, 0.3]).double()
+    return make_pose(exp_so3(turn), torch.tensor([0.1, -0.2, 1.0]).double())
+
+
+def draw(count: int, seed: int, scale: np.ndarray = SCALE) -> np.ndarray:
+    noise = torch.from_numpy(np.random.default_rng(seed).normal(size=(count, 6)) * scale)
+    return move_about(middle().expand(count, 4, 4), noise, torch.from_numpy(CENTER)).numpy()
+
+
+def belief_of(samples: np.ndarray, weights: np.ndarray | None = None, **more: object) -> Belief:
+    weights = np.ones(len(samples)) if weights is None else weights
+    return Belief(samples, weights / weights.sum(), CENTER, RADIUS, DIAMETER, "thing", **more)  # type: ignore[arg-type]
+
+
+def half_turn() -> np.ndarray:
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[:3, 3] = CENTER - turn[:3, :3] @ CENTER
+    return np.stack([np.eye(4), turn])
+
+
+def test_credible_sets_hold_their_share_of_what_the_belief_was_drawn_from() -> None:
+    """Particles are drawn broadly and weighted to be the belief: the weights must count."""
+    broad = draw(500, 0, 1.5 * SCALE)
+    noise = np.random.default_rng(0).normal(size=(500, 6)) * 1.5 * SCALE
+    belief = belief_of(broad, np.exp(-0.5 * (noise**2 / SCALE**2 * (1 - 1 / 1.5**2)).sum(1)))
+    fresh, last = draw(500, 1), np.zeros(500, bool)
+    for level in (0.5, 0.8, 0.95):
+        inside = belief.contains(fresh, level)
+        assert inside.mean() == pytest.approx(level, abs=0.08)
+        assert (inside | ~last).all()  # a set of a higher level holds those of lower ones
+        last = inside
+        one = belief.credible_set(level)
+        assert one.weights.sum() == pytest.approx(level, abs=0.03)
+        assert one.contains(fresh).tolist() == inside.tolist()
+    assert not belief.credible_set(0.999).contains(move_far(middle().numpy()))
+    assert belief.credible_set(1.0).weights.sum() == pytest.approx(1)
+    with pytest.raises(UserError, match=r"1\.5"):
+        belief.credible_set(1.5)
+
+
+def move_far(pose: np.ndarray) -> np.ndarray:
+    pose = pose.copy()
+    pose[2, 3] += 0.3
+    return pose
+
+
+def test_a_wider_belief_has_a_higher_entropy_by_the_logarithm_of_its_volume() -> None:
+    narrow, wide = (belief_of(draw(400, 2, factor * SCALE)) for factor in (1.0, 2.0))
+    assert wide.differential_entropy - narrow.differential_entropy == pytest.approx(
+        6 * math.log(2), abs=0.25
+    )
+    # of a Gaussian, in rotation vectors, less the logarithm of 8 for the unit of rotation
+    exact = 3 * math.log(2 * math.pi * math.e) + np.log(SCALE).sum() - math.log(8)
+    assert narrow.differential_entropy == pytest.approx(exact, abs=0.6)
+
+
+def test_density_has_the_shape_of_what_is_asked() -> None:
+    belief = belief_of(draw(60, 3))
+    asked = draw(6, 4).reshape(2, 3, 4, 4)
+    found = belief.log_density(asked)
+    assert found.shape == (2, 3)
+    assert found[1, 2] == pytest.approx(float(belief.log_density(asked[1, 2])))
+
+
+def test_a_symmetric_object_turned_is_as_likely_and_as_much_in_the_set() -> None:
+    belief = belief_of(draw(200, 5), symmetries=half_turn())
+    fresh = draw(50, 6)
+    turned = fresh @ half_turn()[1]
+    assert np.allclose(belief.log_density(turned), belief.log_density(fresh))
+    assert (belief.contains(turned) == belief.contains(fresh)).all()
+    assert belief.contains(fresh).mean() > 0.7
+    assert not belief_of(draw(200, 5)).contains(turned).any()
+
+
+def test_modes_that_a_symmetry_makes_of_one_another_are_named_as_such() -> None:
+    tight = draw(90, 7, SCALE / 3)
+    both = np.concatenate([tight, tight[:30] @ half_turn()[1]])
+    found = belief_of(both, symmetries=half_turn()).modes
+    assert [mode.equivalent for mode in found] == [None, 0]
+    assert [mode.equivalent for mode in belief_of(both).modes] == [None, None]
+
+
+def test_marginals_have_their_axis_own_quantiles() -> None:
+    belief = belief_of(draw(4000, 8))
+    z, turn = belief.marginal("z"), belief.marginal("ry")
+    at = (middle().numpy() @ np.append(CENTER, 1))[2]
+    assert (z.mean, z.deviation) == pytest.approx((at, 0.008), abs=4e-4)
+    assert z.quantile(0.5) == pytest.approx(at, abs=5e-4)
+    low, high = turn.interval(0.9)
+    assert (low, high) == pytest.approx((-1.645 * 0.05, 1.645 * 0.05), abs=0.006)
+    assert (z.quantile(0), z.quantile(1)) == (z.values.min(), z.values.max())
+    weighted = dataclasses.replace(
+        z, values=np.array([3.0, 1.0, 2.0]), weights=np.array([0.7, 0.1, 0.2])
+    )
+    assert [weighted.quantile(q) for q in (0.05, 0.2, 0.3, 0.31)] == [1, 2, 2, 3]
+    with pytest.raises(UserError, match="roll"):
+        belief.marginal("roll")
+    with pytest.raises(UserError, match=r"-0\.1"):
+        z.quantile(-0.1)
+
+
+def test_words_say_the_distance_that_the_share_of_the_particles_keeps() -> None:
+    belief = belief_of(draw(1200, 9))
+    sure = belief.uncertainty(0.95)
+    shifts = np.linalg.norm(np.random.default_rng(0).normal(size=(200_000, 3)) * SCALE[:3], axis=1)
+    turns = np.linalg.norm(np.random.default_rng(1).normal(size=(200_000, 3)) * SCALE[3:], axis=1)
+    assert sure.shift == pytest.approx(np.quantile(shifts, 0.95), rel=0.08)
+    assert sure.turn == pytest.approx(np.quantile(turns, 0.95), rel=0.08)
+    said = dataclasses.replace(sure, shift=0.0042, turn=math.radians(3.14), mass=1.0)
+    assert said.describe() == "within 4.2 mm and 3.1 degrees (95 %)"
+    assert (
+        dataclasses.replace(said, mass=0.7)
+        .describe()
+        .endswith("a pose that has 70 % of the belief")
+    )
+    mixed = np.concatenate([draw(40, 9, SCALE / 4), draw(20, 10, SCALE / 4) @ half_turn()[1]])
+    # equivalent poses in one mode are no uncertainty
+    one = belief_of(mixed, symmetries=half_turn()).uncertainty()
+    assert one.turn < 0.1
+
+
+def test_a_point_of_the_object_lands_where_the_particles_put_it() -> None:
+    shifts = np.repeat(middle().numpy()[None], 2, 0)
+    shifts[1, 0, 3] += 0.01
+    belief = belief_of(shifts, np.array([0.5, 0.5]))
+    depth = (shifts[0] @ np.append(CENTER, 1))[2]
+    at = belief.project(K)
+    pixels = 600 * 0.01 / depth
+    assert at.covariance[0] == pytest.approx(np.diag([(pixels / 2) ** 2, 0]), abs=1e-9)
+    assert at.radius[0] == pytest.approx(pixels / 2)
+    place = shifts.mean(0) @ np.append(CENTER, 1)
+    assert at.mean[0] == pytest.approx((K @ (place[:3] / place[2]))[:2])
+    assert belief.project(K, np.zeros((5, 3))).covariance.shape == (5, 2, 2)
+
+
+def test_symmetries_are_saved_and_files_without_them_are_read(tmp_path: Path) -> None:
+    belief = belief_of(draw(30, 11), symmetries=half_turn())
+    belief.save(tmp_path / "new.npz")
+    again = Belief.load(tmp_path / "new.npz")
+    assert np.allclose(again.symmetries, half_turn())
+    asked = draw(8, 12)
+    assert np.allclose(again.log_density(asked), belief.log_density(asked), atol=0.02)
+    with np.load(tmp_path / "new.npz") as stored:
+        arrays = {name: stored[name] for name in stored.files if name != "symmetries"}
+    np.savez(tmp_path / "old.npz", **arrays)
+    assert np.allclose(Belief.load(tmp_path / "old.npz").symmetries, np.eye(4)[None])
+    for name, symmetries in (
+        ("flat", np.eye(4)),
+        ("mirror", np.diag([-1.0, 1, 1, 1])[None]),
+        ("many", np.repeat(np.eye(4)[None], 1001, 0)),
+    ):
+        np.savez(tmp_path / f"{name}.npz", **arrays, symmetries=symmetries)
+        with pytest.raises(UserError, match=f"{name}.npz: belief: .*symmetries") as caught:
+            Belief.load(tmp_path / f"{name}.npz")
+        assert "\n" not in str(caught.value)
