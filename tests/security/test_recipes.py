@@ -327,7 +327,7 @@ def test_a_resumed_checkpoint_names_no_file_to_delete(
     folder = tmp_path / "run" / "checkpoints"
     folder.mkdir(parents=True)
     (folder / "old.ckpt").write_text("")
-    conf = HOME / "conf" / "callbacks" / "none.yaml"
+    conf = HOME / "conf" / "callbacks" / "checkpoints.yaml"
     job = compose_job("train", HOME / "conf", ["callbacks=checkpoints"], tmp_path / "run")
     job.cfg.folder = str(tmp_path / "run")
     victims = [f"{folder}/../../secret/file.txt", str(secret / "file.txt"), "memory://x/y.ckpt"]
