@@ -123,6 +123,17 @@ def list_choices(group: Path) -> list[str]:
     return sorted(f.stem for f in group.glob("*.yaml") if not f.stem.startswith("_"))
 
 
+def name_places(arguments: Sequence[str]) -> list[str]:
+    """Return the command line with its first two bare words as `bag=` and `out=`."""
+    names = iter(("bag", "out"))
+    out = []
+    for argument in arguments:
+        bare = "=" not in argument and not argument.startswith(("-", "~", "+"))
+        key = next(names, None) if bare else None
+        out.append(argument if key is None else f"{key}={argument}")
+    return out
+
+
 def spelled(arguments: Sequence[str]) -> list[str]:
     """Return the command line as Hydra reads it: `sweep` is a group of its own, and folders may
     have `=` and `,` in them.

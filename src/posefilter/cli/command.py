@@ -25,6 +25,7 @@ from posefilter.cli.arguments import (
     bracketed,
     check_choices,
     defer_settings,
+    name_places,
     quoted,
     spelled,
 )
@@ -80,6 +81,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     arguments = spelled(arguments) if name == "report" else arguments
+    arguments = name_places(arguments) if name == "convert_bag" else arguments
     # Hydra's parser wants it before or after all the rest
     arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)
     trace = "debug=traceback" in arguments

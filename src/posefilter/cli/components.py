@@ -9,7 +9,7 @@ from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
 SECTIONS = ("filter", "model")
-LOOSE = ("evaluate", "predict", "track", "export", "calibrate")
+LOOSE = ("evaluate", "predict", "track", "convert_bag", "export", "calibrate")
 
 
 def loosen(arguments: list[str], name: str) -> list[str]:

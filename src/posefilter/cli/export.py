@@ -1,5 +1,5 @@
 """Reduce a checkpoint to what prediction needs: weights, object, and recipe (with components
-of the filter chosen anew, if wished).
+of the filter chosen anew, if wished); or write its networks for programs of others.
 """
 
 from pathlib import Path
@@ -19,12 +19,15 @@ _KEPT = ("state_dict", "recipe", "object_model", "calibration", "pytorch-lightni
 
 
 def export(job: Job) -> None:
-    """Write the stripped checkpoint; it works wherever the whole one did, but for going on with
-    training.
+    """Write the stripped checkpoint, which works wherever the whole one did, but for going on with
+    training; or with `format=onnx|torch` the networks.
     """
     if job.cfg.out is None:
         raise UserError("out: is missing; name the file to write, such as out=weights/carton.ckpt")
     out = Path(job.cfg.out)
+    if job.cfg.format != "weights":
+        export_networks(job, out)
+        return
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
     stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
@@ -40,6 +43,23 @@ def export(job: Job) -> None:
         f"intrinsics=fx,fy,cx,cy depth_scale=10000"
     ]
     ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
+
+
+def export_networks(job: Job, out: Path) -> None:
+    """Write the networks and the filter's settings into a folder.
+
+    Raises:
+        UserError: The folder holds other files, or the filter cannot be exported.
+    """
+    from posefilter.deploy.write import check_format, write_filter  # tracing: seldom asked for
+
+    check_format(job.cfg.format)
+    if out.suffix == ".ckpt" or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
+        raise UserError(f"out={out}: name a new folder, or an empty one, for the networks")
+    checkpoint = read_checkpoint(job.cfg.checkpoint)
+    method = method_of(checkpoint, changes(job.cfg), lightning=False)
+    size = write_filter(method, out, job.cfg.width, job.cfg.height, job.cfg.format)
+    ended(job.cfg.console, "exported", {"networks": out}, [], megabytes=size)
 
 
 def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:

@@ -16,12 +16,16 @@ _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
     "predict": ("seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
+    "convert_bag": (
+        *("color", "depth", "camera_info", "detections", "tolerance", "track", "keep", "seed"),
+        *("cost_false_alarm", "cost_miss", "cost_unsure"),
+    ),
     "calibrate": ("frames", "seed", "replace"),
     "generate": ("seed",),
     "check_data": ("data", "out"),
     "evaluate": ("trainer", "absent_frames"),
     "onboard": ("seed", "budget_minutes", "test_frames", "workers"),
-    "export": ("points", "max_mb"),
+    "export": ("points", "max_mb", "format", "width", "height"),
 }
 
 

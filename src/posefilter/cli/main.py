@@ -12,12 +12,13 @@ COMMANDS = {
     "evaluate": "test a checkpoint, or poses of any other method, on a dataset",
     "predict": "estimate the pose of one object or several in an RGB-D image",
     "track": "follow objects through a video",
+    "convert_bag": "find objects in the images of a ROS 2 bag",
     "generate": "render a dataset",
     "check_data": "check that a dataset and its meshes fit each other",
     "report": "explain a run or a sweep, or compare two runs, on one HTML page",
     "onboard": "go from a mesh to trained weights and a report",
     "calibrate": "learn the probability that a checkpoint's poses are right",
-    "export": "reduce a checkpoint to what prediction needs",
+    "export": "reduce a checkpoint to what prediction needs, or write its networks as ONNX",
 }
 _USAGE = "usage: posefilter COMMAND [setting=value ...]; posefilter COMMAND --help for its settings"
 

@@ -48,6 +48,8 @@ def check_files(command: str, cfg: DictConfig) -> None:
         _check_video(cfg)
     if command == "train":
         _check_loggers(cfg.logger)
+    if command == "convert_bag":
+        _check_bag(cfg)
     if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
         several = command == "predict" and is_several(cfg.checkpoint)
         for one in expand_weights(cfg.checkpoint) if several else [cfg.checkpoint]:
@@ -69,6 +71,26 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if key == "data.root" and _select(cfg, "data.generate") is not None:
             continue  # it is rendered
         raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
+
+
+def _check_bag(cfg: DictConfig) -> None:
+    """Raise UserError where there is no bag to be read, or no place for the other."""
+    for key in ("bag", "out", "checkpoint"):
+        if cfg[key] is None:
+            raise UserError(f"{key}: is missing; type convert_bag in.mcap out.mcap checkpoint=...")
+    if not Path(str(cfg.bag)).exists():
+        raise UserError(f"bag={cfg.bag}: no such file")
+    for key in ("track", "keep"):
+        if not isinstance(cfg[key], bool):
+            raise UserError(f"{key}={cfg[key]}: choose true or false")
+    find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
+    for one in find_all:
+        find_weights(one)
+    if find_spec("rosbags") is None:
+        raise UserError(
+            "convert_bag: the package rosbags is missing; pip install 'posefilter[bags]' (in a "
+            "clone: pip install -e '.[bags]')"
+        )
 
 
 def _check_video(cfg: DictConfig) -> None:

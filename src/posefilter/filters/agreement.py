@@ -85,7 +85,7 @@ class Agreement:
         provider = require_surface_points(method)
         center, radius = provider.model.center.to(particles.state), provider.model.radius
         point, known = provider.surface_points(scene, particles.state)
-        share, position = self._object_points(output, point, center, radius)
+        share, position = self.list_object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known
         votes = draw_votes(
             point, weight, share, position, center, radius, self.hypotheses, generator
@@ -113,7 +113,7 @@ class Agreement:
         )
         return Belief(votes, log_weights, best, score)
 
-    def _object_points(
+    def list_object_points(
         self, output: ParticleOutput, point: Tensor, center: Tensor, radius: float
     ) -> tuple[Tensor, Tensor]:
         """Return the candidate object points of each particle's own point.

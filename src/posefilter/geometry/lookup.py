@@ -128,7 +128,7 @@ def argmin(values: Tensor) -> Tensor:
 
     On the CPU it uses numpy's vectorized argmin, which is faster than PyTorch's.
     """
-    if values.device.type != "cpu":
+    if values.device.type != "cpu" or torch.compiler.is_compiling():
         return values.argmin(-1)
     return torch.from_numpy(values.detach().numpy().argmin(-1))
 

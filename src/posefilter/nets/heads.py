@@ -254,9 +254,19 @@ def fill_depth(depth: Tensor, size: int = 7) -> Tensor:
     known = (depth > 0).to(depth.dtype)
     total, count = _window_mean(torch.cat([depth, known]), size).chunk(2)
     near = total / count.clamp_min(1e-6)
-    flat = torch.where(depth > 0, depth, torch.nan).flatten(1).nanmedian(1).values
-    median = torch.nan_to_num(flat, nan=1.0)[:, None, None, None]
+    median = _known_median(depth.flatten(1))[:, None, None, None]
     return torch.where(depth > 0, depth, torch.where(near > 0, near, median))
+
+
+def _known_median(depth: Tensor) -> Tensor:
+    """Return the lower median of what is known, 1 where nothing is.  (B, n) [m] -> (B,) [m]."""
+    if not torch.compiler.is_compiling():
+        return torch.nan_to_num(torch.where(depth > 0, depth, torch.nan).nanmedian(1).values, nan=1)
+    # for export: ONNX has no median
+    ordered = torch.where(depth > 0, depth, torch.inf).sort(1).values
+    count = (depth > 0).sum(1, keepdim=True)
+    middle = ordered.gather(1, (count - 1).clamp_min(0) // 2)
+    return torch.where(count > 0, middle, torch.ones_like(middle))[:, 0]
 
 
 def _window_mean(x: Tensor, size: int) -> Tensor:

@@ -10,8 +10,10 @@ from posefilter.nets.linear import Linear
 
 def fast_bfloat16(device: torch.device) -> bool:
     """Return whether the hardware computes in bfloat16 natively; emulation is several times
-    slower.
+    slower.  False for a network that is traced for export, which is to run anywhere.
     """
+    if torch.compiler.is_compiling():
+        return False
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

@@ -239,12 +239,17 @@ class PoseLikelihood(nn.Module):
         Returns:
             Log-likelihoods (B, N).
         """
-        B = poses.shape[0]
-        noise = torch.randn(B, 1, pixels, 2, generator=generator, device=poses.device)
+        noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
         # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
             points = sample_points(image, poses, center, radius, noise)
-        level = self.level(sigma.expand(B))
+        return self.score_sampled(points, poses, sigma, center, radius)
+
+    def score_sampled(
+        self, points: Points, poses: Tensor, sigma: Tensor, center: Tensor, radius: float
+    ) -> Tensor:
+        """Score poses by points that are drawn already; arguments as of `forward`.  -> (B, N)."""
+        level = self.level(sigma.expand(len(poses)))
         scores = torch.where(
             points.inside, self.score_at_level(points, level, radius), self.outside(level)[:, None]
         )

@@ -30,7 +30,11 @@ class Linear(nn.Linear):
 
 
 def takes_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Return whether oneDNN applies: float32 on the CPU, not empty, no autocast to another type."""
+    """Return whether oneDNN applies: float32 on the CPU, not empty, no autocast to another type,
+    not traced for export.
+    """
+    if torch.compiler.is_compiling():
+        return False
     plain = x.device.type == "cpu" and x.dtype == weight.dtype == torch.float32 and x.numel() > 0
     return _ONEDNN and plain and not torch.is_autocast_enabled("cpu")
 

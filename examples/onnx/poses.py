@@ -1,0 +1,173 @@
+"""Estimate an object's pose by ONNX Runtime and NumPy alone: a particle filter over poses.
+
+    python export.py checkpoint=003_cracker_box format=onnx out=cracker
+    python examples/onnx/poses.py cracker rgb.png depth.png fx,fy,cx,cy 10000
+
+Needs numpy, onnxruntime, and opencv-python-headless to read the images.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+
+class PoseFilter:
+    """What `export.py format=onnx` wrote of a `pose_pf`."""
+
+    def __init__(self, folder, threads=1):
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        self.settings = json.loads((Path(folder) / "filter.json").read_text())
+        self.encode, self.measure = (
+            onnxruntime.InferenceSession(Path(folder) / f"{name}.onnx", options)
+            for name in ("encode", "measure")
+        )
+        self.center, self.radius = np.float32(self.settings["center"]), self.settings["radius"]
+
+    def estimate(self, rgb, depth, intrinsics, seed=0):
+        """RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3) -> camera_from_object (4, 4), its score,
+        and the belief: poses (N, 4, 4), weights (N,).
+        """
+        s, rng = self.settings, np.random.default_rng(seed)
+        names = [output.name for output in self.encode.get_outputs()]
+        image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
+        scene = dict(zip(names, self.encode.run(names, image), strict=True))
+        poses = draw_poses(*(scene[name] for name in ("point", "weight", "share", "position")),
+                           self.center, self.radius, s["first_particles"], rng)  # fmt: skip
+        weights = np.ones(len(poses)) / len(poses)
+        for number, sigma in enumerate(s["levels"]):
+            if number:
+                if s["resample"] == "systematic":
+                    poses = poses[resample(weights, s["particles"], rng)]
+                for kernel in s["propagate"]:
+                    poses = self.propagate(poses, kernel, sigma, rng)
+            scores = self.score(scene, poses, sigma, s["points"], rng)
+            weights = softmax(scores)
+        best, score = poses[scores.argmax()], scores.max()
+        for step in s["refine"]:
+            refine = self.rescore if step["kind"] == "rescore" else self.shift
+            best, score = refine(scene, best, poses, weights, rng, **step)
+        return best, float(score), poses, weights
+
+    def score(self, scene, poses, sigma, points, rng):
+        """Log-likelihoods (N,) at a noise level [m], from so many image points."""
+        noise = rng.standard_normal((points, 2), dtype=np.float32)
+        given = {"poses": poses, "sigma": np.array(sigma, np.float32), "noise": noise, **scene}
+        names = [one.name for one in self.measure.get_inputs()]
+        return self.measure.run(None, {name: given[name] for name in names})[0]
+
+    def scale(self, sigma):
+        """Standard deviations of a shift [m] and a turn [rad] that move the surface by sigma."""
+        return np.repeat(np.float32([sigma, min(sigma / self.radius, 1.2)]), 3)
+
+    def propagate(self, poses, kernel, sigma, rng):
+        count = len(poses)
+        if kernel["kind"] == "gaussian":
+            noise = rng.standard_normal((count, 6), dtype=np.float32)
+            return move(poses, self.scale(sigma * kernel["noise_scale"]) * noise, self.center)
+        axes = np.float32(kernel["axes"])[rng.integers(3, size=count)]
+        free = rng.random(count) < kernel["uniform_angle_probability"]
+        angle = np.where(free, rng.uniform(0, 2 * np.pi, count), np.pi)
+        angle = angle * (rng.random(count) < kernel["probability"])
+        turn = np.float32(axes * angle[:, None])
+        return move(poses, np.concatenate([np.zeros_like(turn), turn], 1), self.center)
+
+    def rescore(self, scene, best, poses, weights, rng, top_k, pixels, sigma, **_):
+        """The best of the estimate and the heaviest particles, by more points."""
+        poses = np.concatenate([best[None], poses[np.argsort(-weights)[:top_k]]])
+        scores = self.score(scene, poses, sigma, pixels, rng)
+        return poses[scores.argmax()], scores.max()
+
+    def shift(self, scene, best, poses, weights, rng, iterations, antithetic_pairs, start, end,
+              sigma, pixels, **_):  # fmt: skip
+        """Mean shift: the likelihood-weighted mean of pairs of opposite moves."""
+        for index in range(iterations):
+            spread = start * (end / start) ** (index / max(iterations - 1, 1))
+            noise = rng.standard_normal((antithetic_pairs, 6), dtype=np.float32)
+            moves = np.concatenate([noise, -noise]) * self.scale(spread)
+            near = move(np.broadcast_to(best, (len(moves), 4, 4)), moves, self.center)
+            weight = softmax(self.score(scene, near, sigma, pixels, rng))
+            best = move(best[None], (weight[:, None] * moves).sum(0)[None], self.center)[0]
+        return best, self.score(scene, best[None], sigma, pixels, rng)[0]
+
+
+def softmax(x):
+    x = np.exp(x - x.max())
+    return x / x.sum()
+
+
+def resample(weights, count, rng):
+    """Systematic resampling: the ancestors (count,) of equally weighted children."""
+    at = (np.arange(count) + rng.random()) / count
+    return np.searchsorted(np.cumsum(weights, dtype=float), at).clip(0, len(weights) - 1)
+
+
+def move(poses, tangents, center):
+    """Turn poses about the object's center, and shift them: (N, 4, 4), (N, 6) -> (N, 4, 4)."""
+    x, y, z = tangents[:, 3:].T
+    zero = np.zeros_like(x)
+    K = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    angle = np.linalg.norm(tangents[:, 3:], axis=1)[:, None, None].clip(1e-6)
+    turn = np.eye(3) + np.sin(angle) / angle * K + (1 - np.cos(angle)) / angle**2 * (K @ K)
+    moved = poses.copy()
+    moved[:, :3, :3] = poses[:, :3, :3] @ turn
+    moved[:, :3, 3] += poses[:, :3, :3] @ center + tangents[:, :3] - moved[:, :3, :3] @ center
+    return moved
+
+
+def draw(weights, rng, *shape):
+    """Draw indices by the last axis of weights: (*, n) -> (*, *shape)."""
+    sums = np.cumsum(weights, axis=-1, dtype=float)
+    at = rng.random((*weights.shape[:-1], *shape)) * sums[..., -1][(...,) + (None,) * len(shape)]
+    sums = sums[(..., *(None,) * len(shape), slice(None))]
+    return (sums <= at[..., None]).sum(-1).clip(0, weights.shape[-1] - 1)
+
+
+def draw_poses(point, weight, share, position, center, radius, count, rng, votes=3):
+    """Poses (count, 4, 4) by rigid fits to a seed and `votes` more correspondences near it."""
+    weight = weight * share.max(-1)
+    weight = weight if weight.any() else np.ones_like(weight)
+    seed = draw(weight, rng, count)
+    near = np.linalg.norm(point[seed][:, None] - point, axis=-1) < 2 * radius
+    rest = draw(weight * near + 1e-12 * (weight > 0), rng, votes)
+    first = position[seed, draw(share[seed], rng)]
+    distance = np.linalg.norm(point[rest] - point[seed][:, None], axis=-1) / radius
+    apart = np.linalg.norm(position[rest] - first[:, None, None], axis=-1)
+    agreeing = share[rest] * (np.exp(-0.5 * ((apart - distance[..., None]) / 0.1) ** 2) + 1e-6)
+    others = position[rest, draw(agreeing + 1e-30, rng)]
+    index = np.concatenate([seed[:, None], rest], 1)
+    found = np.concatenate([first[:, None], others], 1) * radius + center
+    return fit_rigid(found, point[index], weight[index])
+
+
+def fit_rigid(source, target, weights):
+    """Kabsch's fit: (*, P, 3) x 2, (*, P) -> target_from_source (*, 4, 4)."""
+    w = (weights / weights.sum(-1, keepdims=True).clip(1e-12))[..., None]
+    mean_s, mean_t = (w * source).sum(-2, keepdims=True), (w * target).sum(-2, keepdims=True)
+    U, _, Vh = np.linalg.svd(np.swapaxes((target - mean_t) * w, -1, -2) @ (source - mean_s))
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]
+    poses = np.zeros((*source.shape[:-2], 4, 4), np.float32)
+    poses[..., :3, :3] = R = U @ Vh
+    poses[..., :3, 3] = (mean_t - mean_s @ np.swapaxes(R, -1, -2))[..., 0, :]
+    poses[..., 3, 3] = 1
+    return poses
+
+
+def read_arguments():
+    """Folder, RGB (H, W, 3) uint8, depth (H, W) [m] and camera matrix of the command line."""
+    import cv2
+
+    folder, rgb, depth, intrinsics, scale = sys.argv[1:]
+    fx, fy, cx, cy = map(float, intrinsics.split(","))
+    color = cv2.cvtColor(cv2.imread(rgb), cv2.COLOR_BGR2RGB)
+    z = cv2.imread(depth, cv2.IMREAD_UNCHANGED) / float(scale)
+    return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+if __name__ == "__main__":
+    place, *images = read_arguments()
+    pose, score, *_ = PoseFilter(place).estimate(*images)
+    print(np.array2string(pose, precision=4, suppress_small=True), f"score {score:.2f}")

@@ -1,0 +1,82 @@
+"""Find objects in the images of a ROS 2 bag, and write detections into another bag."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.components import changes
+from posefilter.cli.console import JSON, ended, say
+from posefilter.cli.job import Job
+from posefilter.cli.machine import settle
+from posefilter.cli.predict import read_costs
+from posefilter.errors import UserError
+from posefilter.estimator import Estimator, Result
+from posefilter.ros.bags import BagFrame, BagReader, BagWriter, Topics
+from posefilter.ros.detections import make_detections
+from posefilter.tracking.tracker import Tracker
+from posefilter.weights import expand_weights
+
+
+def convert_bag(job: Job) -> None:
+    """Write a Detection3DArray for each color image that has depth.
+
+    Raises:
+        UserError: The bag cannot be read, or not one of its images has depth and a camera.
+    """
+    cfg = job.cfg
+    out = Path(str(cfg.out))
+    if out.exists():
+        raise UserError(f"out={out}: exists already; choose another")
+    topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
+    with BagReader(Path(str(cfg.bag)), topics, float(cfg.tolerance)) as reader:
+        settle(cfg.threads, cfg.seed)
+        wanted = changes(cfg)
+        estimator = Estimator(
+            [
+                method_of(read_checkpoint(one), wanted, lightning=False)
+                for one in expand_weights(cfg.checkpoint)
+            ],
+            costs=read_costs(cfg),
+        )
+        find = choose_finder(estimator, cfg.track, cfg.seed)
+        images, found = 0, Counter(dict.fromkeys(estimator.objects, 0))
+        with BagWriter(out, str(cfg.detections)) as writer:
+            for frame in reader.frames():
+                message = make_detections(find(frame), frame.header)
+                writer.write(message, frame.time)
+                found.update(one.id for one in message.detections)
+                images += 1
+            if not images:
+                raise UserError(
+                    f"bag={cfg.bag}: no color image has depth within tolerance={cfg.tolerance} s, "
+                    f"after a first camera_info"
+                )
+            if cfg.keep:
+                writer.copy(reader.reader.connections, reader.messages())
+    if reader.distorted:
+        say(
+            cfg.console,
+            "distorted",
+            "warning: the camera has a lens distortion, and images are taken as rectified ones",
+        )
+    if cfg.console != JSON:
+        print(f"{images} images, {reader.unpaired} without depth")
+        for name, count in found.items():
+            print(f"{name}: in {count}")
+    ended(
+        cfg.console, "converted", {"bag": out}, [],
+        images=images, unpaired=reader.unpaired, found=dict(found),
+    )  # fmt: skip
+
+
+def choose_finder(
+    estimator: Estimator, track: bool, seed: int
+) -> Callable[[BagFrame], list[Result]]:
+    """Return what finds the objects in a frame: each frame by itself, or by tracking."""
+    if track:
+        tracker = Tracker(estimator, seed=seed)
+        return lambda frame: [*tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)]
+    return lambda frame: estimator.predict_batch(
+        frame.rgb, frame.depth, frame.intrinsics, seed=seed
+    )[0]

@@ -1,0 +1,1 @@
+"""Networks and settings of a trained filter for programs without torch."""

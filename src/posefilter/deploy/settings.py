@@ -1,0 +1,136 @@
+"""The settings of a trained filter as plain data, for programs that run the exported networks."""
+
+from typing import Any
+
+from posefilter.errors import UserError
+from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
+from posefilter.filters.agreement import Agreement
+from posefilter.models.base import PoseEstimator
+from posefilter.models.image_space import ImageSpace
+from posefilter.models.pose_pf import PosePF
+from posefilter.nets.likelihood import PoseLikelihood
+
+VERSION = 1  # of the files' format
+
+
+def describe_filter(method: PoseEstimator) -> dict[str, Any]:
+    """Return what a program needs to know of a filter, beside its networks.
+
+    Args:
+        method: The trained method, with its object.
+
+    Raises:
+        UserError: A component cannot be exported; the message names a choice that can.
+    """
+    check_method(method)
+    own, model = method.filter, method.model
+    return {
+        "version": VERSION,
+        "particles_are": "poses" if isinstance(method, PosePF) else "pixels",
+        "object": model.name,
+        "center": model.center.tolist(),
+        "radius": float(model.radius),
+        "diameter": float(model.diameter),
+        "first_particles": own.first_particles,
+        "particles": own.particles,
+        "levels": [float(level) for level in own.schedule(own.steps)],
+        "points": method.pixels if isinstance(method, PosePF) else None,
+        "latent_width": method.latent_width,
+        "initialize": _describe_start(own.initialize),
+        "resample": _choose(own.resample, "resample", systematic=resample.Systematic,
+                            none=resample.NoResampling),
+        "reweight": _choose(own.reweight, "reweight", annealed=reweight.Annealed),
+        "propagate": [part for one in _list(own.propagate) for part in _describe_move(one, method)],
+        "estimate": _describe_estimate(own.estimate),
+        "refine": [part for one in _list(own.refine) for part in _describe_refinement(one)],
+    }  # fmt: skip
+
+
+def check_method(method: PoseEstimator) -> None:
+    """Check that a method's networks can be exported.
+
+    Raises:
+        UserError: They cannot.
+    """
+    if "pose" not in method.capabilities:
+        raise UserError(f"{type(method).__name__} detects, and estimates no pose to be exported")
+    if isinstance(method, ImageSpace):
+        return
+    if not isinstance(method, PosePF):
+        raise UserError(f"format: the networks of {type(method).__name__} cannot be exported")
+    likelihood = method.likelihood
+    contextual = isinstance(likelihood, PoseLikelihood) and likelihood.context is not None
+    if method.proposals is None or not contextual:
+        raise UserError(
+            "format: of pose_pf only model/proposals=dense with model/likelihood=contextual is "
+            "exported"
+        )
+
+
+def _list(component: Any) -> list[Any]:
+    """Return the components of a chain, or the only one."""
+    return component.components if hasattr(component, "components") else [component]
+
+
+def _refuse(component: Any, group: str, *choices: str) -> UserError:
+    return UserError(
+        f"filter/{group}: {type(component).__name__} is not exported; choose {' or '.join(choices)}"
+    )
+
+
+def _choose(component: Any, group: str, **kinds: type) -> str:
+    for name, kind in kinds.items():
+        if type(component) is kind:
+            return name
+    raise _refuse(component, group, *kinds)
+
+
+def _describe_start(start: Any) -> dict[str, Any]:
+    if isinstance(start, initialize.Informed):  # the truth informs training alone
+        start = start.initializer
+    if isinstance(start, initialize.FromRelevance):
+        return {"kind": "from_relevance", "uniform_fraction": start.uniform_fraction}
+    known = {"uniform": initialize.UniformPixels, "from_proposals": initialize.FromProposals}
+    return {"kind": _choose(start, "initialize", **known)}
+
+
+def _describe_move(move: Any, method: PoseEstimator) -> list[dict[str, Any]]:
+    if isinstance(move, propagate.Identity):
+        return []
+    if isinstance(move, propagate.LearnedDisplacement):
+        return [{"kind": "displacement"}]
+    if isinstance(move, propagate.Gaussian):
+        return [{"kind": "gaussian", "noise_scale": move.noise_scale}]
+    half = isinstance(move, propagate.HalfTurns)
+    if isinstance(method, PosePF) and (half or isinstance(move, propagate.AxisTurns)):
+        any_angle = getattr(move, "uniform_angle_probability", 0.0)
+        axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        axes = axes if half else method.space.axes.tolist()
+        return [
+            {
+                "kind": "turns",
+                "probability": move.probability,
+                "uniform_angle_probability": any_angle,
+                "axes": axes,
+            }
+        ]
+    raise _refuse(move, "propagate", "gaussian", "gaussian_and_turns", "learned", "identity")
+
+
+def _describe_estimate(one: Any) -> dict[str, Any]:
+    if isinstance(one, Agreement):
+        names = ("scale_m", "hypotheses", "iterations", "counts")
+        return {"kind": "agreement", **{name: getattr(one, name) for name in names}}
+    return {"kind": _choose(one, "estimate", argmax=estimate.Argmax)}
+
+
+def _describe_refinement(one: Any) -> list[dict[str, Any]]:
+    if isinstance(one, refine.NoRefine):
+        return []
+    if isinstance(one, refine.Rescore):
+        names: tuple[str, ...] = ("top_k", "pixels", "sigma")
+        return [{"kind": "rescore", **{name: getattr(one, name) for name in names}}]
+    if isinstance(one, refine.MeanShift):
+        names = ("iterations", "antithetic_pairs", "start", "end", "sigma", "pixels")
+        return [{"kind": "mean_shift", **{name: getattr(one, name) for name in names}}]
+    raise _refuse(one, "refine", "mean_shift", "rescore", "none")

@@ -1,0 +1,239 @@
+"""Frames out of a ROS 2 bag, and detections into another."""
+
+import shutil
+import tempfile
+from collections import deque
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    DETECTIONS,
+    IMAGE,
+    decode_color,
+    decode_depth,
+    decode_intrinsics,
+    is_distorted,
+    open_types,
+    stamp_of,
+)
+
+_WAITING = 30  # messages of a topic that wait for one of another
+
+
+class Topics(NamedTuple):
+    """Where the images of a bag are."""
+
+    color: str
+    depth: str
+    camera_info: str
+
+
+class BagFrame(NamedTuple):
+    """Color and depth of one moment."""
+
+    rgb: np.ndarray  # (H, W, 3) uint8
+    depth: np.ndarray  # (H, W) float32 [m], 0 where unknown
+    intrinsics: np.ndarray  # (3, 3) [px]
+    header: Any  # of the color image
+    time: int  # when it was recorded [ns]
+
+
+class BagReader:
+    """The frames of a bag, in the order of time.
+
+    Args:
+        path: A bag's folder, or its .mcap or .db3 file.
+        topics: Where its images are.
+        tolerance: Largest difference between the times of color and depth [s].
+
+    Raises:
+        UserError: It cannot be read, or has no such topics.
+    """
+
+    def __init__(self, path: Path, topics: Topics, tolerance: float) -> None:
+        from rosbags.rosbag2 import Reader, ReaderError
+
+        self.path, self.topics, self.tolerance = path, topics, int(tolerance * 1e9)
+        self.distorted = False  # whether a camera had a lens distortion that is not undone
+        self.unpaired = 0  # color images without depth
+        try:
+            self.reader = Reader(path)
+            self.reader.open()
+        except (ReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+            raise UserError(f"bag={path}: cannot be read as a ROS 2 bag ({error})") from error
+        try:
+            self._check_topics()
+        except UserError:
+            self.reader.close()
+            raise
+
+    def __enter__(self) -> "BagReader":
+        """Return the reader."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the bag."""
+        self.reader.close()
+
+    def _check_topics(self) -> None:
+        kinds = {one.topic: one.msgtype for one in self.reader.connections}
+        allowed = ((IMAGE, COMPRESSED), (IMAGE,), (CAMERA_INFO,))
+        for key, topic, fits in zip(Topics._fields, self.topics, allowed, strict=True):
+            if topic not in kinds:
+                some = ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items())[:12])
+                raise UserError(
+                    f"{key}={topic}: the bag has no such topic; it has {some or 'none'}"
+                )
+            if kinds[topic] not in fits:
+                raise UserError(f"{key}={topic}: is of {kinds[topic]}, not {' or '.join(fits)}")
+
+    def messages(self) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield each message as it is stored: its connection, when it was recorded, its bytes.
+
+        Raises:
+            UserError: The bag is damaged.
+        """
+        try:
+            yield from self.reader.messages()
+        except Exception as error:  # of storages and compressions, many kinds
+            raise UserError(f"bag={self.path}: is damaged ({first_words(error)})") from error
+
+    def frames(self) -> Iterator[BagFrame]:
+        """Yield each color image with the depth of its moment, once the camera is known.
+
+        Raises:
+            UserError: A message is damaged, or color and depth are not of one size.
+        """
+        colors: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
+        depths: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
+        camera: Any = None
+        for connection, time, raw in self.messages():
+            if connection.topic not in self.topics:
+                continue
+            message = self._read(connection, raw)
+            if connection.topic == self.topics.camera_info:
+                camera = message
+                self.distorted |= is_distorted(message)
+                continue
+            own, other = (
+                (colors, depths) if connection.topic == self.topics.color else (depths, colors)
+            )
+            stamp = stamp_of(message)
+            near = min(other, key=lambda one: abs(one[0] - stamp), default=None)
+            if near is None or abs(near[0] - stamp) > self.tolerance or camera is None:
+                self.unpaired += own is colors and len(own) == _WAITING
+                own.append((stamp, time, message))
+                continue
+            other.remove(near)
+            mine = (stamp, time, message)
+            yield self._make(*((mine, near) if own is colors else (near, mine)), camera)
+        self.unpaired += len(colors)
+
+    def _read(self, connection: Any, raw: bytes) -> Any:
+        try:
+            return open_types().deserialize_cdr(raw, connection.msgtype)
+        except Exception as error:  # of struct, numpy and assertions
+            raise UserError(
+                f"bag={self.path}: a message of {connection.topic} is damaged "
+                f"({first_words(error)})"
+            ) from error
+
+    def _make(self, color: tuple[int, int, Any], depth: tuple[int, int, Any], camera: Any) -> Any:
+        rgb = decode_color(color[2], self.topics.color)
+        z = decode_depth(depth[2], self.topics.depth)
+        if rgb.shape[:2] != z.shape:
+            raise UserError(
+                f"depth={self.topics.depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image "
+                f"has {rgb.shape[1]}x{rgb.shape[0]}; name a topic of depth aligned to color"
+            )
+        return BagFrame(rgb, z, decode_intrinsics(camera), color[2].header, color[1])
+
+
+class BagWriter:
+    """A new bag; it comes to be when it is closed without an error, whole.
+
+    Args:
+        path: The .mcap file to write, or without that ending a bag's folder.
+        topic: Where detections go.
+
+    Raises:
+        UserError: The path exists already.
+    """
+
+    def __init__(self, path: Path, topic: str) -> None:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        if path.exists():
+            raise UserError(f"out={path}: exists already; choose another")
+        self.path, self.topic = path, topic
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.parts = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        name = path.stem if path.suffix == ".mcap" else path.name
+        self.writer = Writer(self.parts / name, version=9, storage_plugin=StoragePlugin.MCAP)
+        self.copies: dict[int, Any] = {}
+
+    def __enter__(self) -> "BagWriter":
+        """Open the bag."""
+        self.writer.open()
+        self.detections = self.writer.add_connection(self.topic, DETECTIONS, typestore=open_types())
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the bag, and put it into its place; after an error nothing is left."""
+        try:
+            self.writer.close()
+            if kind is None:
+                whole = self.writer.path
+                if self.path.suffix == ".mcap":
+                    (whole,) = whole.glob("*.mcap")
+                whole.rename(self.path)
+        finally:
+            shutil.rmtree(self.parts, ignore_errors=True)
+
+    def write(self, message: Any, time: int) -> None:
+        """Write a Detection3DArray at a time [ns]."""
+        self.writer.write(self.detections, time, open_types().serialize_cdr(message, DETECTIONS))
+
+    def copy(self, connections: Sequence[Any], messages: Iterator[tuple[Any, int, bytes]]) -> None:
+        """Write the messages of another bag, as they are.
+
+        Raises:
+            UserError: It has messages on the topic of the detections.
+        """
+        for one in connections:
+            if one.topic == self.topic:
+                raise UserError(
+                    f"detections={self.topic}: the bag has this topic already; name another"
+                )
+            self.copies[one.id] = self.writer.add_connection(
+                one.topic,
+                one.msgtype,
+                msgdef=one.msgdef.data,
+                rihs01=one.digest or "RIHS01_",
+                offered_qos_profiles=one.ext.offered_qos_profiles,
+            )
+        for connection, time, raw in messages:
+            self.writer.write(self.copies[connection.id], time, raw)
+
+
+def first_words(error: Exception) -> str:
+    """Return what an error says in one short line."""
+    lines = str(error).splitlines()
+    return (lines[0] if lines else type(error).__name__)[:200]

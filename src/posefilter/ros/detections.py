@@ -1,0 +1,100 @@
+"""Results as vision_msgs/Detection3DArray."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from posefilter.estimator import Result
+from posefilter.geometry.rotation import hat, quat_xyzw_from_matrix
+from posefilter.ros.messages import DETECTIONS, make_message
+
+
+def to_ros_covariance(covariance: np.ndarray, pose: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return a covariance in ROS's convention.
+
+    ROS has the position of the object frame's origin [m] and a turn about the camera's fixed axes
+    [rad]; ours are the shift of the object's center in the camera's axes and a turn about that
+    center in the object's.  A turn w about the center, in the object's axes, moves the origin by
+    R [center] w.
+
+    Args:
+        covariance: (6, 6) as `Belief.covariance`.
+        pose: (4, 4) camera_from_object [m], about which it is.
+        center: (3,) the object's center in its own frame [m].
+
+    Returns:
+        (6, 6), rows and columns [x, y, z, rotation about x, y, z].
+    """
+    R = pose[:3, :3]
+    J = np.eye(6)
+    J[:3, 3:] = R @ hat(torch.from_numpy(np.asarray(center, dtype=np.float64))).numpy()
+    J[3:, 3:] = R
+    return np.asarray(J @ covariance @ J.T)
+
+
+def list_shown(results: Sequence[Result]) -> list[Result]:
+    """Return the results of objects that are not absent, and of tracks that are not lost."""
+    return [one for one in results if one.verdict != "absent" and getattr(one, "found", True)]
+
+
+def make_quaternion(pose: np.ndarray) -> list[float]:
+    """Return the rotation of a pose (4, 4) as a quaternion [x, y, z, w]."""
+    R = torch.from_numpy(pose[:3, :3].astype(np.float64))
+    return [float(value) for value in quat_xyzw_from_matrix(R)]
+
+
+def make_detections(results: Sequence[Result], header: Any) -> Any:
+    """Return a Detection3DArray with a detection for each object but those that are absent.
+
+    A detection's hypothesis has the calibrated probability as its score, NaN where there is none,
+    and the pose of the object's frame, that of its mesh file. Its box is the object's own.
+
+    Args:
+        results: Of one image, an object each.
+        header: Of the color image: time and the camera's optical frame.
+    """
+    made = [_make_detection(one, header) for one in list_shown(results)]
+    return make_message(DETECTIONS, header=header, detections=made)
+
+
+def _make_detection(result: Result, header: Any) -> Any:
+    belief, model = result.belief, result.model
+    covariance = to_ros_covariance(belief.covariance, belief.mean, belief.center)
+    middle = result.pose.copy()
+    points = model.points.detach().cpu().double().numpy()
+    low, high = points.min(0), points.max(0)
+    middle[:3, 3] += result.pose[:3, :3] @ ((low + high) / 2)
+    size = dict(zip("xyz", (high - low).tolist(), strict=True))
+    score = math.nan if result.probability is None else result.probability
+    hypothesis = make_message(
+        "vision_msgs/msg/ObjectHypothesis", class_id=result.object, score=score
+    )
+    pose = make_message(
+        "geometry_msgs/msg/PoseWithCovariance",
+        pose=_make_pose(result.pose),
+        covariance=covariance.reshape(36),
+    )
+    box = make_message(
+        "vision_msgs/msg/BoundingBox3D",
+        center=_make_pose(middle),
+        size=make_message("geometry_msgs/msg/Vector3", **size),
+    )
+    whole = make_message(
+        "vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose
+    )
+    return make_message(
+        "vision_msgs/msg/Detection3D", header=header, results=[whole], bbox=box, id=result.object
+    )
+
+
+def _make_pose(pose: np.ndarray) -> Any:
+    x, y, z, w = make_quaternion(pose)
+    place = dict(zip("xyz", pose[:3, 3].tolist(), strict=True))
+    return make_message(
+        "geometry_msgs/msg/Pose",
+        position=make_message("geometry_msgs/msg/Point", **place),
+        orientation=make_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )

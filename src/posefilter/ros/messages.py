@@ -1,0 +1,131 @@
+"""The messages that are read and written, by the package rosbags.
+
+A bag's own definitions of its messages are not used: code would be made of them.
+"""
+
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+
+from posefilter.errors import UserError
+from posefilter.limits import MOST_SIDE
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+DETECTIONS = "vision_msgs/msg/Detection3DArray"
+
+# vision_msgs 4
+_VISION = {
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id"
+    ),
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+_CHANNELS = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "8UC3": 3}
+_TO_RGB = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8UC3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "mono8": cv2.COLOR_GRAY2RGB,
+}
+_DEPTHS: dict[str, tuple[str, float]] = {
+    "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)
+}  # fmt: skip
+
+
+@cache
+def open_types() -> Any:
+    """Return the types of messages: those of ROS 2 Humble, and vision_msgs."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _VISION.items():
+        types.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    return types
+
+
+def make_message(name: str, **fields: Any) -> Any:
+    """Return a message of a type such as `geometry_msgs/msg/Pose`."""
+    return open_types().types[name](**fields)
+
+
+def decode_color(message: Any, topic: str) -> np.ndarray:
+    """Return the color of an Image or a CompressedImage.  -> (H, W, 3) uint8, RGB.
+
+    Raises:
+        UserError: It is damaged, or of an encoding that is not known.
+    """
+    if hasattr(message, "format"):
+        picture = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
+        if picture is None:
+            raise UserError(f"color={topic}: an image cannot be decoded ({message.format})")
+        return np.ascontiguousarray(picture[..., ::-1])
+    encoding = str(message.encoding)
+    if encoding not in _CHANNELS:
+        known = ", ".join(_CHANNELS)
+        raise UserError(f"color={topic}: encoding {encoding} is not known; there are {known}")
+    rows = _read_rows(message, topic, "color", np.dtype("u1"), _CHANNELS[encoding])
+    if encoding in _TO_RGB:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows), _TO_RGB[encoding]))
+    return np.ascontiguousarray(rows)
+
+
+def decode_depth(message: Any, topic: str) -> np.ndarray:
+    """Return the depth of an Image.  -> (H, W) float32 [m], 0 where unknown.
+
+    Raises:
+        UserError: It is damaged, or of an encoding that is not known.
+    """
+    encoding = str(getattr(message, "encoding", "compressed"))
+    if encoding not in _DEPTHS:
+        raise UserError(
+            f"depth={topic}: encoding {encoding} is not known; there are 16UC1 (millimeters) and "
+            f"32FC1 (meters)"
+        )
+    kind, scale = _DEPTHS[encoding]
+    order = ">" if message.is_bigendian else "<"
+    rows = _read_rows(message, topic, "depth", np.dtype(order + kind), 1)[..., 0]
+    depth = rows.astype(np.float32) * np.float32(scale)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def _read_rows(message: Any, topic: str, key: str, kind: np.dtype, channels: int) -> np.ndarray:
+    """Return an image's pixels (H, W, channels), without the padding of its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    needed = width * channels * kind.itemsize
+    sized = 0 < height <= MOST_SIDE and 0 < width <= MOST_SIDE
+    if not sized or step < needed or len(data) < step * height:
+        raise UserError(
+            f"{key}={topic}: an image of {width}x{height} pixels has {len(data)} bytes, of rows of "
+            f"{step}"
+        )
+    rows = data[: step * height].reshape(height, step)[:, :needed]
+    return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
+
+
+def decode_intrinsics(message: Any) -> np.ndarray:
+    """Return the camera matrix (3, 3) [px] of a CameraInfo: of the rectified image where it has
+    one.
+    """
+    P = np.asarray(message.p, dtype=np.float64).reshape(3, 4)[:, :3]
+    return P if P[0, 0] > 0 else np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+
+
+def is_distorted(message: Any) -> bool:
+    """Tell whether a CameraInfo has coefficients of lens distortion."""
+    return bool(np.any(np.asarray(message.d, dtype=np.float64) != 0))
+
+
+def stamp_of(message: Any) -> int:
+    """Return the time in a message's header [ns]."""
+    return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)

@@ -1,0 +1,259 @@
+"""What is exported answers as the method does, in programs without torch and posefilter."""
+
+import ast
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import posefilter
+from posefilter.cli import run_command
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
+from posefilter.deploy.resizing import Resize
+from posefilter.deploy.settings import describe_filter
+from posefilter.deploy.write import make_graphs, to_program, write_filter
+from posefilter.errors import UserError
+from posefilter.geometry.pose import fit_rigid, is_rigid, move_about
+from posefilter.geometry.rotation import random_rotation
+from posefilter.images import check_images, make_batch
+from posefilter.models.base import PoseEstimator
+
+HOME = Path(__file__).parents[2]
+SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
+
+
+def read_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return color (H, W, 3) uint8, depth (H, W) float32 [m] and K (3, 3) of a scene that ships."""
+    stem = min(SCENE.glob("*.left.jpg")).name.removesuffix(".left.jpg")
+    rgb = np.ascontiguousarray(cv2.imread(str(SCENE / f"{stem}.left.jpg"))[..., ::-1])
+    depth = cv2.imread(str(SCENE / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED) / 10000
+    (camera,) = json.loads((SCENE / "_camera_settings.json").read_text())["camera_settings"][:1]
+    own = camera["intrinsic_settings"]
+    K = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
+    return rgb, depth.astype(np.float32), K
+
+
+@pytest.fixture(scope="module")
+def poses(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    pytest.importorskip("onnxruntime", reason="needs the extra export")
+    return load_script("examples/onnx/poses.py")
+
+
+@pytest.fixture(scope="module")
+def pixels(poses: ModuleType, load_script: Callable[[str], ModuleType]) -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(HOME / "examples" / "onnx"))
+        return load_script("examples/onnx/pixels.py")
+
+
+@pytest.fixture(scope="module")
+def estimator() -> posefilter.Estimator:
+    return posefilter.load("003_cracker_box", device="cpu")
+
+
+@pytest.fixture(scope="module")
+def exported(estimator: posefilter.Estimator, poses: ModuleType, tmp_path_factory) -> Path:
+    pytest.importorskip("onnxscript", reason="needs the extra export")
+    folder: Path = tmp_path_factory.mktemp("exported")
+    height, width = read_scene()[1].shape
+    write_filter(estimator.methods[0], folder, width, height, "onnx")
+    return folder
+
+
+def make_pixel_method(*overrides: str) -> PoseEstimator:
+    """Return an untrained patch_pf of the cracker box, in test mode."""
+    job = compose_job("train", HOME / "conf", ["model=patch_pf", *overrides], Path())
+    torch.manual_seed(0)
+    model = posefilter.load("003_cracker_box", device="cpu").models[0]
+    return build_method(recipe(job), model, lightning=False).eval()
+
+
+def test_networks_are_those_of_torch(
+    exported: Path, estimator: posefilter.Estimator, poses: ModuleType, monkeypatch
+) -> None:
+    monkeypatch.setattr("posefilter.nets.encoding.fast_bfloat16", lambda device: False)
+    rgb, depth, K = read_scene()
+    graphs = make_graphs(estimator.methods[0], depth.shape[1], depth.shape[0])
+    images = torch.from_numpy(rgb), torch.from_numpy(depth), torch.from_numpy(K).float()
+    own = poses.PoseFilter(exported)
+    names = [one.name for one in own.encode.get_outputs()]
+    with torch.no_grad():
+        truth = graphs.encode.network(*images)
+    given = {"rgb": rgb, "depth": depth, "intrinsics": np.float32(K)}
+    scene = dict(zip(names, own.encode.run(names, given), strict=True))
+    for name, value in zip(names, truth, strict=True):
+        assert np.abs(scene[name] - value.numpy()).max() < 1e-3 * max(1, float(value.abs().max()))
+    draw = np.random.default_rng(0)
+    for count, points, sigma in ((1, 7, 0.04), (200, 64, 0.01)):
+        states = poses.draw_poses(
+            *(scene[name] for name in ("point", "weight", "share", "position")),
+            own.center, own.radius, count, draw,
+        )  # fmt: skip
+        scores = own.score(scene, states, sigma, points, np.random.default_rng(1))
+        noise = np.random.default_rng(1).standard_normal((points, 2), dtype=np.float32)
+        tensors = [torch.from_numpy(one) for one in (states, noise)]
+        with torch.no_grad():
+            same = graphs.measure.network(tensors[0], torch.tensor(sigma), tensors[1], *truth[:5])
+        assert scores.std() > 0 or count == 1
+        assert np.abs(scores - same.numpy()).max() < 2e-2  # of scores of up to hundreds
+
+
+def test_an_estimate_is_that_of_torch(
+    exported: Path, estimator: posefilter.Estimator, poses: ModuleType
+) -> None:
+    rgb, depth, K = read_scene()
+    pose, _, particles, weights = poses.PoseFilter(exported).estimate(rgb, depth, K)
+    points = estimator.models[0].points.numpy()
+    theirs = estimator.predict(rgb, depth, K).pose
+    apart = np.linalg.norm(
+        points @ (pose[:3, :3] - theirs[:3, :3]).T + pose[:3, 3] - theirs[:3, 3], axis=1
+    )
+    assert apart.mean() < 0.004
+    assert is_rigid(torch.from_numpy(pose))
+    assert particles.shape == (400, 4, 4)
+    assert weights.sum() == pytest.approx(1)
+
+
+def test_a_filter_over_pixels_takes_the_same_steps(pixels: ModuleType, tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript", reason="needs the extra export")
+    method = make_pixel_method(
+        *("filter/propagate=learned", "filter/resample=none", "filter/estimate=argmax"),
+        *("filter.particles=12", "filter.steps=3", "data.image_width=96"),
+    )
+    rgb, depth, K = read_scene()
+    write_filter(method, tmp_path, depth.shape[1], depth.shape[0], "onnx")
+    images, _ = check_images(rgb, depth, K)
+    batch = make_batch(images, 96, None)
+    with pytest.MonkeyPatch.context() as patch, torch.no_grad():
+        patch.setattr("posefilter.nets.encoding.fast_bfloat16", lambda device: False)
+        trace = method.predict_step(batch, 0)
+    start = trace.particles[0].state[0].numpy()
+    pose, score, found = pixels.PixelFilter(tmp_path).estimate(rgb, depth, K, start=start)
+    assert np.abs(trace.particles[-1].state[0].numpy() - start).max() > 0.5  # they moved
+    np.testing.assert_allclose(found["state"], trace.particles[-1].state[0], atol=0.02)
+    np.testing.assert_allclose(found["next_latent"], trace.outputs[-1].latent[0], atol=2e-3)
+    np.testing.assert_allclose(pose, trace.belief.best[0], atol=2e-3)
+    assert score == pytest.approx(float(trace.belief.score[0]), abs=1e-3)
+
+
+def test_agreement_finds_a_planted_pose_among_wrong_particles(pixels: ModuleType) -> None:
+    draw = np.random.default_rng(0)
+    truth = np.eye(4, dtype=np.float32)
+    truth[:3, :3], truth[:3, 3] = random_rotation(1)[0], (0.1, -0.05, 0.8)
+    objects = np.float32(draw.uniform(-1, 1, (100, 3)))
+    points = np.float32(0.1 * objects) @ truth[:3, :3].T + truth[:3, 3]
+    points[60:] += np.float32(draw.uniform(-0.2, 0.2, (40, 3)))
+    own = pixels.PixelFilter.__new__(pixels.PixelFilter)
+    rule = {"scale_m": 0.015, "hypotheses": 64, "iterations": 8}
+    own.settings = {"center": [0, 0, 0], "radius": 0.1, "estimate": rule}
+    found = {
+        "point": points, "known": np.ones(100, np.float32), "log_likelihood": np.zeros(100),
+        "share": np.ones((100, 1), np.float32), "position": objects[:, None],
+        "pose": np.tile(np.eye(4, dtype=np.float32), (100, 1, 1)),
+    }  # fmt: skip
+    pose, score = own.agree(found, np.random.default_rng(0))
+    np.testing.assert_allclose(pose, truth, atol=1e-3)
+    assert 0.55 < score < 0.7
+
+
+def test_the_examples_geometry_is_ours(poses: ModuleType) -> None:
+    R = random_rotation(8)
+    states = torch.eye(4).repeat(8, 1, 1)
+    states[:, :3, :3], states[:, :3, 3] = R, torch.randn(8, 3)
+    tangent, center = torch.randn(8, 6), torch.randn(3)
+    tangent[0] = 0
+    moved = poses.move(states.numpy(), tangent.numpy(), center.numpy())
+    np.testing.assert_allclose(moved, move_about(states, tangent, center), atol=1e-5)
+    source, target, weights = torch.randn(8, 5, 3), torch.randn(8, 5, 3), torch.rand(8, 5)
+    ours = fit_rigid(source, target, weights)
+    theirs = poses.fit_rigid(source.numpy(), target.numpy(), weights.numpy())
+    np.testing.assert_allclose(theirs, ours, atol=1e-4)
+
+
+def test_the_examples_draws_follow_their_weights(poses: ModuleType) -> None:
+    weights = np.random.default_rng(0).dirichlet(np.ones(30))
+    children = np.bincount(poses.resample(weights, 200, np.random.default_rng(1)), minlength=30)
+    assert (np.abs(children - 200 * weights) < 1).all()  # systematic: floor or ceil
+    drawn = poses.draw(np.stack([weights, weights[::-1]]), np.random.default_rng(2), 4000)
+    for row, wanted in zip(drawn, (weights, weights[::-1]), strict=True):
+        share = np.bincount(row, minlength=30) / 4000
+        assert (np.abs(share - wanted) < 5 * np.sqrt(wanted / 4000) + 1e-3).all()
+
+
+@pytest.mark.parametrize("name", ["poses", "pixels"])
+def test_the_examples_import_neither_torch_nor_us(name: str) -> None:
+    tree = ast.parse((HOME / "examples" / "onnx" / f"{name}.py").read_text())
+    found = {one.module for one in ast.walk(tree) if isinstance(one, ast.ImportFrom)}
+    found |= {a.name for one in ast.walk(tree) if isinstance(one, ast.Import) for a in one.names}
+    assert found <= {"json", "sys", "pathlib", "numpy", "onnxruntime", "cv2", "poses"}
+
+
+@pytest.mark.parametrize(
+    ("before", "width"), [((480, 640), 320), ((481, 643), 200), ((60, 80), 160), ((48, 64), 64)]
+)
+def test_images_are_resized_as_before_prediction(before: tuple[int, int], width: int) -> None:
+    draw = np.random.default_rng(0)
+    rgb = cv2.GaussianBlur(draw.integers(0, 256, (*before, 3), dtype=np.uint8), (0, 0), 2)
+    depth = np.float32(draw.uniform(0.6, 0.62, before) + (draw.random(before) < 0.3))
+    depth[draw.random(before) < 0.1] = 0
+    K = np.array([[0.9 * before[1], 0, 31.5], [0, 0.9 * before[1], 20.2], [0, 0, 1]])
+    ours = make_batch(check_images(rgb, depth, K)[0], width, None)
+    resize = Resize(before, (ours.rgb.shape[2], ours.rgb.shape[3]))
+    color, z, camera = resize(
+        torch.from_numpy(rgb), torch.from_numpy(depth), torch.from_numpy(K).float()
+    )
+    assert (color - ours.rgb).abs().max() < 1.01 / 255  # cv2 rounds ties otherwise
+    torch.testing.assert_close(z, ours.depth, atol=1e-6, rtol=0)
+    torch.testing.assert_close(camera, ours.intrinsics)
+
+
+def test_a_traced_program_runs_in_torch_alone(estimator: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    graphs = make_graphs(estimator.methods[0], depth.shape[1], depth.shape[0])
+    measure = torch.export.load(io.BytesIO(to_program(graphs.measure))).module()
+    images = torch.from_numpy(rgb), torch.from_numpy(depth), torch.from_numpy(K).float()
+    with torch.no_grad():
+        scene = graphs.encode.network(*images)[:5]
+        states = torch.eye(4).repeat(9, 1, 1)
+        states[:, 2, 3] = torch.linspace(0.4, 1.2, 9)
+        given = (states, torch.tensor(0.02), torch.randn(31, 2), *scene)
+        torch.testing.assert_close(
+            measure(*given), graphs.measure.network(*given), atol=1e-3, rtol=1e-4
+        )
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["model=cnn_patch"], "estimates no pose"),
+        (["model=pose_pf", "variant=paper"], "model/proposals=dense"),
+        (["model=patch_pf", "filter/resample=soft"], "filter/resample: Soft"),
+        (["model=patch_pf", "filter/estimate=mean"], "choose argmax"),
+    ],
+)
+def test_what_cannot_be_exported_is_named(overrides: list[str], named: str) -> None:
+    job = compose_job("train", HOME / "conf", overrides, Path())
+    model = posefilter.load("003_cracker_box", device="cpu").models[0]
+    with pytest.raises(UserError, match=named):
+        describe_filter(build_method(recipe(job), model, lightning=False))
+
+
+def test_mistakes_are_one_line(tmp_path: Path, capfd, monkeypatch) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("kept")
+    typed = ["checkpoint=003_cracker_box", "format=onnx"]
+    monkeypatch.setattr("posefilter.deploy.write.find_spec", lambda name: object())
+    assert run_command("export", HOME, [*typed, f"out={tmp_path / 'full'}"]) == 2
+    assert "name a new folder" in capfd.readouterr().err
+    monkeypatch.setattr("posefilter.deploy.write.find_spec", lambda name: None)
+    assert run_command("export", HOME, [*typed, f"out={tmp_path / 'new'}"]) == 2
+    assert "pip install 'posefilter[export]'" in capfd.readouterr().err
+    assert run_command("export", HOME, [*typed[:1], "format=tflite", f"out={tmp_path}"]) == 2
+    assert "choose weights, onnx, torch" in capfd.readouterr().err

@@ -1,0 +1,260 @@
+"""Bags in and out: the library's poses in ROS's conventions, and only what was there."""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("rosbags", reason="needs the extra bags")
+
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+import posefilter
+from posefilter.cli import run_command
+from posefilter.errors import UserError
+from posefilter.geometry.pose import move_about
+from posefilter.geometry.rotation import log_so3, quat_xyzw_from_matrix, random_rotation
+from posefilter.ros.bags import BagReader, Topics
+from posefilter.ros.detections import make_detections, to_ros_covariance
+from posefilter.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    DETECTIONS,
+    IMAGE,
+    decode_color,
+    decode_depth,
+    decode_intrinsics,
+    make_message,
+    open_types,
+)
+
+HOME = Path(__file__).parents[2]
+SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
+NAME = "003_cracker_box"
+FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "filter/refine=none"]
+TOPICS = Topics("/rgb", "/depth", "/info")
+TYPED = ["color=/rgb", "depth=/depth", "camera_info=/info"]
+
+
+def read_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return color (H, W, 3) uint8, depth (H, W) uint16 [mm] and K (3, 3) of a scene that ships."""
+    stem = min(SCENE.glob("*.left.jpg")).name.removesuffix(".left.jpg")
+    rgb = np.ascontiguousarray(cv2.imread(str(SCENE / f"{stem}.left.jpg"))[..., ::-1])
+    depth = cv2.imread(str(SCENE / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED) / 10
+    (camera,) = json.loads((SCENE / "_camera_settings.json").read_text())["camera_settings"][:1]
+    own = camera["intrinsic_settings"]
+    K = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
+    return rgb, depth.round().astype(np.uint16), K
+
+
+def make_header(milliseconds: int) -> Any:
+    seconds, rest = divmod(milliseconds, 1000)
+    stamp = make_message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest * 1_000_000)
+    return make_message("std_msgs/msg/Header", stamp=stamp, frame_id="camera_optical")
+
+
+def make_image(pixels: np.ndarray, encoding: str, time: int = 0, **fields: Any) -> Any:
+    height, width = pixels.shape[:2]
+    row = pixels.reshape(height, -1).view(np.uint8).reshape(height, -1)
+    given = {
+        "header": make_header(time), "height": height, "width": width, "encoding": encoding,
+        "is_bigendian": 0, "step": row.shape[1], "data": row.reshape(-1),
+    }  # fmt: skip
+    return make_message(IMAGE, **{**given, **fields})
+
+
+def make_info(K: np.ndarray) -> Any:
+    region = make_message(
+        "sensor_msgs/msg/RegionOfInterest",
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+    )  # fmt: skip
+    P = np.concatenate([K, np.zeros((3, 1))], axis=1)
+    return make_message(
+        CAMERA_INFO, header=make_header(0), height=1, width=1, distortion_model="plumb_bob",
+        d=np.zeros(5), k=K.reshape(9), r=np.eye(3).reshape(9), p=P.reshape(12),
+        binning_x=0, binning_y=0, roi=region,
+    )  # fmt: skip
+
+
+def write_bag(path: Path, messages: list[tuple[str, str, int, Any]]) -> Path:
+    """Write a bag of (topic, type, time [ms], message), and return its .mcap file."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {}
+        for topic, kind, time, message in messages:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=open_types())
+            raw = open_types().serialize_cdr(message, kind)
+            writer.write(topics[topic], time * 1_000_000, raw)
+    (file,) = path.glob("*.mcap")
+    return file
+
+
+def write_scene(path: Path, depth_after: tuple[int, ...] = (5, 3)) -> Path:
+    """Write a bag of one scene, once every 100 ms; the depth of each comes so many ms later."""
+    rgb, depth, K = read_scene()
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for number, after in enumerate(depth_after):
+        time = 100 * (number + 1)
+        messages += [
+            ("/rgb", IMAGE, time, make_image(rgb, "rgb8", time)),
+            ("/depth", IMAGE, time + after, make_image(depth, "16UC1", time + after)),
+        ]
+    return write_bag(path, messages)
+
+
+def read_bag(path: Path) -> Iterator[tuple[str, int, bytes]]:
+    with Reader(path) as reader:
+        for connection, time, raw in reader.messages():
+            yield connection.topic, time, bytes(raw)
+
+
+def test_detections_are_the_librarys_results(tmp_path: Path, capfd) -> None:
+    bag, out = write_scene(tmp_path / "in", (5, 3, 40)), tmp_path / "found.mcap"
+    typed = [str(bag), str(out), f"checkpoint={NAME}", *TYPED, *FEW, "console=json", "keep=true"]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert '"images": 2' in capfd.readouterr().out
+    stored = [*read_bag(out)]
+    raw = [(time, raw) for topic, time, raw in stored if topic == "/detections"]
+    assert [time for time, _ in raw] == [100_000_000, 200_000_000]  # the third has no depth near
+    copied = sorted((topic, time, raw) for topic, time, raw in stored if topic != "/detections")
+    assert copied == sorted(read_bag(bag))
+    alone = tmp_path / "tracked.mcap"
+    typed = [str(bag), str(alone), f"checkpoint={NAME}", *TYPED, *FEW, "track=true"]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert [(topic, time) for topic, time, _ in read_bag(alone)] == [
+        ("/detections", 100_000_000), ("/detections", 200_000_000)
+    ]  # fmt: skip
+    found = open_types().deserialize_cdr(raw[1][1], DETECTIONS)
+    assert (found.header.stamp.nanosec, found.header.frame_id) == (200_000_000, "camera_optical")
+    rgb, depth, K = read_scene()
+    estimator = posefilter.load(NAME, overrides=FEW, device="cpu")
+    result = estimator.predict(rgb, depth.astype(np.float32) * np.float32(1e-3), K)
+    (detection,) = found.detections
+    pose = detection.results[0].pose
+    place, turn = pose.pose.position, pose.pose.orientation
+    np.testing.assert_allclose([place.x, place.y, place.z], result.pose[:3, 3], atol=1e-6)
+    quaternion = quat_xyzw_from_matrix(torch.from_numpy(result.pose[:3, :3])).numpy()
+    assert abs(np.dot([turn.x, turn.y, turn.z, turn.w], quaternion)) == pytest.approx(1, abs=1e-9)
+    own = result.belief
+    wanted = to_ros_covariance(own.covariance, own.mean, own.center)
+    np.testing.assert_allclose(pose.covariance.reshape(6, 6), wanted, rtol=1e-6, atol=1e-12)
+    assert detection.id == detection.results[0].hypothesis.class_id == NAME
+    assert np.isnan(detection.results[0].hypothesis.score)  # another filter than was calibrated
+    size = detection.bbox.size
+    assert sorted([size.x, size.y, size.z]) == pytest.approx([0.07, 0.16, 0.21], abs=0.015)
+
+
+def test_covariance_is_that_of_the_origin_and_turns_about_the_cameras_axes() -> None:
+    torch.manual_seed(1)
+    mean = torch.eye(4, dtype=torch.float64)
+    mean[:3, :3], mean[:3, 3] = random_rotation(1)[0].double(), torch.tensor([0.1, 0.2, 0.9])
+    center = torch.tensor([0.05, -0.1, 0.2], dtype=torch.float64)
+    root = 1e-3 * torch.randn(6, 6, dtype=torch.float64)
+    moved = move_about(
+        mean.expand(20_000, 4, 4), torch.randn(20_000, 6, dtype=torch.float64) @ root.T, center
+    )
+    shift = moved[:, :3, 3] - mean[:3, 3]
+    turn = log_so3(moved[:, :3, :3] @ mean[:3, :3].T)
+    seen = np.cov(torch.cat([shift, turn], dim=1).numpy().T)
+    ours = to_ros_covariance((root @ root.T).numpy(), mean.numpy(), center.numpy())
+    np.testing.assert_allclose(ours, seen, atol=0.05 * np.abs(seen).max())
+
+
+def test_what_is_absent_or_lost_is_no_detection() -> None:
+    rgb, depth, K = read_scene()
+    estimator = posefilter.load(NAME, overrides=FEW, device="cpu")
+    result = estimator.predict(rgb, depth.astype(np.float32) * np.float32(1e-3), K)
+    there = dataclasses.replace(result, probability=0.93, presence=0.99)
+    gone = dataclasses.replace(result, probability=0.01, presence=0.02)
+    assert (there.verdict, gone.verdict) == ("found", "absent")
+    message = make_detections([there, gone], make_header(0))
+    assert [one.results[0].hypothesis.score for one in message.detections] == [0.93]
+
+
+def test_images_are_read_in_every_layout() -> None:
+    draw = np.random.default_rng(0)
+    rgb = draw.integers(0, 256, (6, 5, 3), dtype=np.uint8)
+    padded = np.concatenate([rgb.reshape(6, 15), np.full((6, 4), 7, np.uint8)], axis=1)
+    cases = [
+        make_image(rgb, "rgb8"),
+        make_image(np.ascontiguousarray(rgb[..., ::-1]), "bgr8"),
+        make_image(np.dstack([rgb, rgb[..., :1]]), "rgba8"),
+        make_image(rgb, "rgb8", step=19, data=padded.reshape(-1)),
+    ]
+    for message in cases:
+        np.testing.assert_array_equal(decode_color(message, "/rgb"), rgb)
+    png = cv2.imencode(".png", rgb[..., ::-1])[1].reshape(-1)
+    packed = make_message(COMPRESSED, header=make_header(0), format="png", data=png)
+    np.testing.assert_array_equal(decode_color(packed, "/rgb"), rgb)
+    meters = np.float32([[0.5, np.nan, 1.25], [0, np.inf, -1]])
+    kept = np.float32([[0.5, 0, 1.25], [0, 0, 0]])
+    np.testing.assert_array_equal(decode_depth(make_image(meters, "32FC1"), "/d"), kept)
+    big = np.array([[500, 0, 1250]], dtype=">u2")
+    message = make_image(big, "16UC1", is_bigendian=1)
+    np.testing.assert_allclose(decode_depth(message, "/d"), kept[:1], rtol=1e-6)
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    np.testing.assert_array_equal(decode_intrinsics(make_info(K)), K)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"encoding": "yuv422"}, {"data": np.zeros(3, np.uint8)}, {"step": 2}, {"width": 0},
+        {"height": 2**31},
+    ],
+)  # fmt: skip
+def test_a_damaged_image_is_named(broken: dict[str, Any]) -> None:
+    message = dataclasses.replace(make_image(np.zeros((4, 4, 3), np.uint8), "rgb8"), **broken)
+    with pytest.raises(UserError, match="color=/rgb"):
+        decode_color(message, "/rgb")
+
+
+def test_each_image_has_the_depth_nearest_in_time(tmp_path: Path) -> None:
+    K = np.array([[100.0, 0, 2], [0, 100, 2], [0, 0, 1]])
+    messages = [("/info", CAMERA_INFO, 0, make_info(K))]
+    for number in range(6):
+        color = np.full((4, 4, 3), number, np.uint8)
+        depth = np.full((4, 4), 1000 + number, np.uint16)
+        time = 33 * (number + 1)
+        messages.append(("/rgb", IMAGE, time, make_image(color, "rgb8", time)))
+        if number != 3:  # which has none
+            # it arrives late, after the next image
+            messages.append(("/depth", IMAGE, time + 40, make_image(depth, "16UC1", time + 4)))
+    bag = write_bag(tmp_path / "in", sorted(messages, key=lambda one: one[2]))
+    with BagReader(bag, TOPICS, 0.01) as reader:
+        frames = [*reader.frames()]
+        assert reader.unpaired == 1
+    pairs = [(int(one.rgb[0, 0, 0]), round(float(one.depth[0, 0]) * 1000)) for one in frames]
+    assert pairs == [(number, 1000 + number) for number in (0, 1, 2, 4, 5)]
+
+
+def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
+    bag = write_scene(tmp_path / "in", (50,))
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
+    (tmp_path / "there.mcap").write_text("mine")
+    cases = [
+        ([str(bag)], ["color=/nothing"], "/rgb (sensor_msgs/msg/Image)"),
+        ([str(bag)], ["color=/info"], "is of sensor_msgs/msg/CameraInfo"),
+        ([str(bag)], [], "no color image has depth within tolerance=0.01"),
+        ([str(broken)], [], "bag="),
+        ([str(tmp_path / "no.mcap")], [], "no such file"),
+        ([str(bag), str(tmp_path / "there.mcap")], [], "exists already"),
+        ([str(bag)], ["track=maybe"], "choose true or false"),
+    ]
+    for places, settings, said in cases:
+        places = places if len(places) == 2 else [*places, str(tmp_path / "new.mcap")]
+        typed = [*places, f"checkpoint={NAME}", *TYPED, *FEW, *settings]
+        assert run_command("convert_bag", HOME, typed) == 2, said
+        error = capfd.readouterr().err.strip()
+        assert said in error
+        assert "\n" not in error
+    assert not (tmp_path / "new.mcap").exists()
+    assert [one.name for one in tmp_path.glob(".*")] == []
+    assert (tmp_path / "there.mcap").read_text() == "mine"
