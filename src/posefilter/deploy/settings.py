@@ -39,7 +39,7 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         "initialize": _describe_start(own.initialize),
         "resample": _choose(own.resample, "resample", systematic=resample.Systematic,
                             none=resample.NoResampling),
-        "reweight": _choose(own.reweight, "reweight", annealed=reweight.Annealed),
+        "reweight": _choose(own.reweight, "reweight", current_likelihood=reweight.Annealed),
         "propagate": [part for one in _list(own.propagate) for part in _describe_move(one, method)],
         "estimate": _describe_estimate(own.estimate),
         "refine": [part for one in _list(own.refine) for part in _describe_refinement(one)],

@@ -36,8 +36,8 @@ def to_ros_covariance(covariance: np.ndarray, pose: np.ndarray, center: np.ndarr
 
 
 def list_shown(results: Sequence[Result]) -> list[Result]:
-    """Return the results of objects that are not absent, and of tracks that are not lost."""
-    return [one for one in results if one.verdict != "absent" and getattr(one, "found", True)]
+    """Return the results of objects that are not absent; of tracks, those that are not lost."""
+    return [one for one in results if getattr(one, "found", one.verdict != "absent")]
 
 
 def make_quaternion(pose: np.ndarray) -> list[float]:
@@ -47,7 +47,8 @@ def make_quaternion(pose: np.ndarray) -> list[float]:
 
 
 def make_detections(results: Sequence[Result], header: Any) -> Any:
-    """Return a Detection3DArray with a detection for each object but those that are absent.
+    """Return a Detection3DArray with a detection for each object but those that are absent, or
+    whose track is lost.
 
     A detection's hypothesis has the calibrated probability as its score, NaN where there is none,
     and the pose of the object's frame, that of its mesh file. Its box is the object's own.
