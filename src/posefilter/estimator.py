@@ -41,14 +41,14 @@ class Result:
             is arbitrary, so it is no measure of confidence: `probability` is.
         probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
             object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
-            not calibrated; `uncalibrated` says why.
+            not calibrated; `calibration_note` says why.
         presence: That the object is there, whatever the pose: at least `probability`, or None.
         belief: Every particle and its weight.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         seconds: The filter's time for this image, its share of a batch.
         model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
-        uncalibrated: Why there is no probability; empty where there is one.
+        calibration_note: In words, why there is no probability; empty where there is one.
         conformal: What `conformal_set` goes by; None where the calibration has none.
         surface: The share of the object's surface points at which the depth shows a surface, by
             which the group of a conformal set is chosen.
@@ -64,7 +64,7 @@ class Result:
     seconds: float
     model: ObjectModel
     costs: Costs = field(default_factory=Costs, kw_only=True)
-    uncalibrated: str = field(default="", kw_only=True)
+    calibration_note: str = field(default="", kw_only=True)
     conformal: Conformal | None = field(default=None, kw_only=True)
     surface: float = field(default=math.nan, kw_only=True)
 
@@ -106,7 +106,7 @@ class Result:
             UserError: The checkpoint was not calibrated for sets.
         """
         if self.conformal is None:
-            why = self.uncalibrated or "it was calibrated by an earlier version, without sets"
+            why = self.calibration_note or "it was calibrated by an earlier version, without sets"
             raise UserError(f"{self.object}: has no conformal sets ({why})")
         check_share(level)
         limit = self.conformal.find_limit(level, self.surface)
@@ -311,7 +311,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         seconds=run.seconds,
         model=model,
         costs=costs or Costs(),
-        uncalibrated="" if found is not None else explain_missing(run.method),
+        calibration_note="" if found is not None else explain_missing(run.method),
         conformal=None if found is None or calibration is None else calibration.conformal,
         surface=math.nan if run.surface is None else float(run.surface[image]),
     )
@@ -320,7 +320,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
 def explain_missing(method: PoseEstimator) -> str:
     """Return why an estimate has no probability."""
     known = method.calibration is not None
-    return "no pixel of the frame has depth" if known else method.uncalibrated
+    return "no pixel of the frame has depth" if known else method.calibration_note
 
 
 def get_trained_size(settings: dict[str, Any]) -> tuple[int | None, int | None]:

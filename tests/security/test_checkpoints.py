@@ -243,4 +243,4 @@ def test_a_calibration_as_it_should_be_is_read(content: dict[str, Any], save: Sa
     assert method.calibration.features == ("a", "b")
     other = method_of(read_checkpoint(save(content)), {"filter": {"particles": 5}})
     assert other.calibration is None
-    assert "another filter" in other.uncalibrated
+    assert "another filter" in other.calibration_note

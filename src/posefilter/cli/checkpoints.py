@@ -139,5 +139,5 @@ def method_of(
         if same:
             method.calibration = read_calibration(checkpoint["calibration"], "checkpoint")
         else:
-            method.uncalibrated = "the checkpoint was calibrated for another filter"
+            method.calibration_note = "the checkpoint was calibrated for another filter"
     return method.eval()

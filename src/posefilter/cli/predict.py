@@ -160,7 +160,7 @@ def print_result(result: Result) -> None:
     place = np.array2string(1000 * result.pose[:3, 3], precision=1)
     if result.verdict is None:
         print(f"{result.object} at {place} mm, {result.seconds:.2f} s")
-        print(f"no probability: {result.uncalibrated}")
+        print(f"no probability: {result.calibration_note}")
     elif result.verdict == "absent":
         print(f"{result.describe()}, {result.seconds:.2f} s")
     else:
@@ -192,7 +192,7 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
         "verdict": result.verdict,
         "probability": result.probability,
         "presence": result.presence,
-        "probability_is": result.uncalibrated or _PROBABILITY,
+        "probability_is": result.calibration_note or _PROBABILITY,
         "costs": asdict(result.costs),
         "camera_from_object": None if absent else pose.tolist(),
         "rotation": None if absent else pose[:3, :3].tolist(),
