@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ from posefilter.confidence.evidence import measure_depth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
+from posefilter.instances.detect import detect
+from posefilter.instances.pixels import resize_mask
 from posefilter.limits import MOST_SIDE
 from posefilter.models.base import PoseEstimator
 from posefilter.plausibility import find_warnings
@@ -26,6 +29,8 @@ from posefilter.types import Belief as BeliefTensors
 
 if TYPE_CHECKING:
     from posefilter.figures.overlay import Shape
+
+_MOST = 100  # instances of an object
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +57,9 @@ class Result:
         conformal: What `conformal_set` goes by; None where the calibration has none.
         surface: The share of the object's surface points at which the depth shows a surface, by
             which the group of a conformal set is chosen.
+        instance: Which of its class it is, from 0, the most probable first.
+        mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
+            else None.
     """
 
     object: str
@@ -67,6 +75,8 @@ class Result:
     calibration_note: str = field(default="", kw_only=True)
     conformal: Conformal | None = field(default=None, kw_only=True)
     surface: float = field(default=math.nan, kw_only=True)
+    instance: int = field(default=0, kw_only=True)
+    mask: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def verdict(self) -> Verdict | None:
@@ -214,8 +224,19 @@ class Estimator:
         """What is known of each object: its center, size, surface points and hull."""
         return tuple(method.model for method in self.methods)
 
-    def predict(self, rgb: Any, depth: Any, intrinsics: Any, *, seed: int = 0) -> Any:
+    def predict(
+        self,
+        rgb: Any,
+        depth: Any,
+        intrinsics: Any,
+        *,
+        instances: int | Mapping[str, int] | None = None,
+        seed: int = 0,
+    ) -> Any:
         """Find each object in an image, or in each of a batch.
+
+        With `instances`, an image may show an object more than once, and no two results are on the
+        same pixels: the more probable keeps them.  An object that is absent then has no result.
 
         Args:
             rgb: Color, RGB, as a numpy array or tensor: (H, W, 3) or (3, H, W), uint8 or float in
@@ -223,18 +244,25 @@ class Estimator:
             depth: z-depth (H, W) in meters, as float, aligned with the color; 0 or NaN where
                 unknown; or (B, H, W).
             intrinsics: Camera matrix (3, 3) [px] of these images; or one each, (B, 3, 3).
+            instances: How many of each object an image shows at most: a number, or one for each
+                name, 1 for those left out.  None: one answer an object, whatever it covers.
             seed: Decides every random draw of the filter: the same images and seed give the same
                 answer.
 
         Returns:
             A `Result` where one image is given and one object was loaded; a list of them, an
             object each, where several were loaded; for a batch, a list with one of these an image.
+            With `instances` a list of all that is found, the most probable first.
             `predict_batch` returns the same always as a list of lists.
 
         Raises:
-            UserError: Images or intrinsics are not as they should be.
+            UserError: Images or intrinsics are not as they should be, or `instances` is no number
+                from 1 to 100.
         """
         images, batched = check_images(rgb, depth, intrinsics)
+        if instances is not None:
+            several = self._detect(images, count_instances(instances, self.objects), seed)
+            return several if batched else several[0]
         found = collect_results(self.run(images, seed), self.costs)
         answers = [own if len(self.methods) > 1 else own[0] for own in found]
         return answers if batched else answers[0]
@@ -249,6 +277,34 @@ class Estimator:
         """
         images, _ = check_images(rgb, depth, intrinsics)
         return collect_results(self.run(images, seed), self.costs)
+
+    def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
+        """Find several instances: a list of results an image, the most probable first."""
+        for method in self.methods:
+            method.seed = seed
+        size = (images.depth.shape[1], images.depth.shape[2])
+        out = []
+        for i in range(len(images.depth)):
+            one = Images(*(part[i : i + 1] for part in images))
+            batches = [
+                Batch(*(x.to(method.device) for x in make_batch(one, *own)))
+                for method, own in zip(self.methods, self._sizes, strict=True)
+            ]
+            found, seconds = detect(self.methods, batches, counts, self.costs)
+            many = Counter(each.number for each in found)
+            before, results = Counter[int](), []
+            for each in found:
+                number, trace = each.number, Trace((), (), (), each.belief)
+                spent = seconds[number] / many[number]
+                run = Run(self.methods[number], batches[number], trace, spent, each.assessment)
+                result = make_result(run, 0, self.costs)
+                mask = resize_mask(each.mask, size).cpu().numpy()
+                # a conformal set holds for the filter that was calibrated, this one is smaller
+                which = before[number]
+                results.append(replace(result, instance=which, mask=mask, conformal=None))
+                before[number] += 1
+            out.append(results)
+        return out
 
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did."""
@@ -267,6 +323,28 @@ class Estimator:
                 surface = measure_depth(trace.belief.best, batch, method.model)["surface"]
             runs.append(Run(method, batch, trace, seconds, found, surface))
         return runs
+
+
+def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) -> list[int]:
+    """Return how many instances of each object are searched for.
+
+    Args:
+        instances: A number, or one for each name; 1 for the names left out.
+        objects: The names.
+
+    Raises:
+        UserError: One is no whole number from 1 to 100, or no object has the name.
+    """
+    wanted = dict(instances) if isinstance(instances, Mapping) else {}
+    unknown = sorted(set(wanted) - set(objects))
+    if unknown:
+        raise UserError(f"instances: {unknown[0]} is not loaded, only {', '.join(objects)}")
+    rest = 1 if isinstance(instances, Mapping) else instances
+    counts = [wanted.get(name, rest) for name in objects]
+    for count in counts:
+        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= _MOST:
+            raise UserError(f"instances={count}: a whole number from 1 to {_MOST} is due")
+    return counts
 
 
 def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:

@@ -104,9 +104,11 @@ RANGES: dict[str, Range] = {
     "generate.distractors": _whole(0, 1000),
     "generate.tabletop_share": SHARE,
     "generate.absent_share": SHARE,
+    "generate.instances": _whole(1, 100),
     "generate.frames_per_scene": COUNT,
     # other commands
     "check_data.limit": _whole(1),
+    "predict.instances": _whole(1, 100),
     "predict.depth_scale": Range(1e-2, 1e7),
     "cost_false_alarm": POSITIVE,
     "cost_miss": POSITIVE,

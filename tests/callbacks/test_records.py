@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from posefilter.callbacks.records import (
-    HEADER,
-    Outcome,
-    PoseRow,
-    collect_outcomes,
-    read_poses_csv,
-    to_mesh,
-    to_native,
-    to_rows,
-    write_beliefs,
-    write_poses_csv,
-)
+from posefilter.callbacks.records import Outcome, collect_outcomes, to_rows, write_beliefs
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import random_rotation
+from posefilter.metrics.bop_results import (
+    HEADER,
+    PoseRow,
+    read_poses_csv,
+    to_mesh,
+    to_native,
+    write_poses_csv,
+)
 from posefilter.types import Batch, Belief, Trace
 
 

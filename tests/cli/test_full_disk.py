@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from posefilter.belief import Belief
-from posefilter.callbacks.records import PoseRow, write_beliefs, write_poses_csv
+from posefilter.callbacks.records import write_beliefs
 from posefilter.cli.files import save_whole
 from posefilter.cli.results import write_json
 from posefilter.data.cache import DiskCache
@@ -19,6 +19,7 @@ from posefilter.data.checking.contact_figure import write_sheet
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
+from posefilter.metrics.bop_results import PoseRow, write_poses_csv
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.synthetic.fat_format import write_image
 

@@ -14,6 +14,7 @@ import torch
 import posefilter
 from posefilter.cli.command import run_command
 from posefilter.images import check_images
+from posefilter.metrics.bop_results import read_poses_csv
 
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
@@ -104,6 +105,40 @@ def test_several_checkpoints_give_one_list_and_one_overlay(
     assert (np.abs(picture[:height].astype(int) - plain).max(-1) > 60).mean() > 0.002
     assert run_command("predict", arguments=[*typed, "view=true"]) == 2
     assert not (tmp_path / "pose.json").exists()
+
+
+def test_instances_are_listed_once_each_and_absent_ones_are_named(
+    estimator: posefilter.Estimator, tmp_path: Path
+) -> None:
+    rgb, depth, K = read_scene()
+    stem = SCENE / sorted(SCENE.glob("*.left.jpg"))[0].name.removesuffix(".left.jpg")
+    typed = [
+        f"checkpoint=[{NAME},025_mug]",
+        f"rgb={stem}.left.jpg",
+        f"depth={stem}.left.depth.png",
+        f"intrinsics={K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}",
+        "instances=2",
+        f"out={tmp_path}",
+        "console=json",
+    ]
+    assert run_command("predict", arguments=typed) == 0
+    told = json.loads((tmp_path / "poses.json").read_text())
+    rows = read_poses_csv(tmp_path / "poses.csv")
+    alone = estimator.predict(rgb, depth, K)
+    # the one that is there, where the whole filter finds it; the rest is less probable
+    assert told[0]["object"] == NAME
+    assert told[0]["verdict"] == "found"
+    found = np.array(told[0]["camera_from_object"])
+    assert np.linalg.norm(found[:3, 3] - alone.pose[:3, 3]) < 0.01
+    assert [one["verdict"] for one in told].count("found") == 1
+    assert {one["object"] for one in told} == {NAME, "025_mug"}
+    assert len(rows) == sum(one["camera_from_object"] is not None for one in told)
+    assert rows[0].obj_id == 2  # of YCB-Video's classes
+    assert np.allclose(rows[0].camera_from_native, found)
+    for one in told:
+        if one["camera_from_object"] is not None:
+            assert one["visible_pixels"] > 0
+            assert Path(one["belief_file"]).is_file()
 
 
 def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> None:

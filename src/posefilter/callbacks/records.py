@@ -1,9 +1,7 @@
 """Results of a test by image: poses in the format of the BOP challenge, and whole beliefs."""
 
-import csv
 import math
 from collections.abc import Callable, Sequence
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,12 +10,11 @@ from lightning import LightningModule, Trainer
 
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
-from posefilter.errors import UserError
-from posefilter.files import open_whole, open_whole_text
+from posefilter.files import open_whole
+from posefilter.metrics.bop_results import PoseRow, to_native
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
-HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 NativeFromMesh = Callable[[str], np.ndarray]
 
 
@@ -34,17 +31,6 @@ class Outcome(NamedTuple):
     poses: np.ndarray  # (N, 4, 4) float32
     weights: np.ndarray  # (N,) float32, summing to 1
     probability: float = math.nan  # that the estimate is right, where the method is calibrated
-
-
-class PoseRow(NamedTuple):
-    """One line of a BOP results file, the pose in the dataset's own object frame."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    score: float
-    camera_from_native: np.ndarray  # (4, 4) float64 [m]
-    seconds: float  # -1 where unknown, as BOP has it
 
 
 class Records(TraceCallback):
@@ -123,102 +109,6 @@ def to_rows(
         score = outcome.probability if known else outcome.score
         rows.append(PoseRow(record.scene_id, record.im_id, record.obj_id, score, pose, seconds))
     return rows
-
-
-def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:
-    """Return poses of the dataset's own object frame.
-
-    (*, 4, 4) of the mesh file's -> (*, 4, 4) float64.
-    """
-    return np.asarray(camera_from_object, np.float64) @ np.linalg.inv(
-        np.asarray(native_from_mesh, np.float64)
-    )
-
-
-def to_mesh(camera_from_native: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:
-    """Return poses of the mesh file's frame: undoes `to_native`."""
-    return np.asarray(camera_from_native, np.float64) @ np.asarray(native_from_mesh, np.float64)
-
-
-def write_poses_csv(path: Path, rows: Sequence[PoseRow]) -> None:
-    """Write a BOP results file: R row by row, t in millimeters, every digit kept, so that reading
-    gives the same numbers.
-    """
-    with open_whole_text(path) as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        for row in rows:
-            pose = np.asarray(row.camera_from_native, np.float64)
-            R = " ".join(repr(float(x)) for x in pose[:3, :3].reshape(-1))
-            t_mm = " ".join(
-                format(Decimal(repr(float(x))).scaleb(3), "f") for x in pose[:3, 3]
-            )  # moves the point, rounds nothing
-            writer.writerow(
-                [
-                    row.scene_id,
-                    row.im_id,
-                    row.obj_id,
-                    repr(float(row.score)),
-                    R,
-                    t_mm,
-                    repr(float(row.seconds)),
-                ]
-            )
-
-
-def read_poses_csv(path: Path) -> list[PoseRow]:
-    """Read a BOP results file; its header may be missing.
-
-    Raises UserError, naming file and line, where it is malformed.
-    """
-    if not path.is_file():
-        raise UserError(f"estimates={path}: no such file")
-    rows = []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        for number, cells in enumerate(csv.reader(file), start=1):
-            if not cells or (number == 1 and cells[0].strip().lstrip("\ufeff") == HEADER[0]):
-                continue
-            rows.append(_parse(cells, f"{path}, line {number}"))
-    return rows
-
-
-def _parse(cells: Sequence[str], where: str) -> PoseRow:
-    if len(cells) != len(HEADER):
-        raise UserError(
-            f"{where}: {len(cells)} columns where {len(HEADER)} are due ({','.join(HEADER)})"
-        )
-    scene, image, object_id = (
-        _whole(cell, name, where) for cell, name in zip(cells[:3], HEADER[:3], strict=True)
-    )
-    pose = np.eye(4)
-    pose[:3, :3] = np.reshape([float(x) for x in _numbers(cells[4], 9, "R", where)], (3, 3))
-    pose[:3, 3] = [float(x.scaleb(-3)) for x in _numbers(cells[5], 3, "t", where)]
-    R = pose[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
-        raise UserError(f"{where}: R is no rotation (nine numbers, row by row, are due)")
-    score, seconds = (_numbers(cells[i], 1, HEADER[i], where)[0] for i in (3, 6))
-    return PoseRow(scene, image, object_id, float(score), pose, float(seconds))
-
-
-def _whole(cell: str, name: str, where: str) -> int:
-    try:
-        return int(cell)
-    except ValueError as error:
-        raise UserError(f"{where}: {name} is {cell!r}, and should be a whole number") from error
-
-
-def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
-    try:
-        numbers = [Decimal(part) for part in cell.split()]
-    except InvalidOperation as error:
-        raise UserError(f"{where}: {name} holds something that is no number: {cell!r}") from error
-    if len(numbers) != count:
-        raise UserError(
-            f"{where}: {name} has {len(numbers)} numbers where {count} are due, separated by blanks"
-        )
-    if name in "Rt" and not all(number.is_finite() for number in numbers):
-        raise UserError(f"{where}: {name} is not finite: {cell!r}")
-    return numbers
 
 
 def write_beliefs(

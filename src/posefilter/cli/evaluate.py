@@ -10,14 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.errors import ErrorTable, make_rows
-from posefilter.callbacks.records import (
-    Records,
-    read_poses_csv,
-    to_mesh,
-    to_rows,
-    write_beliefs,
-    write_poses_csv,
-)
+from posefilter.callbacks.records import Records, to_rows, write_beliefs
 from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
@@ -35,6 +28,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.metrics.bop import BopErrors
+from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
 from posefilter.metrics.collect import BoxIoU, PoseErrors
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors

@@ -9,6 +9,7 @@ from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
 from posefilter.figures.preview import draw_preview
+from posefilter.meshes.store import MeshStore
 from posefilter.synthetic.generate import Summary
 
 
@@ -19,7 +20,7 @@ def generate(job: Job) -> None:
     shown = bool(job.cfg.progress) and job.cfg.console != JSON
     summary = instantiate({**job.cfg.generate, "progress": shown}, "generate")
     assert isinstance(summary, Summary)
-    preview = draw(summary, job.cfg.object)
+    preview = draw(summary, job)
     if job.cfg.console != JSON:
         speed = f" ({summary.frames_per_second:.1f} frames/s)" if summary.rendered else ""
         print(
@@ -46,9 +47,13 @@ def generate(job: Job) -> None:
     )
 
 
-def draw(summary: Summary, name: str) -> Path:
+def draw(summary: Summary, job: Job) -> Path:
     """Write preview.png: four of the frames."""
-    reader = open_reader("scenes", summary.out, name)
+    name = job.cfg.object
+    # the instances of a class are told apart by its mesh
+    several = job.cfg.instances > 1
+    meshes = MeshStore(job.cfg.meshes, scale=job.cfg.mesh_scale or 1.0) if several else None
+    reader = open_reader("scenes", summary.out, name, meshes)
     path = summary.out / "preview.png"
     save_image(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
     return path

@@ -2,6 +2,7 @@
 
 import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
+from posefilter.meshes.ycb import CLASSES, ycbvideo_index
+from posefilter.metrics.bop_results import PoseRow, write_poses_csv
 from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"
@@ -44,15 +47,16 @@ _COVARIANCE = (
 
 
 def predict(job: Job) -> None:
-    """Find one object, or where several checkpoints are given, each of theirs.
+    """Find one object; or where several checkpoints are given, or instances, all that there are.
 
     Raises:
         NotThere: Everything is written, and the verdict on every object is that it is absent.
     """
     settle(job.cfg.threads, job.cfg.seed)
-    results = predict_several(job) if is_several(job.cfg.checkpoint) else predict_one(job)
+    several = is_several(job.cfg.checkpoint) or job.cfg.instances is not None
+    results = predict_several(job) if several else predict_one(job)
     if not job.swept and all(one.verdict == "absent" for one in results):
-        raise NotThere("; ".join(one.describe() for one in results))
+        raise NotThere("; ".join(one.describe() for one in results) or "nothing is found")
 
 
 def predict_one(job: Job) -> list[Result]:
@@ -97,8 +101,8 @@ def predict_one(job: Job) -> list[Result]:
 
 
 def predict_several(job: Job) -> list[Result]:
-    """Write poses.json, a list with an object each, one overlay of those that are not absent, and
-    each one's belief.
+    """Write poses.json, a list with an entry an object, or with `instances` one for each that is
+    found; one overlay of those that are not absent; poses.csv, and each one's belief.
     """
     cfg, folder = job.cfg, job.folder
     costs = read_costs(cfg)
@@ -111,25 +115,46 @@ def predict_several(job: Job) -> list[Result]:
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
-    (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
+    if cfg.instances is None:
+        (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
+    else:
+        results = estimator.predict(rgb, depth, K, instances=cfg.instances, seed=cfg.seed)
     seen = [one for one in results if one.verdict != "absent"]
-    absent = [one.object for one in results if one.verdict == "absent"]
+    absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
     drawn = [mark_result(one, store.load(one.object) if store else one.model.hull) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
+    own = dict(zip(estimator.objects, checkpoints, strict=True))
     answers = []
-    for number, (checkpoint, result) in enumerate(zip(checkpoints, results, strict=True)):
+    for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
         result.belief.save(file)
-        answers.append({**describe(result, checkpoint, job), "belief_file": str(file)})
+        answers.append({**describe(result, own[result.object], job), "belief_file": str(file)})
         if cfg.console != JSON:
             print_result(result)
+    missing = [name for name in absent if name not in {one.object for one in results}]
+    answers += [describe_absent(name, own[name], job) for name in missing]
     write_json(folder / "poses.json", answers)
-    files = {"poses": "poses.json", "overlay": "overlay.png", "beliefs": "beliefs"}
-    paths = {name: folder / file for name, file in files.items()}
+    write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects))
+    files = {name: folder / name for name in ("poses.json", "poses.csv", "overlay.png", "beliefs")}
+    paths = {name.removesuffix(".json").replace(".png", ""): file for name, file in files.items()}
     ended(cfg.console, "predicted", paths, [], poses=answers)
     return results
+
+
+def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow]:
+    """Return results as lines of a BOP results file: of scene 0 and image 0, in the frame of the
+    mesh files; an object has its number among YCB-Video's, or else its place among those asked for.
+    """
+    seconds = sum(one.seconds for one in results)  # the challenge's time is that of an image
+    rows = []
+    for one in results:
+        known = one.object in CLASSES
+        number = ycbvideo_index(one.object) if known else objects.index(one.object) + 1
+        score = one.score if one.probability is None else one.probability
+        rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
+    return rows
 
 
 def record_view(run: Run, shape: Any, path: Path) -> None:
@@ -189,6 +214,7 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
     absent = result.verdict == "absent"
     return {
         "object": result.object,
+        "instance": result.instance,
         "verdict": result.verdict,
         "probability": result.probability,
         "presence": result.presence,
@@ -217,12 +243,20 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
                 for mode in belief.modes
             ],
         },
+        "visible_pixels": None if result.mask is None else int(result.mask.sum()),
         "seconds": result.seconds,
         "frame": _FRAME,
         "checkpoint": str(checkpoint),
         "rgb": str(job.cfg.rgb),
         "depth": str(job.cfg.depth),
     }
+
+
+def describe_absent(name: str, checkpoint: str | Path, job: Job) -> dict[str, Any]:
+    """Return the entry of poses.json of an object that is not in the image."""
+    empty = dict.fromkeys(("probability", "presence", "camera_from_object", "instance"))
+    files = {"checkpoint": str(checkpoint), "rgb": str(job.cfg.rgb), "depth": str(job.cfg.depth)}
+    return {"object": name, "verdict": "absent", **empty, **files}
 
 
 def read_photograph(rgb: str, depth: str, depth_scale: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -43,7 +43,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
         UserError: A file or folder is missing; the message names the setting.
     """
     if command == "predict":
-        _check_view(cfg.view, is_several(cfg.checkpoint))
+        _check_view(cfg.view, is_several(cfg.checkpoint) or cfg.instances is not None)
     if command == "track":
         _check_video(cfg)
     if command == "train":

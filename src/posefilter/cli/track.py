@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from posefilter.callbacks.records import PoseRow, to_native, write_poses_csv
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, finite, say, show_table
@@ -23,6 +22,7 @@ from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
 from posefilter.figures.video import VideoWriter
 from posefilter.meshes.store import MeshStore
+from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
 from posefilter.tracking.motion import RandomWalk
 from posefilter.tracking.records import (
     TrackRow,

@@ -147,7 +147,7 @@ class FrameRenderer:
             picture = self.renderer.render(
                 layout.instances(), self.K, height, width, layout.lights, layout.planes
             )
-            if absent or self._shows_target(picture):
+            if all(self._shows(picture, k) for k in range(layout.targets)):
                 return layout, picture, rng
         raise UserError(
             f"frame {frame}: no layout of {self.job.object} fits after {ATTEMPTS} tries; "
@@ -180,9 +180,9 @@ class FrameRenderer:
                 fat.write_image(next(files), image)
             fat.write_json(next(files), record)
 
-    def _shows_target(self, picture: Rendered) -> bool:
-        """Return whether enough of the target is visible."""
-        seen, alone = int((picture.index == 0).sum()), int(picture.unoccluded[0])
+    def _shows(self, picture: Rendered, instance: int) -> bool:
+        """Return whether enough of an instance of the target is visible."""
+        seen, alone = int((picture.index == instance).sum()), int(picture.unoccluded[instance])
         least = 0.002 * self.job.width * self.job.height
         return alone >= least and seen >= (1 - self.job.scenes.occlusion) * alone
 

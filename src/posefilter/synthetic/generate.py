@@ -73,6 +73,7 @@ def generate(
     progress: bool = True,
     mesh_scale: float | None = None,
     absent_share: float = 0.0,
+    instances: int = 1,
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or go on with one that was begun.
 
@@ -101,6 +102,7 @@ def generate(
         mesh_scale: Meters a unit of the mesh files; None: 1.
         absent_share: The share of frames that the object is taken out of, once all else is placed:
             so that a filter can be told to say that it is not there.
+        instances: How many of the object a frame shows.
 
     Returns:
         What was done.
@@ -116,6 +118,7 @@ def generate(
         tabletop_share=float(tabletop_share),
         settle=bool(settle),
         absent_share=float(absent_share),
+        instances=int(instances),
     )
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
@@ -203,6 +206,7 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "occluded_share": job.scenes.occluded_share,
         "tabletop_share": job.scenes.tabletop_share,
         "absent_share": job.scenes.absent_share,
+        "instances": job.scenes.instances,
         "mesh_scale": job.mesh_scale,
     }
     check_ranges(numbers, "generate")
@@ -279,6 +283,6 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
-    scenes = {"absent_share": 0.0, **settings.get("scenes", {})}
+    scenes = {"absent_share": 0.0, "instances": 1, **settings.get("scenes", {})}
     out = {"mesh_scale": 1.0, **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
+from posefilter.synthetic.copies import place_copies
 from posefilter.synthetic.lookalikes import make_lookalike
 from posefilter.synthetic.placing import (
     Placed,
@@ -51,6 +52,7 @@ class SceneSettings:
     shadow_share: float = 0.7
     settle: bool = False  # let the objects on a table fall and come to rest (mujoco)
     absent_share: float = 0.0  # share of frames that the target is taken out of, once all is placed
+    instances: int = 1  # of the target in a frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +70,13 @@ class SceneSet:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """One frame, ready to render.  The target comes first."""
+    """One frame, ready to render.  The target comes first, all of its instances."""
 
     placed: tuple[Placed, ...]
     planes: tuple[Plane, ...]
     lights: Lights
     tabletop: bool
+    targets: int = 1
 
     def instances(self) -> list[Instance]:
         """Return the objects as the renderer takes them."""
@@ -170,14 +173,15 @@ def draw_layout(
     # not every corner of a table has room in front of the target
     for _ in range(8 if occluded else 1):
         placed, table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
-        enough = len(placed) > settings.distractors[0]
+        enough = len(placed) >= settings.distractors[0] + settings.instances
         if enough and (not occluded or view.visible(placed) < wanted + 0.1):
             break
     if not enough:
         return None
     up = np.array([0.0, -0.8, -0.6]) if table is None else table.camera_from_top[:3, 2]
     planes = _surroundings(scene, placed[0], table, rng)
-    return Layout(tuple(placed), planes, _draw_lights(up, settings, rng), tabletop)
+    lights = _draw_lights(up, settings, rng)
+    return Layout(tuple(placed), planes, lights, tabletop, settings.instances)
 
 
 def _draw_objects(
@@ -208,7 +212,10 @@ def _draw_objects(
         target = place_floating_target(scene.target, view, distance, rng)
     if not view.holds(target, settings.largest_truncation):
         return [], table
-    placed = [target]
+    more, largest = settings.instances - 1, settings.largest_truncation
+    placed = place_copies(target, more, view, table, wanted, largest, rng)
+    if placed is None:
+        return [], table
     solids = _draw_solids(scene, settings, rng)
     if occluded:  # whatever can hide most is tried in front first
         solids.sort(key=lambda solid: -compute_hiding_size(solid))
@@ -284,8 +291,8 @@ def _draw_lights(up: np.ndarray, settings: SceneSettings, rng: np.random.Generat
 
 
 def remove_target(layout: Layout) -> Layout:
-    """Return the layout without its target; all else stays where it is."""
-    return replace(layout, placed=layout.placed[1:])
+    """Return the layout without its target, all of its instances; all else stays where it is."""
+    return replace(layout, placed=layout.placed[layout.targets :], targets=0)
 
 
 def shift_camera(layout: Layout, offset: float) -> Layout:

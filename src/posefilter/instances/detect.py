@@ -1,0 +1,247 @@
+"""Search one image for several objects, and let the more probable answer keep the pixels."""
+
+import copy
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.verdicts import Costs, Verdict, decide
+from posefilter.filters.loop import ParticleFilter
+from posefilter.instances.pixels import blank, find_visible, keep_pixels, resize_mask
+from posefilter.models.base import PoseEstimator
+from posefilter.protocols import HasRelevance, Scene
+from posefilter.types import Batch, Belief, Trace
+
+_CELLS = 6  # of the network, that a small object covers
+_LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How instances are searched for.
+
+    Attributes:
+        particles: Of the filter that follows one instance, at most.
+        first_particles: Of its first step, at most.
+        spare: Searches beyond the instances asked for, while an answer is doubtful.
+        share: Of its visible pixels, that an answer must have for itself.
+        worth: Mean probability of the network's surest cells, below which there is no more to find.
+    """
+
+    particles: int = 100
+    first_particles: int = 400
+    spare: int = 1
+    share: float = 0.5
+    worth: float = 0.3
+
+
+class Detection(NamedTuple):
+    """One object that is found in an image."""
+
+    number: int  # of its method
+    belief: Belief  # of one image
+    assessment: Assessment | None  # None where the method is not calibrated
+    mask: Tensor  # (H, W) bool, the pixels that are its own, of the first method's image
+
+    @property
+    def probability(self) -> float:
+        """That it is there and its pose right; -1 where nothing is known of that."""
+        return -1.0 if self.assessment is None else float(self.assessment.probability[0])
+
+
+@dataclass
+class _Job:
+    """One class that is searched for in one image."""
+
+    number: int
+    method: PoseEstimator
+    batch: Batch  # of one image
+    count: int  # instances at most
+    filter: ParticleFilter
+    generator: Generator
+    searches: int = 0
+    exhausted: bool = False
+    seconds: float = field(default=0.0)
+
+
+class _Encoded:
+    """A method whose image is encoded already."""
+
+    def __init__(self, method: PoseEstimator, scene: Scene) -> None:
+        self._method, self._scene = method, scene
+
+    def encode(self, batch: Batch) -> Scene:
+        return self._scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._method, name)
+
+
+@torch.no_grad()
+def detect(
+    methods: Sequence[PoseEstimator],
+    batches: Sequence[Batch],
+    counts: Sequence[int],
+    costs: Costs,
+    settings: SearchSettings | None = None,
+) -> tuple[list[Detection], list[float]]:
+    """Find the instances of several classes in one image, no two on the same pixels.
+
+    Each class is searched for once; then again where instances are missing, without what is found.
+
+    Args:
+        methods: A trained filter a class.
+        batches: The image, as each method takes it.
+        counts: Instances of each class at most.
+        costs: What errors cost: an object that is absent by these is left out.
+        settings: Of the search.
+
+    Returns:
+        What is found, the most probable first; and the seconds that each class took.
+    """
+    settings = settings or SearchSettings()
+    jobs = [
+        _begin(i, *one, settings)
+        for i, one in enumerate(zip(methods, batches, counts, strict=True))
+    ]
+    grid = (batches[0].depth.shape[-2], batches[0].depth.shape[-1])
+    found: list[Detection] = []
+    while any(_is_open(job, found, costs, settings) for job in jobs):
+        fresh = [
+            _search(job, found, grid, costs, settings)
+            for job in jobs
+            if _is_open(job, found, costs, settings)
+        ]
+        found = resolve([*found, *(one for one in fresh if one is not None)], settings.share)
+    found = [_judge_again(jobs[one.number], one, found, grid) for one in found]
+    there = [one for one in found if is_there(one, costs)]
+    return _keep_best(resolve(there, settings.share), counts), [job.seconds for job in jobs]
+
+
+def is_there(one: Detection, costs: Costs) -> bool:
+    """Tell whether an object may be in the image, by what errors cost; True where nothing is known
+    of that.
+    """
+    return _judge(one, costs) != "absent"
+
+
+def resolve(found: Sequence[Detection], share: float) -> list[Detection]:
+    """Return the detections that keep pixels, the most probable first.
+
+    The more probable answer keeps the pixels, and one that has hardly any of its own is dropped.
+    Those without a probability come last, by their scores.
+
+    Args:
+        found: Detections of one image.
+        share: Of its pixels, that each must have for itself.
+    """
+    order = sorted(found, key=lambda one: (-one.probability, -float(one.belief.score[0])))
+    kept = keep_pixels([one.mask for one in order], share)
+    pairs = zip(order, kept, strict=True)
+    return [one._replace(mask=mask) for one, mask in pairs if mask is not None]
+
+
+def _begin(
+    number: int, method: PoseEstimator, batch: Batch, count: int, settings: SearchSettings
+) -> _Job:
+    small = copy.copy(method.filter)
+    small.particles = min(small.particles, settings.particles)
+    small.first_particles = min(small.first_particles, settings.first_particles)
+    return _Job(number, method, batch, count, small, method.generator("predict", 0))
+
+
+def _is_open(job: _Job, found: Sequence[Detection], costs: Costs, settings: SearchSettings) -> bool:
+    """Tell whether a class is to be searched for once more."""
+    if job.exhausted or job.searches >= job.count + settings.spare:
+        return False
+    own = [_judge(one, costs) for one in found if one.number == job.number]
+    return sum(verdict != "unsure" for verdict in own) < job.count
+
+
+def _search(
+    job: _Job,
+    found: Sequence[Detection],
+    grid: tuple[int, int],
+    costs: Costs,
+    settings: SearchSettings,
+) -> Detection | None:
+    """Search for one instance more, in the image without what is found; None if there is none."""
+    start = time.perf_counter()
+    job.searches += 1
+    hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
+    image, scene = _encode(job, hidden)
+    one = None
+    if bool(image.depth.any()) and (job.searches == 1 or _look_left(scene) >= settings.worth):
+        trace = job.filter(image, _Encoded(job.method, scene), job.generator)
+        depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
+        seen = find_visible(trace.belief.best, job.method.model, depth, K)[0] & ~hidden
+        assessment = _assess(job.method, trace.belief, image, scene)
+        one = Detection(job.number, trace.belief, assessment, resize_mask(seen, grid))
+        one = one if bool(seen.any()) and is_there(one, costs) else None
+    job.exhausted = one is None
+    job.seconds += time.perf_counter() - start
+    return one
+
+
+def _judge_again(
+    job: _Job, one: Detection, found: Sequence[Detection], grid: tuple[int, int]
+) -> Detection:
+    """Return a detection with its probabilities in the image without the others of its class."""
+    others = [x for x in found if x.number == one.number and x is not one]
+    if one.assessment is None or not others:
+        return one
+    start = time.perf_counter()
+    image, scene = _encode(job, _hide(job, others) & ~_hide(job, [one]))
+    again = one._replace(assessment=_assess(job.method, one.belief, image, scene))
+    job.seconds += time.perf_counter() - start
+    return again
+
+
+def _hide(job: _Job, taken: Sequence[Detection]) -> Tensor:
+    """Return the pixels (H, W) bool of detections in a class's own image."""
+    size = (job.batch.depth.shape[-2], job.batch.depth.shape[-1])
+    hidden = torch.zeros(size, dtype=torch.bool, device=job.batch.depth.device)
+    for one in taken:
+        hidden |= resize_mask(one.mask, size)
+    return hidden
+
+
+def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Scene]:
+    """Return the image without some pixels, and as the method encodes it."""
+    image = blank(job.batch, hidden[None]) if bool(hidden.any()) else job.batch
+    return image, job.method.encode(image)
+
+
+def _look_left(scene: Scene) -> float:
+    """Return the mean probability of the surest cells of a scene; 1 where it has none."""
+    if not isinstance(scene, HasRelevance):
+        return 1.0
+    relevance = scene.relevance.flatten()
+    return float(relevance.topk(min(_CELLS, len(relevance))).values.mean())
+
+
+def _assess(method: PoseEstimator, belief: Belief, image: Batch, scene: Scene) -> Assessment | None:
+    return method.assess(Trace((), (), (), belief, scene=scene), image)
+
+
+def _judge(one: Detection, costs: Costs) -> Verdict | None:
+    """Return the verdict on a detection; None where nothing is known of it."""
+    if one.assessment is None:
+        return None
+    presence, probability = (float(value[0]) for value in one.assessment)
+    return decide(presence, probability, costs)
+
+
+def _keep_best(found: Sequence[Detection], counts: Sequence[int]) -> list[Detection]:
+    """Return no more of each class than were asked for."""
+    left, out = list(counts), []
+    for one in found:
+        if left[one.number]:
+            left[one.number] -= 1
+            out.append(one)
+    return out

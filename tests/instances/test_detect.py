@@ -1,0 +1,163 @@
+"""The search over toy classes: a class is a color, an instance a square of it."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.verdicts import Costs
+from posefilter.errors import UserError
+from posefilter.estimator import count_instances
+from posefilter.geometry.camera import back_project
+from posefilter.geometry.pose import make_pose
+from posefilter.instances.detect import Detection, SearchSettings, detect
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Belief, ObjectModel, Trace
+
+H, W, SIDE = 48, 64, 6  # [px]
+K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]])
+CORNERS = torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]).float()
+MODEL = ObjectModel(
+    "square", CORNERS * 0.05, torch.zeros(3), 0.087, 0.173, torch.eye(4)[None], CORNERS * 0.05
+)
+
+
+class Toy:
+    """Finds the brightest pixel of its color; the brighter, the more probable."""
+
+    def __init__(self, channel: int, rank: float = 1.0, calibrated: bool = True) -> None:
+        self.channel, self.rank, self.model = channel, rank, MODEL
+        self.filter = SimpleFilter()
+        self.calibrated, self.encoded = calibrated, 0
+
+    def encode(self, batch: Batch) -> Tensor:
+        self.encoded += 1
+        return batch.rgb[:, self.channel]
+
+    def generator(self, stage: str, number: int) -> Generator:
+        return Generator().manual_seed(0)
+
+    def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
+        if not self.calibrated:
+            return None
+        brightness = self.rank * trace.belief.score.double().clamp(0, 1)
+        return Assessment(brightness, brightness)
+
+
+class SimpleFilter:
+    """What the search needs of a filter."""
+
+    particles = first_particles = 8
+
+    def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
+        seen = method.encode(batch)[0] * (batch.depth[0, 0] > 0)
+        index = int(seen.argmax())
+        pixel = torch.tensor([[index % W, index // W]]).float() + (SIDE - 1) / 2
+        center = back_project(pixel, torch.tensor([1.0]), K)[0] + torch.tensor([0, 0, 0.03])
+        pose = make_pose(torch.eye(3), center)[None]
+        belief = Belief(pose[:, None], torch.zeros(1, 1), pose, seen.max()[None])
+        return SimpleNamespace(belief=belief)
+
+
+def draw(squares: Sequence[tuple[int, int, int, float]]) -> Batch:
+    """Return an image of squares (u, v, channel, brightness) at 1 m, before a wall at 2 m."""
+    rgb, depth = torch.zeros(1, 3, H, W), torch.full((1, 1, H, W), 2.0)
+    for u, v, channel, value in squares:
+        rgb[0, channel, v : v + SIDE, u : u + SIDE] = value
+        depth[0, 0, v : v + SIDE, u : u + SIDE] = 1.0
+    none = torch.zeros(1, dtype=torch.int64)
+    return Batch(
+        rgb, depth, depth > 9, K[None], torch.eye(4)[None], none, none, torch.full((1,), torch.nan)
+    )
+
+
+def run(toys: list[Toy], counts: list[int], batch: Batch, **more: Any) -> list[Detection]:
+    methods = [cast(PoseEstimator, toy) for toy in toys]
+    found, seconds = detect(methods, [batch] * len(toys), counts, Costs(), SearchSettings(**more))
+    assert len(seconds) == len(toys)
+    return found
+
+
+def corners(found: list[Detection]) -> list[tuple[int, int]]:
+    """Return where each detection's pixels begin (u, v)."""
+    places = [one.mask.nonzero() for one in found]
+    return [(int(p[:, 1].min()), int(p[:, 0].min())) for p in places]
+
+
+THREE = [(4, 5, 0, 0.95), (30, 20, 0, 0.9), (50, 36, 0, 0.85)]
+
+
+def test_each_instance_is_found_once_the_most_probable_first() -> None:
+    found = run([Toy(0)], [3], draw(THREE))
+    assert len(found) == 3
+    for (u, v), (true_u, true_v, _, _) in zip(corners(found), THREE, strict=True):
+        assert abs(u - true_u) <= 2
+        assert abs(v - true_v) <= 2
+    assert int(torch.stack([one.mask for one in found]).sum(0).max()) == 1
+    probabilities = [one.probability for one in found]
+    assert probabilities == sorted(probabilities, reverse=True)
+
+
+def test_no_more_are_found_than_asked_for_or_than_there_are() -> None:
+    assert len(run([Toy(0)], [2], draw(THREE))) == 2
+    assert len(run([Toy(0)], [9], draw(THREE))) == 3
+    assert run([Toy(1)], [3], draw(THREE)) == []
+
+
+def test_the_first_search_is_on_the_whole_image_and_ends_where_all_are_sure() -> None:
+    toy = Toy(0)
+    run([toy], [1], draw(THREE))
+    assert toy.encoded == 1
+    # two searches, and each judged again without the other
+    toy = Toy(0)
+    run([toy], [2], draw(THREE))
+    assert toy.encoded == 4
+
+
+def test_the_more_probable_class_keeps_the_pixels() -> None:
+    both = draw([(10, 10, 0, 0.9), (40, 30, 1, 0.85)])
+    both.rgb[0, 1, 10:16, 10:16] = 1.0  # the other class takes it for its own, too
+    first, second = Toy(0), Toy(1, rank=0.8)
+    found = run([first, second], [1, 1], both)
+    assert [one.number for one in found] == [0, 1]
+    places = corners(found)
+    assert abs(places[0][0] - 10) <= 2
+    assert abs(places[1][0] - 40) <= 2  # found by a second look, without what the first covers
+    turned = run([Toy(1, rank=0.8), Toy(0)], [1, 1], both)  # in whatever order they come
+    assert [(1 - one.number) for one in turned] == [0, 1]
+    assert corners(turned) == places
+
+
+def test_a_doubtful_answer_is_followed_by_another_search() -> None:
+    """The brightest may be something that only looks alike: here it is believed by half."""
+
+    class Doubtful(Toy):
+        def assess(self, trace: Trace, batch: Batch) -> Assessment:
+            bright = trace.belief.score.double()
+            value = torch.where(bright > 0.92, 0.5, bright)
+            return Assessment(value, value)
+
+    (one,) = run([Doubtful(0)], [1], draw(THREE))
+    assert one.probability == pytest.approx(0.9)
+    (one,) = run([Doubtful(0)], [1], draw(THREE), spare=0)
+    assert one.probability == pytest.approx(0.5)
+
+
+def test_without_a_calibration_as_many_are_returned_as_were_asked_for() -> None:
+    found = run([Toy(0, calibrated=False)], [2], draw(THREE))
+    assert [one.assessment for one in found] == [None, None]
+    scores = [float(one.belief.score[0]) for one in found]
+    assert scores == sorted(scores, reverse=True)
+
+
+def test_counts_are_numbers_of_objects_that_are_loaded() -> None:
+    assert count_instances(3, ["a", "b"]) == [3, 3]
+    assert count_instances({"b": 2}, ["a", "b"]) == [1, 2]
+    wrong: list[tuple[Any, str]] = [(0, "instances=0"), (True, "True"), ({"c": 1}, "not loaded")]
+    for instances, told in wrong:
+        with pytest.raises(UserError, match=told):
+            count_instances(instances, ["a", "b"])
