@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from posefilter.metrics.confidence import Confidence, calibration_error, error_at_coverage
+from posefilter.metrics.confidence import (
+    Confidence,
+    calibration_error,
+    error_at_coverage,
+    list_bins,
+)
 
 
 def test_calibration_error_is_the_mean_gap_of_the_bins() -> None:
@@ -54,3 +59,18 @@ def test_frames_without_the_object_count_for_presence_and_false_alarms_alone() -
     assert told["found"] == pytest.approx(1 / 3)
     assert told["absent"] == pytest.approx(1 / 3)
     assert told["brier"] == pytest.approx((0.01 + 0.25 + 0.16 + 0.01) / 4, abs=1e-6)
+
+
+def test_the_bins_of_the_reliability_diagram_hold_every_frame_once() -> None:
+    probability = torch.tensor([0.0, 0.05, 0.3, 0.95, 1.0, 0.99])
+    right = torch.tensor([False, True, False, True, True, False])
+    found = list_bins(probability, right)
+    assert [(one["from"], one["to"], one["frames"]) for one in found] == [
+        (0.0, 0.1, 2),
+        (0.3, 0.4, 1),
+        (0.9, 1.0, 3),
+    ]
+    assert [one["right"] for one in found] == pytest.approx([0.5, 0, 2 / 3])
+    assert found[0]["probability"] == pytest.approx(0.025)
+    gap = sum(one["frames"] * abs(one["probability"] - one["right"]) for one in found) / 6
+    assert gap == pytest.approx(float(calibration_error(probability, right)))

@@ -31,6 +31,22 @@ def calibration_error(probability: Tensor, right: Tensor, bins: int = _BINS) -> 
     return gap.abs().sum() / len(probability)
 
 
+def list_bins(probability: Tensor, right: Tensor, bins: int = _BINS) -> list[dict[str, float]]:
+    """Return the reliability diagram: of each bin that is not empty its ends, its number of frames,
+    mean probability and share that is right.
+
+    (M,), (M,) bool.
+    """
+    bin = (probability * bins).long().clamp(0, bins - 1)
+    out = []
+    for k in bin.unique().tolist():
+        own = bin == k
+        said, share = float(probability[own].mean()), float(right[own].double().mean())
+        ends = {"from": k / bins, "to": (k + 1) / bins, "frames": int(own.sum())}
+        out.append({**ends, "probability": said, "right": share})
+    return out
+
+
 def error_at_coverage(probability: Tensor, right: Tensor, coverage: float = COVERAGE) -> Tensor:
     """Return the share that is wrong among the predictions of highest probability.
 
@@ -61,7 +77,7 @@ class Confidence(Metric):
     the probability, over all frames. wrong: share of wrong poses among frames with the object;
     wrong_at_80: the same among the 80 % of highest probability. found, absent: share of the frames
     with the object that are declared so. false_alarms: number of frames without the object in which
-    one is found.
+    one is found. bins: the reliability diagram over all frames.
     """
 
     full_state_update = False
@@ -103,4 +119,5 @@ class Confidence(Metric):
             "found": float((declared > 0).double().mean()),
             "absent": float((declared < 0).double().mean()),
             "false_alarms": int((verdict[~own] > 0).sum()),
+            "bins": list_bins(probability, is_right),
         }

@@ -5,6 +5,7 @@ from datetime import datetime
 
 from posefilter.metrics.registry import find_metric
 from posefilter.report import panels
+from posefilter.report.beliefs import show_calibration
 from posefilter.report.blocks import (
     Block,
     Cell,
@@ -61,7 +62,15 @@ def make_run_page(run: Run, changed: Sequence[Change] | None, command: str) -> P
         Section("Worst and best", show_worst_and_best(images)),
         Section("Results", [*list_results(run), *show_errors(run.errors)]),
         Section("Curves", draw_charts(curves)),
-        Section("Belief", [*list_belief(run), *beliefs, *show_images(images["belief"], wide=True)]),
+        Section(
+            "Belief",
+            [
+                *list_belief(run),
+                *show_calibration(run.metrics),
+                *beliefs,
+                *show_images(images["belief"], wide=True),
+            ],
+        ),
         Section(
             "The filter at work",
             [
