@@ -20,6 +20,7 @@ from dataset_trees import (
 )
 from torch.utils.data import default_collate
 
+from posefilter.data.dataset import EpochShuffle
 from posefilter.data.loaders import spare_cores
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
@@ -382,3 +383,30 @@ def test_a_gpu_leaves_the_cores_to_the_loader(monkeypatch):
     )
     monkeypatch.setattr("posefilter.data.loaders.torch.cuda.is_available", lambda: True)
     assert spare_cores() == 3
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_that_train_together_share_an_epochs_frames(processes: int) -> None:
+    alone = list(EpochShuffle(20, 5, lambda epoch: None))
+    shares = [
+        list(EpochShuffle(20, 5, lambda epoch: None, rank, processes)) for rank in range(processes)
+    ]
+    each = 20 // processes
+    assert [len(share) for share in shares] == [each] * processes
+    assert len(EpochShuffle(20, 5, lambda epoch: None, 0, processes)) == each
+    # together, step by step, the frames that one process would have seen
+    together = [frame for step in zip(*shares, strict=True) for frame in step]
+    assert together == alone[: each * processes]
+
+
+def test_a_process_goes_on_in_its_own_share() -> None:
+    order = EpochShuffle(20, 5, lambda epoch: None, 1, 2)
+    whole = list(order)
+    order.skip(4)
+    assert list(order) == whole[4:]
+    assert list(order) == whole
+
+
+def test_fewer_frames_than_processes_are_refused() -> None:
+    with pytest.raises(UserError, match=r"^trainer.devices=3: there are only 2 training frames"):
+        EpochShuffle(2, 5, lambda epoch: None, 0, 3)

@@ -16,12 +16,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from posefilter.cli.ranks import is_follower
+
 JSON = "json"
 Files = Mapping[str, Path | str]
 
 
 def say(console: str, event: str, sentence: str, **content: Any) -> None:
-    """Print a sentence, or for machines its content."""
+    """Print a sentence, or for machines its content; of several processes, the first one does."""
+    if is_follower():
+        return
     print(
         json.dumps({"event": event, **finite(content)}) if console == JSON else sentence, flush=True
     )
@@ -34,6 +38,8 @@ def ended(
 
     For machines: the last line, with all content.
     """
+    if is_follower():
+        return
     if console == JSON:
         told = {
             **content,
@@ -55,6 +61,8 @@ def ended(
 
 def show_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print a table of names and values."""
+    if is_follower():
+        return
     table = Table("", "", title=title, show_header=False, title_justify="left", title_style="bold")
     table.columns[1].justify = "right"
     for row in rows:

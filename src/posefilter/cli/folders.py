@@ -1,7 +1,6 @@
 """Folders that commands write to: what is in them is not overwritten, and none is left empty."""
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.job import Job, check_out
+from posefilter.cli.ranks import is_follower
 from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
 from posefilter.locks import hold
@@ -20,7 +20,6 @@ from posefilter.locks import hold
 FAILED = "failed.json"  # in the folder of a sweep's job
 OUTPUTS = "outputs"  # where commands write unless told otherwise
 _WRITTEN = (".", "checkpoints", "figures", "beliefs")  # folders of ours in a command's folder
-_RANKS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")
 _BY_HYDRA = ("config.yaml", "hydra.yaml", "overrides.yaml")
 
 
@@ -48,7 +47,7 @@ class KeepResults(Callback):
         if config.hydra.job.name == "evaluate":
             if holds_evaluation(folder):
                 refuse(folder, "an evaluation already; choose another folder: out=DIR")
-        elif holds_run(folder) and not config.get("resume"):
+        elif holds_run(folder) and not config.get("resume") and not is_follower():
             refuse(
                 folder, f"a run already; choose another folder, or go on with it: resume={folder}"
             )
@@ -75,8 +74,8 @@ def hold_folder(folder: Path) -> None:
     Raises:
         UserError: Another process holds it, or it cannot be written to.
     """
-    if any(os.environ.get(rank, "0") != "0" for rank in _RANKS):
-        return  # one of several processes of a training: the first of them holds it
+    if is_follower():
+        return  # the first process of the training holds it
     if hold(folder):
         remove_parts(folder, _WRITTEN)
 

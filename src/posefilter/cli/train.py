@@ -14,6 +14,7 @@ from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint,
 from posefilter.cli.console import is_installed, say, typed
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
+from posefilter.cli.ranks import is_follower
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import finished, learned_from, start_from, take_over
@@ -78,7 +79,8 @@ def build(job: Job) -> Run:
             left,
         )
     rehearse(method, data)
-    write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
+    if not is_follower():
+        write_json(job.folder / "data.json", {**data.describe(), "split": data.split_record()})
     return Run(job, method, trainer, data)
 
 
@@ -123,6 +125,8 @@ def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[
     """Write metrics.json, print the table, and say what may be typed next; return the metrics."""
     job, file = run.job, run.job.folder / "metrics.json"
     metrics = record(results, job, run.data.describe(), run.best) | {"training": training}
+    if is_follower():
+        return metrics
     write_json(file, metrics)
     report = typed("report", run=job.folder)
     evaluate = typed("evaluate", checkpoint=run.best, **places(job), **plugins(job))

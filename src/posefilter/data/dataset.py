@@ -77,19 +77,41 @@ class FrameDataset(Dataset[Batch]):
 
 
 class EpochShuffle(Sampler[int]):
-    """Shuffle by (seed, epoch).  Lightning tells samplers the epoch; this one passes it on."""
+    """Shuffle by (seed, epoch).  Lightning tells samplers the epoch; this one passes it on.
 
-    def __init__(self, length: int, seed: int, tell: Callable[[int], None]) -> None:
+    Args:
+        length: Number of frames.
+        seed: Decides the orders.
+        tell: Given each epoch.
+        rank: Of this process, if several train together: each has its own frames of an epoch, and
+            as many as the others.
+        processes: How many train together.
+
+    Raises:
+        UserError: There are fewer frames than processes.
+    """
+
+    def __init__(
+        self,
+        length: int,
+        seed: int,
+        tell: Callable[[int], None],
+        rank: int = 0,
+        processes: int = 1,
+    ) -> None:
         if length == 0:
             raise UserError(
                 "no training frames are left: see data.split, data.min_visibility and data.object"
             )
+        if length < processes:
+            raise UserError(f"trainer.devices={processes}: there are only {length} training frames")
         self._length, self._seed, self._tell, self._epoch = length, seed, tell, 0
+        self._rank, self._processes = rank, processes
         self._skip = 0
 
     def __len__(self) -> int:
-        """Return the number of frames."""
-        return self._length
+        """Return the number of frames of this process."""
+        return self._length // self._processes
 
     def __iter__(self) -> Iterator[int]:
         """Yield the epoch's order."""
@@ -99,7 +121,8 @@ class EpochShuffle(Sampler[int]):
             .tolist()
         )
         skip, self._skip = self._skip, 0
-        return iter(order[skip:])
+        own = order[self._rank :: self._processes][: len(self)]
+        return iter(own[skip:])
 
     def skip(self, frames: int) -> None:
         """Leave out the first frames of the next epoch: a run that was cut short has seen them."""

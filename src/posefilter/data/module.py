@@ -266,10 +266,12 @@ class PoseDataModule(LightningDataModule):
         self.train_dataset.set_epoch(epoch)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        """Return shuffled, augmented batches."""
+        """Return shuffled, augmented batches; of several processes, each has frames of its own."""
         dataset = self.train_dataset
-        order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch)
-        full = len(dataset) >= self._batch_size
+        trainer = self.trainer
+        place = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
+        order = EpochShuffle(len(dataset), self._seed, dataset.set_epoch, *place)
+        full = len(order) >= self._batch_size
         return make_loader(dataset, self._batch_size, self._workers, sampler=order, drop_last=full)
 
     def val_dataloader(self) -> DataLoader[Batch]:

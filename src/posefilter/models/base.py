@@ -145,6 +145,8 @@ class PoseEstimator(Module):
         """The metrics of the object by name, a ModuleDict; created at the first use."""
         if self._scores is None:
             self._scores = nn.ModuleDict(self.make_metrics()).to(self.device)
+            for metric in self._scores.values():
+                metric.distributed_available_fn = _has_all_images
         return self._scores
 
     def make_metrics(self) -> dict[str, nn.Module]:
@@ -182,7 +184,11 @@ class PoseEstimator(Module):
         self._scores = None
 
     def generator(self, stage: str, batch_number: int) -> Generator:
-        """Return the random generator of a batch: a function of seed, stage, epoch and number."""
+        """Return the random generator of a batch: a function of seed, stage, epoch and number; in
+        training of the process's rank, too.
+        """
+        if stage == "train" and self._trainer is not None:
+            batch_number = batch_number * self._trainer.world_size + self._trainer.global_rank
         epoch = getattr(self, "current_epoch", 0) if stage == "train" else 0
         seed = ((self.seed * 8 + _STAGES[stage]) * 100_003 + epoch) * 1_000_003 + batch_number
         return torch.Generator(device=self.device).manual_seed(seed % (1 << 63))
@@ -443,6 +449,11 @@ class PoseEstimator(Module):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Set the object that the checkpoint holds."""
         self.set_object(ObjectModel(**checkpoint["object_model"]))
+
+
+def _has_all_images() -> bool:
+    """Tell metrics not to add up those of other processes: each validates and tests on all."""
+    return False
 
 
 @cache

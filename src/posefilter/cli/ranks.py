@@ -1,0 +1,12 @@
+"""Data-parallel training: which of its processes this is."""
+
+import os
+
+_RANKS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")  # as Lightning, torchrun and Slurm set them
+
+
+def is_follower() -> bool:
+    """Tell whether this is another than the first of several processes of a training: the first
+    writes, and says, for all of them.
+    """
+    return any(os.environ.get(rank, "0") != "0" for rank in _RANKS)
