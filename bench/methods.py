@@ -103,6 +103,12 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
             "detach_position",
             f"{short} loss/schedule=none,displacement_only,likelihood_only seed=0,1,2",
         ),
+        # the classes balanced in the loss itself, and not in one more beside it
+        Line(
+            "class_balance",
+            "model=patch_pf experiment=memorize sweep=ablation ablation=paper loss=balanced_bce "
+            "seed=0,1,2",
+        ),
     ]
     for models, sweep, ablations in (
         (WITH_POSE, "ablation", TELLING),
