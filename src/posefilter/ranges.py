@@ -106,6 +106,9 @@ RANGES: dict[str, Range] = {
     "generate.absent_share": SHARE,
     "generate.instances": _whole(1, 100),
     "generate.frames_per_scene": COUNT,
+    "generate.moving_mm": Range(0, 1000),
+    "generate.moving_deg": Range(0, 180),
+    "generate.covered_frames": COUNT_OR_NONE,
     # other commands
     "check_data.limit": _whole(1),
     "predict.instances": _whole(1, 100),

@@ -1,6 +1,6 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.renderer import Renderer
 from posefilter.rendering.surfaces import Rendered
 from posefilter.synthetic import fat_format as fat
+from posefilter.synthetic.motion import MotionSettings, Scenario, draw_scenario, is_possible
+from posefilter.synthetic.placing import View
 from posefilter.synthetic.scenes import (
     Layout,
     SceneSet,
@@ -45,6 +47,7 @@ class Job:
     renderer: str
     scenes: SceneSettings
     mesh_scale: float = 1.0  # meters a unit of the mesh files
+    motion: MotionSettings = field(default_factory=MotionSettings)
 
     def folder(self, frame: int) -> str:
         """Return the folder of a frame."""
@@ -108,6 +111,7 @@ class FrameRenderer:
         self.renderer = make_renderer(job.renderer)
         self.sensor = sensor_model(job.sensor)
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
+        self._scenario: tuple[int, Scenario] | None = None
 
     def scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
         """Return a folder's scene set and its classes by name; write the folder's settings."""
@@ -138,15 +142,17 @@ class FrameRenderer:
         absent = self.job.lacks_target(frame)
         scene, _ = self.scene(frame // self.job.frames_per_scene)
         rng = np.random.default_rng([self.job.seed, 2, frame])
-        height, width = self.job.height, self.job.width
-        for _ in range(ATTEMPTS):
-            layout = draw_layout(scene, self.job.scenes, self.K, height, width, rng)
-            if layout is None:
-                continue
+        if self.job.motion.moves != "none":
+            number, k = divmod(frame, self.job.frames_per_scene)
+            layout = self.scenario(number).at(k)
             layout = remove_target(layout) if absent else layout
-            picture = self.renderer.render(
-                layout.instances(), self.K, height, width, layout.lights, layout.planes
-            )
+            return layout, self._render(layout), rng
+        for _ in range(ATTEMPTS):
+            drawn = self._draw_layout(scene, rng)
+            if drawn is None:
+                continue
+            layout = remove_target(drawn) if absent else drawn
+            picture = self._render(layout)
             if all(self._shows(picture, k) for k in range(layout.targets)):
                 return layout, picture, rng
         raise UserError(
@@ -154,6 +160,46 @@ class FrameRenderer:
             "the object may be too large or small for this camera, or occlusion and distractors "
             "leave no room"
         )
+
+    def scenario(self, number: int) -> Scenario:
+        """Return what happens in a scene whose frames follow each other.
+
+        Raises:
+            UserError: No layout and path keep the target in view.
+        """
+        if self._scenario is None or self._scenario[0] != number:
+            self._scenario = number, self._draw_scenario(number)
+        return self._scenario[1]
+
+    def _draw_scenario(self, number: int) -> Scenario:
+        scene, _ = self.scene(number)
+        rng = np.random.default_rng([self.job.seed, 4, number])
+        view = View(self.K, self.job.height, self.job.width)
+        for _ in range(ATTEMPTS):
+            layout = self._draw_layout(scene, rng)
+            if layout is None:
+                continue
+            picture = self._render(layout)
+            if not all(self._shows(picture, k) for k in range(layout.targets)):
+                continue
+            for _ in range(8):
+                found = draw_scenario(
+                    layout, self.job.motion, self.job.frames_per_scene, scene.textures[1], rng
+                )
+                if is_possible(found, view, self.job.scenes.largest_truncation):
+                    return found
+        raise UserError(
+            f"scene {number}: no layout and path keep {self.job.object} in view after {ATTEMPTS} "
+            f"tries; choose fewer frames_per_scene, or less of moving_mm and moving_deg"
+        )
+
+    def _draw_layout(self, scene: SceneSet, rng: np.random.Generator) -> Layout | None:
+        size = self.job.height, self.job.width
+        return draw_layout(scene, self.job.scenes, self.K, *size, rng)
+
+    def _render(self, layout: Layout) -> Rendered:
+        size = self.job.height, self.job.width
+        return self.renderer.render(layout.instances(), self.K, *size, layout.lights, layout.planes)
 
     def write(self, frame: int) -> None:
         """Render a frame and write its files."""
@@ -163,14 +209,7 @@ class FrameRenderer:
         for k, (_, right) in enumerate(self.job.cameras()):
             if k > 0:
                 layout_here = shift_camera(layout, right)
-                picture = self.renderer.render(
-                    layout_here.instances(),
-                    self.K,
-                    self.job.height,
-                    self.job.width,
-                    layout_here.lights,
-                    layout_here.planes,
-                )
+                picture = self._render(layout_here)
             else:
                 layout_here = layout
             pending.append(self._images(layout_here, picture, exported, right, rng))

@@ -23,6 +23,7 @@ from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.ranges import check_ranges
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.frame_renderer import Job, make_renderer
+from posefilter.synthetic.motion import MotionSettings
 from posefilter.synthetic.scenes import SceneSettings, choose_distractors
 from posefilter.synthetic.sensor import sensor_model
 from posefilter.synthetic.settle import load_mujoco
@@ -74,6 +75,10 @@ def generate(
     mesh_scale: float | None = None,
     absent_share: float = 0.0,
     instances: int = 1,
+    moving: str = "none",
+    moving_mm: float = 5.0,
+    moving_deg: float = 1.0,
+    covered_frames: int = 0,
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or go on with one that was begun.
 
@@ -103,6 +108,11 @@ def generate(
         absent_share: The share of frames that the object is taken out of, once all else is placed:
             so that a filter can be told to say that it is not there.
         instances: How many of the object a frame shows.
+        moving: "none": each frame is arranged anew; "camera", "object" or "both": the frames of a
+            scene follow each other, and that moves smoothly.
+        moving_mm: Its shift from frame to frame, root mean square [mm].
+        moving_deg: Its turn likewise [degrees].
+        covered_frames: Frames in a row of each scene in which something hides the object wholly.
 
     Returns:
         What was done.
@@ -136,6 +146,7 @@ def generate(
         renderer,
         scenes,
         1.0 if mesh_scale is None else float(mesh_scale),
+        MotionSettings(moving, float(moving_mm), float(moving_deg), int(covered_frames)),
     )
     _check(job, frames, workers)
     store = MeshStore(meshes, scale=job.mesh_scale)
@@ -208,10 +219,18 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "absent_share": job.scenes.absent_share,
         "instances": job.scenes.instances,
         "mesh_scale": job.mesh_scale,
+        "moving_mm": job.motion.shift_mm,
+        "moving_deg": job.motion.turn_deg,
+        "covered_frames": job.motion.covered_frames,
     }
     check_ranges(numbers, "generate")
     if high < low:
         raise UserError(f"distractors={low},{high}: needs 0 <= least <= most")
+    if job.motion.covered_frames > job.frames_per_scene:
+        raise UserError(
+            f"covered_frames={job.motion.covered_frames}: a scene has {job.frames_per_scene} "
+            f"frames only (frames_per_scene)"
+        )
     sensor_model(job.sensor)
     make_renderer(job.renderer)
     if job.scenes.settle:
@@ -284,5 +303,5 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
     scenes = {"absent_share": 0.0, "instances": 1, **settings.get("scenes", {})}
-    out = {"mesh_scale": 1.0, **settings, "scenes": scenes}
+    out = {"mesh_scale": 1.0, "motion": asdict(MotionSettings()), **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out
