@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.errors import ErrorTable, make_rows
 from posefilter.callbacks.records import Records, to_rows, write_beliefs
+from posefilter.cli.bop_scores import assign_estimates, score_targets
 from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
@@ -51,6 +52,8 @@ def evaluate(job: Job) -> float:
     settle(job.cfg.threads, job.cfg.seed)
     if bool(job.cfg.checkpoint) == bool(job.cfg.estimates):
         raise UserError("give either checkpoint=RUN/checkpoints/best.ckpt or estimates=poses.csv")
+    if job.cfg.targets is not None and not job.cfg.estimates:
+        raise UserError("targets: go with estimates=poses.csv, not with a checkpoint")
     check_same(job)
     keep_training_results(job.folder)
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
@@ -125,7 +128,9 @@ def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> Non
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
-    """Score a BOP results file: of each instance that is there, its most confident estimate."""
+    """Score a BOP results file: of each instance that is there, the estimate that is matched to it;
+    of a class that an image shows once, its most confident estimate.
+    """
     if not job.cfg.get("data"):
         raise UserError(
             "estimates need to know of which data: give data=fat|ycb_video|bop|scenes "
@@ -137,12 +142,13 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     best = {}
     for row in sorted(rows, key=lambda row: row.score):
         best[row.scene_id, row.im_id, row.obj_id] = row
+    assigned = assign_estimates(rows, data.records("test"), data)
     models = [data.object_model(i) for i in range(len(data.objects))]
     errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
     used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
-        estimates = [best.get((r.scene_id, r.im_id, r.obj_id)) for r in own]
+        estimates = [assigned.get(r.key) for r in own]
         poses = torch.full_like(batch.camera_from_object, torch.nan)
         for i, estimate in enumerate(estimates):
             if estimate is not None:
@@ -183,6 +189,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         "seconds_per_image": sum(seconds) / len(seconds) if seconds else None,
         "belief": None,
     }
+    if job.cfg.targets is not None:
+        results["bop"] = score_targets(rows, str(job.cfg.targets), data.records("test"), data)
     write_errors(job.folder / ERRORS, table)
     metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
     return metrics, {"errors": job.folder / ERRORS}

@@ -1,7 +1,7 @@
 """The pose errors of the BOP challenge that know symmetries: MSSD and MSPD (Hodan et al. 2020, "BOP
 Challenge 2020 on 6D Object Localization").
 
-The third error of the challenge, VSD, compares rendered depth and is not computed here.
+The third error of the challenge is in `vsd.py`, their average recall in `bop_recall.py`.
 """
 
 import math

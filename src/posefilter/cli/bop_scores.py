@@ -1,0 +1,184 @@
+"""Estimates of several instances against the instances of a dataset, as the BOP challenge scores
+them.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.module import PoseDataModule
+from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh, hull_vertices
+from posefilter.metrics.bop import REFERENCE_WIDTH, densify, mspd, mssd
+from posefilter.metrics.bop_recall import TargetErrors, compute_average_recall
+from posefilter.metrics.bop_results import PoseRow, to_mesh
+from posefilter.metrics.bop_targets import Target, read_targets
+from posefilter.metrics.matching import match_greedily
+from posefilter.metrics.vsd import vsd
+from posefilter.rendering.embree import EmbreeRenderer, render_depth
+
+ALL = "all"  # targets: every instance that is visible enough
+_VISIBLE = 0.1  # the least visibility of a target, as the challenge has it
+Key = tuple[int, int, int]  # scene_id, im_id, obj_id
+
+
+def assign_estimates(
+    rows: Sequence[PoseRow], records: Sequence[FrameRecord], data: PoseDataModule
+) -> dict[str, PoseRow]:
+    """Return the estimate of each instance, by the record's key.
+
+    Of a class that an image shows once, it is the most confident estimate. Of several instances,
+    the most confident estimates, as many as there are instances, are matched in turn to the nearest
+    instance by MSSD.
+
+    Args:
+        rows: The estimates.
+        records: The instances.
+        data: Their dataset.
+    """
+    groups = _group(records)
+    by_key = _sort_rows(rows)
+    place = {record.key: i for i, record in enumerate(data.reader.records())}
+    out: dict[str, PoseRow] = {}
+    for key, own in groups.items():
+        known = by_key.get(key, [])[: len(own)]
+        if len(own) == 1:
+            if known:
+                out[own[0].key] = known[0]
+            continue
+        model = data.object_model(data.objects.index(own[0].object))
+        samples = [data.reader.read(place[record.key]) for record in own]
+        truths, poses = _stack_poses(samples, known, data.reader)
+        points = torch.cat([model.hull, model.points]).double()
+        errors = _pair(mssd, poses, truths, densify(model.symmetries.double()), points)
+        out |= {own[t].key: known[e] for e, t in match_greedily(errors, np.inf)}
+    return out
+
+
+def score_targets(
+    rows: Sequence[PoseRow], told: str, records: Sequence[FrameRecord], data: PoseDataModule
+) -> dict[str, Any]:
+    """Return the average recall of estimates.
+
+    Args:
+        rows: The estimates.
+        told: A file of targets, or "all": of `records`, those of visibility 0.1 or more.
+        records: The instances that are tested.
+        data: Their dataset, with the meshes of its objects.
+
+    Returns:
+        {"ar", "ar_vsd", "ar_mssd", "ar_mspd", "targets", "estimates"}; recalls in [0, 100].
+
+    Raises:
+        UserError: A target is not in the data, or an object has no mesh.
+    """
+    groups = _group(data.reader.records() if told != ALL else records)
+    targets = read_targets(Path(told)) if told != ALL else None
+    counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
+    place = {record.key: i for i, record in enumerate(data.reader.records())}
+    by_key = _sort_rows(rows)
+    judge = _Judge(data)
+    scored, used = list[TargetErrors](), 0
+    for key in groups if counts is None else counts:
+        if key not in groups:
+            names = dict(zip(Target._fields, key, strict=False))
+            raise UserError(f"targets={told}: the data have no instance of {names}")
+        samples = [data.reader.read(place[record.key]) for record in groups[key]]
+        shares = [data.reader.visible_share(sample) for sample in samples]
+        order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()
+        if counts is None:
+            order = [i for i in order if not shares[i] < _VISIBLE]
+        else:  # the most visible, of which the target says how many
+            order = order[: counts[key]]
+        if order:
+            known = by_key.get(key, [])[: len(order)]
+            used += len(known)
+            scored.append(judge.score([samples[i] for i in order], known))
+    count = sum(one.mssd.shape[1] for one in scored)
+    return {**compute_average_recall(scored), "targets": count, "estimates": used}
+
+
+class _Judge:
+    """Measures the three errors of the challenge, with what they take of each object."""
+
+    def __init__(self, data: PoseDataModule) -> None:
+        self.data, self.renderer = data, EmbreeRenderer(keep=4)
+        self._known: dict[int, tuple[Mesh, Tensor, Tensor, float]] = {}
+
+    def score(self, samples: Sequence[Sample], rows: Sequence[PoseRow]) -> TargetErrors:
+        """Return the errors of estimates of one class in one image, the most confident first."""
+        first = samples[0]
+        mesh, symmetries, points, diameter = self._get(first.object_id)
+        K = first.intrinsics.astype(np.float64)
+        truths, poses = _stack_poses(samples, rows, self.data.reader)
+        camera = torch.from_numpy(K)
+        pixels = _pair(partial(mspd, intrinsics=camera), poses, truths, symmetries, points)
+        true_depths = [self._render(mesh, pose, K, first) for pose in truths]
+        surface = np.zeros((len(poses), len(truths), 10))
+        for e, pose in enumerate(poses):
+            depth = self._render(mesh, pose, K, first)
+            for t, true in enumerate(true_depths):
+                surface[e, t] = vsd(depth, true, first.depth, K, diameter)
+        return TargetErrors(
+            surface,
+            _pair(mssd, poses, truths, symmetries, points) / diameter,
+            pixels * REFERENCE_WIDTH / first.rgb.shape[1],
+        )
+
+    def _render(self, mesh: Mesh, pose: Tensor, K: np.ndarray, like: Sample) -> np.ndarray:
+        height, width = like.depth.shape
+        return render_depth([mesh], [pose.numpy()], K, height, width, self.renderer)[0]
+
+    def _get(self, index: int) -> tuple[Mesh, Tensor, Tensor, float]:
+        if index not in self._known:
+            name = self.data.objects[index]
+            if name not in self.data.meshes.names():
+                raise UserError(f"data.meshes: has no {name}, which VSD renders; name the meshes")
+            mesh, model = self.data.meshes.load(name), self.data.object_model(index)
+            points = torch.from_numpy(hull_vertices(mesh.vertices)).double()
+            symmetries = densify(model.symmetries.double())
+            self._known[index] = mesh, symmetries, points, float(model.diameter)
+        return self._known[index]
+
+
+def _pair(
+    measure: Any, poses: Tensor, truths: Tensor, symmetries: Tensor, points: Tensor
+) -> np.ndarray:
+    """Return an error of each estimate against each truth, (E, T)."""
+    out = np.zeros((len(poses), len(truths)))
+    for e, pose in enumerate(poses):
+        for t, truth in enumerate(truths):
+            out[e, t] = float(measure(pose, truth, symmetries, points))
+    return out
+
+
+def _stack_poses(
+    samples: Sequence[Sample], rows: Sequence[PoseRow], reader: Reader
+) -> tuple[Tensor, Tensor]:
+    """Return true and estimated poses (T, 4, 4), (E, 4, 4) in the mesh file's frame, float64."""
+    native = reader.native_from_mesh(reader.objects[samples[0].object_id])
+    truths = np.stack([sample.camera_from_object for sample in samples]).astype(np.float64)
+    poses = [to_mesh(row.camera_from_native, native) for row in rows]
+    stacked = np.stack(poses) if poses else np.zeros((0, 4, 4))
+    return torch.from_numpy(truths), torch.from_numpy(stacked)
+
+
+def _group(records: Sequence[FrameRecord]) -> dict[Key, list[FrameRecord]]:
+    out: dict[Key, list[FrameRecord]] = {}
+    for record in records:
+        out.setdefault((record.scene_id, record.im_id, record.obj_id), []).append(record)
+    return out
+
+
+def _sort_rows(rows: Sequence[PoseRow]) -> dict[Key, list[PoseRow]]:
+    """Return the estimates of each class in each image, the most confident first."""
+    out: dict[Key, list[PoseRow]] = {}
+    for row in sorted(rows, key=lambda row: row.score)[::-1]:
+        out.setdefault((row.scene_id, row.im_id, row.obj_id), []).append(row)
+    return out

@@ -1,0 +1,57 @@
+"""What an estimator is to find: BOP's `test_targets_bop19.json`, a list of `{"scene_id", "im_id",
+"obj_id", "inst_count"}`.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from posefilter.errors import UserError
+from posefilter.files import write_whole
+from posefilter.limits import read_bytes
+
+_KEYS = ("scene_id", "im_id", "obj_id", "inst_count")
+
+
+class Target(NamedTuple):
+    """Instances of one class in one image that are to be found."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int
+    inst_count: int
+
+
+def read_targets(path: Path) -> list[Target]:
+    """Read a file of targets.
+
+    Raises:
+        UserError: There is none, or it holds something else; the message names the entry.
+    """
+    if not path.is_file():
+        raise UserError(f"targets={path}: no such file")
+    try:
+        content = json.loads(read_bytes(path))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"targets={path}: not readable as JSON ({error})") from error
+    if not isinstance(content, list):
+        raise UserError(f"targets={path}: a list of targets is due")
+    targets = [_read_one(one, f"targets={path}, entry {i}") for i, one in enumerate(content)]
+    if len({one[:3] for one in targets}) < len(targets):
+        raise UserError(f"targets={path}: names a class of an image twice")
+    return targets
+
+
+def write_targets(path: Path, targets: Sequence[Target]) -> None:
+    """Write a file of targets, all of it or nothing."""
+    rows = ",\n".join(json.dumps(one._asdict()) for one in targets)
+    write_whole(path, f"[\n{rows}\n]\n".encode())
+
+
+def _read_one(one: Any, where: str) -> Target:
+    if not isinstance(one, dict) or not all(type(one.get(key)) is int for key in _KEYS):
+        raise UserError(f"{where}: {', '.join(_KEYS)} should be whole numbers")
+    if one["inst_count"] < 1:
+        raise UserError(f"{where}: inst_count={one['inst_count']} should be 1 or more")
+    return Target(*(one[key] for key in _KEYS))
