@@ -103,6 +103,12 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
             "detach_position",
             f"{short} loss/schedule=none,displacement_only,likelihood_only seed=0,1,2",
         ),
+        # two steps alone, from where the paper's particles start
+        Line(
+            "truncated_start",
+            f"{short} model.train_filter.initialize.object_fraction=0.0 loss/schedule=none "
+            "seed=0,1,2",
+        ),
         # the classes balanced in the loss itself, and not in one more beside it
         Line(
             "class_balance",
