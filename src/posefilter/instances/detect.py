@@ -33,8 +33,8 @@ class SearchSettings:
         worth: Mean probability of the network's surest cells, below which there is no more to find.
     """
 
-    particles: int = 100
-    first_particles: int = 400
+    particles: int = 80
+    first_particles: int = 320
     spare: int = 1
     share: float = 0.5
     worth: float = 0.3
@@ -118,7 +118,7 @@ def detect(
             if _is_open(job, found, costs, settings)
         ]
         found = resolve([*found, *(one for one in fresh if one is not None)], settings.share)
-    found = [_judge_again(jobs[one.number], one, found, grid) for one in found]
+        found = [_judge_again(jobs[one.number], one, found, grid, costs) for one in found]
     there = [one for one in found if is_there(one, costs)]
     return _keep_best(resolve(there, settings.share), counts), [job.seconds for job in jobs]
 
@@ -189,11 +189,14 @@ def _search(
 
 
 def _judge_again(
-    job: _Job, one: Detection, found: Sequence[Detection], grid: tuple[int, int]
+    job: _Job, one: Detection, found: Sequence[Detection], grid: tuple[int, int], costs: Costs
 ) -> Detection:
-    """Return a detection with its probabilities in the image without the others of its class."""
+    """Return a doubtful detection with its probabilities in the image without the others of its
+    class, once those that were asked for have been searched for.
+    """
     others = [x for x in found if x.number == one.number and x is not one]
-    if one.assessment is None or not others:
+    searched = job.exhausted or job.searches >= job.count
+    if _judge(one, costs) != "unsure" or not others or not searched:
         return one
     start = time.perf_counter()
     image, scene = _encode(job, _hide(job, others) & ~_hide(job, [one]))
