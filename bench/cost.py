@@ -122,16 +122,21 @@ def describe(name: str, key: str, values: Sequence[int], costs: Sequence[Sequenc
         [float(np.median([getattr(cost, part) for cost in one])) for one in costs]
         for part in Cost._fields
     )
-    shown = [f"{1000 * value:.3g}" for value in own]
+    shown = [show_milliseconds(value) for value in own]
     shown += ["–"] * (len(SWEEPS[key]) - len(values))
     ratios = [last.filter / first.filter for first, last in zip(costs[0], costs[-1], strict=True)]
     cells = [name, *shown, f"{np.median(ratios):.2f}", f"{fit_exponent(values, own):.2f}"]
     cells.append(f"{fit_exponent(values[-2:], own[-2:]):.2f}")
     if key == "width":
-        cells += [f"{1000 * value:.3g}" for value in (encode[0], encode[-1])]
+        cells += [show_milliseconds(value) for value in (encode[0], encode[-1])]
         # maps that are not learned, and copies of the image, are of no cost to speak of
         cells.append(f"{fit_exponent(values, encode):.2f}")
     return f"| {' | '.join(cells)} |"
+
+
+def show_milliseconds(seconds: float) -> str:
+    """Return a time in milliseconds, of three digits."""
+    return f"{float(f'{1000 * seconds:.3g}'):,g}"
 
 
 def choose_values(name: str, key: str, most: int) -> tuple[int, ...]:

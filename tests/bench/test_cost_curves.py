@@ -23,6 +23,7 @@ def test_exponents_are_those_of_planted_curves(cost: ModuleType) -> None:
     assert float(cells[5]) == pytest.approx(ratio, abs=0.01)
     assert float(cells[7]) == pytest.approx(exponent, abs=0.01)
     assert cells[8:10] == ["100", "100"]
+    assert [cost.show_milliseconds(one) for one in (2.0941, 0.012345)] == ["2,090", "12.3"]
 
 
 def test_what_is_measured_is_what_was_asked_for(cost: ModuleType) -> None:
