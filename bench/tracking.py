@@ -2,11 +2,14 @@
 
     python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--losses]
 
+    python bench/tracking.py --sequences DIR [DIR ...] --meshes DIR --only 003_cracker_box
+
 For each object whose weights ship and that is in the scenes: every frame by itself, then the same
 frames tracked, in one process. Times are the processor's of this process, so that other work on the
 machine changes them little; the ratio of the two is what to go by. Then the frames once more, of
 which six are replaced by those of another scene: how many are said to show the object, and after
-how many frames it is found again. Writes the tables of docs/results/tracking.md.
+how many frames it is found again. Sequences are folders of generate.py with moving= and
+covered_frames=: there the losses are in the frames. Writes the tables of docs/results/tracking.md.
 """
 
 import argparse
@@ -41,6 +44,14 @@ LOSSES = (
     "object", "scene", "away", "said to be there", "of these in the first", "found after",
     "presence with it", "without",
 )  # fmt: skip
+
+
+SEQUENCES = (
+    "object", "sequence", "step mm", "step degrees", "frames", "covered", "single: ADD AUC",
+    "tracked", "of every", "all tracked", "lost", "covered: said to be there",
+    "of these in the first", "found after",
+)  # fmt: skip
+EVERY = 3  # of the frames that are estimated as single images, too
 
 
 class Outcome(NamedTuple):
@@ -139,6 +150,59 @@ def make_row(name: str, scene: str, stride: int, single: Outcome, tracked: Outco
     return f"| {' | '.join(cells)} |"
 
 
+def measure_sequence(
+    estimator: posefilter.Estimator, sequence: str, frames: Sequence[VideoFrame]
+) -> str:
+    """Return the row of a rendered sequence, in whose middle the object is covered."""
+    name, model = estimator.objects[0], estimator.models[0]
+    tracked, _ = run_tracked(estimator, frames)
+    shown = [n for n, frame in enumerate(frames) if name in frame.truth]
+    covered = [n for n in range(shown[0], shown[-1]) if n not in shown]
+    some = shown[::EVERY]
+    single, seconds = run_single(estimator, [frames[n] for n in some])
+    outcomes = [
+        judge(results, [frames[n] for n in index], seconds)
+        for results, index in (
+            (single, some),
+            ([tracked[n] for n in some], some),
+            ([tracked[n] for n in shown], shown),
+        )
+    ]
+    first = torch.from_numpy(np.stack([frames[n].truth[name] for n in shown]))
+    steps = measure_jitter(first, torch.eye(4).double().expand_as(first), model.center.double())
+    said = [tracked[n].found for n in covered]
+    early = sum(said[: posefilter.TrackerSettings().patience - 1])
+    back = next(
+        (
+            str(count)
+            for count, n in enumerate((n for n in shown if n > max(covered)), start=1)
+            if tracked[n].found and _error(tracked[n], frames[n]) < 0.1 * model.diameter
+        ),
+        "not again",
+    )
+    numbers = [f"{x:.1f}" for x in (*steps, *(one.add for one in outcomes))]
+    cells = [name, sequence, *numbers[:2], str(len(frames)), str(len(covered)), *numbers[2:4]]
+    cells += [str(EVERY), numbers[4], str(outcomes[2].lost), str(sum(said)), str(early), back]
+    return f"| {' | '.join(cells)} |"
+
+
+def _error(result: Any, frame: VideoFrame) -> float:
+    truth = torch.from_numpy(frame.truth[result.object])[None]
+    return float(add_s(torch.from_numpy(result.pose)[None], truth, result.model.points))
+
+
+def run_sequences(folders: Sequence[str], meshes: str, name: str) -> None:
+    """Measure rendered sequences, print and write."""
+    estimator, lines = posefilter.load(name, device="cpu"), []
+    for folder in folders:
+        reader = open_reader("fat", folder, None, open_meshes(meshes, None, "fat", [name]))
+        for group in list_groups(reader):
+            frames = list(SceneVideo(reader, group, [name]))
+            lines.append(measure_sequence(estimator, Path(folder).name, frames))
+            print(lines[-1], flush=True)
+    write_table("sequences", SEQUENCES, lines)
+
+
 def write_table(name: str, head: Sequence[str], lines: Sequence[str]) -> None:
     """Put a table into the page, between its marks."""
     text = PAGE.read_text()
@@ -153,7 +217,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
+    parser.add_argument("--frames", help="a folder of YCB-Video")
+    parser.add_argument("--sequences", nargs="+", help="folders that generate.py wrote")
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
@@ -163,6 +228,9 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(options.threads)
     names = options.only or list(list_shipped())
+    if options.sequences:
+        run_sequences(options.sequences, options.meshes, names[0])
+        return
     reader = open_reader(
         "ycb_video",
         options.frames,

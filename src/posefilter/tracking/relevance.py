@@ -12,6 +12,9 @@ from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
 _POINTS = 256  # of the surface, that are looked at
+_FULL = (
+    0.6  # relevance that is as good as 1: rims and what stands before an object take their share
+)
 
 
 def measure_relevance(relevance: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
@@ -50,8 +53,8 @@ def measure_presence(
 
     Of a calibrated method it is its calibrated presence. That is fitted to estimates on single
     images; a track's evidence is of the same kind, but its particles are fewer, and the network may
-    have seen a window only. Of another method it is the relevance, lowered where the depth sees
-    through more of the surface than it finds there; that is no probability.
+    have seen a window only. Of another method it is the relevance, as a share of 0.6, lowered where
+    the depth sees through more of the surface than it finds there; that is no probability.
 
     Args:
         method: The object's filter.
@@ -66,4 +69,4 @@ def measure_presence(
     if found is not None:
         return float(found.presence), found
     solid = measure_depth(trace.belief.best, batch, method.model)["solid"]
-    return relevance * min(1.0, 2 * float(solid)), None
+    return min(1.0, relevance / _FULL) * min(1.0, 2 * float(solid)), None

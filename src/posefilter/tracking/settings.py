@@ -61,7 +61,8 @@ class TrackerSettings:
         follow: What a frame costs while the object is tracked.
         search: What it costs while the object is lost.
         walk: Standard deviation of the move between two steps, over the noise level.
-        rounds: Rounds of mean shift that end a frame; 0: the mean of the mode as it is.
+        rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
+            mean as it is.
         jump: Log odds against a jump to what the network proposes, while the object is tracked
             [nat]; so that it does not flip between faces that look alike.
         epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -74,7 +75,7 @@ class TrackerSettings:
         noise: Standard deviation of the estimate of a single frame, for smoothing [m]; 0: none.
         lost_below: A frame counts against the object where its presence is below, in [0, 1].
         found_above: What a search finds is taken up where its presence is above. While a track's is
-            not, the network sees the whole image.
+            not, the network sees the whole image in the next frame.
         patience: Frames in a row that count against an object that is lost.
         full_every: While it is lost, every so many frames the estimator's own filter searches;
             0: never.
@@ -84,19 +85,19 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(64, 300, 8, 2, 0.010, 0.004, 64)
+    follow: Effort = Effort(48, 300, 8, 1, 0.008, 0.008, 64)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
-    rounds: int = 0
+    rounds: int = 1
     jump: float = 5.0
     epsilon: float = 0.15
     quantile: float = 0.95
     cell: float = 0.03
-    look_around: int = 10
+    look_around: int = 1
     side: int = 128
     reach: float = 1.6
-    noise: float = 0.003
-    lost_below: float = 0.1
+    noise: float = 0.0015
+    lost_below: float = 0.3
     found_above: float = 0.5
     patience: int = 2
     full_every: int = 5

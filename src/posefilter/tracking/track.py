@@ -12,7 +12,7 @@ from posefilter.data.resize import network_size
 from posefilter.estimator import Result, Run, make_result
 from posefilter.filters.loop import ParticleFilter, make_particles
 from posefilter.filters.propagate import Gaussian
-from posefilter.filters.refine import MeanShift, NoRefine
+from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
 from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
@@ -21,6 +21,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images, make_batch
 from posefilter.models.base import PoseEstimator
 from posefilter.tracking.estimate import ModeMean, smooth
+from posefilter.tracking.fit import QuadraticFit
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
 from posefilter.tracking.relevance import measure_presence, measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
@@ -166,7 +167,7 @@ class Track:
         scene = self.method.encode(batch)
         against = 0.0 if self.watch.lost else settings.jump
         glance = Glance(self.method, scene, effort.points, effort.proposals, against)
-        refine = MeanShift(settings.rounds, 16) if settings.rounds else NoRefine()
+        refine = QuadraticFit(settings.rounds) if settings.rounds else NoRefine()
         filter = ParticleFilter(
             particles=predicted.belief.state.shape[1],
             steps=effort.steps,

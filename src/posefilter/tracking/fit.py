@@ -1,0 +1,93 @@
+"""The maximum of a likelihood near an estimate, by a quadratic through many noisy scores.
+
+A tracked pose is near the maximum, and only a few poses can be scored in a frame. A mean weighted
+by the likelihood rests on the few of them that score highest; a regression uses all alike.
+"""
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.filters.refine import require_scorer
+from posefilter.protocols import Method, Scene
+from posefilter.types import Belief
+
+_LONGEST = 1.5  # standard deviations of the perturbations, by which a round moves at most
+
+
+class QuadraticFit:
+    """Move the estimate to the maximum of a quadratic fitted to the scores about it: a `Refine`.
+
+    The response-surface method of Box and Wilson (1951). Perturbations come in antithetic pairs:
+    half the difference of a pair's scores is linear in the perturbation, and gives the slope; half
+    their sum is even in it, and gives the curvature along each axis. Slope and curvature are
+    regressions over all pairs. A normal prior of `reach` standard deviations of the perturbations
+    holds what the likelihood leaves open: a constant likelihood leaves the estimate in place.
+
+    Args:
+        rounds: Number of fits, each about the estimate of the one before.
+        pairs: Antithetic pairs of a fit, at least 8.
+        spread: Standard deviation of the perturbations [m on the object's surface].
+        sigma: Noise level of the likelihood [m].
+        pixels: Image points for each score, the same for all poses of a fit.
+        reach: Standard deviation of the prior, over that of the perturbations.
+
+    References:
+        Box, Wilson: On the experimental attainment of optimum conditions. Journal of the Royal
+            Statistical Society B 13 (1951).
+    """
+
+    def __init__(
+        self,
+        rounds: int = 1,
+        pairs: int = 24,
+        spread: float = 0.006,
+        sigma: float = 0.004,
+        pixels: int = 256,
+        reach: float = 2.0,
+    ) -> None:
+        self.rounds, self.pairs, self.spread, self.sigma = rounds, pairs, spread, sigma
+        self.pixels, self.reach = pixels, reach
+
+    @torch.no_grad()
+    def __call__(
+        self, belief: Belief, scene: Scene, method: Method, generator: Generator
+    ) -> Belief:
+        """Return the belief with the estimate moved."""
+        scorer, best, space = require_scorer(method), belief.best, method.space
+        for _ in range(self.rounds):
+            scale = space.noise_scale(best.new_tensor(self.spread))
+            shape = (len(best), self.pairs, space.dimensions)
+            noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)
+            moves = torch.cat([noise, -noise], dim=1) * scale
+            poses = space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
+            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            up, down = scores.chunk(2, dim=1)
+            best = space.move(best, find_maximum(noise, up, down, self.reach) * scale)
+        score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
+        return belief._replace(best=best, score=score)
+
+
+def find_maximum(noise: Tensor, up: Tensor, down: Tensor, reach: float) -> Tensor:
+    """Return where a quadratic with axes along the coordinates, fitted to scores, is highest.
+
+    Args:
+        noise: (B, P, D) perturbations, of unit scale.
+        up: (B, P) scores at the perturbations.
+        down: (B, P) scores at their opposites.
+        reach: Standard deviation of the prior about 0.
+
+    Returns:
+        The maximum (B, D) of fit and prior, within `_LONGEST` along each axis.
+    """
+    slope = regress(noise, (up - down) / 2)
+    ones = torch.ones_like(noise[..., :1])
+    curvature = regress(torch.cat([ones, noise.square() / 2], dim=-1), (up + down) / 2)[:, 1:]
+    step = slope / ((-curvature).clamp_min(0) + 1 / reach**2)
+    return step.clamp(-_LONGEST, _LONGEST)
+
+
+def regress(x: Tensor, y: Tensor) -> Tensor:
+    """Return the coefficients of least squares, a little damped.  (B, P, F), (B, P) -> (B, F)."""
+    damping = 1e-4 * torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    found: Tensor = torch.linalg.solve(x.mT @ x + damping, x.mT @ y[..., None])
+    return found[..., 0]
