@@ -227,6 +227,10 @@ RANGES: dict[str, Range] = {
     "refine.components.steps": COUNT_OR_NONE,
     "refine.components.iterations": COUNT,
     "refine.components.antithetic_pairs": COUNT,
+    "refine.components.samples": COUNT,
+    "refine.components.rounds": COUNT,
+    "refine.components.widening": Range(1, 1e6),
+    "refine.components.temperature": POSITIVE,
     "refine.components.start": METERS,
     "refine.components.end": METERS,
     # model

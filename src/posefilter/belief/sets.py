@@ -13,7 +13,7 @@ class PoseSet:
     Attributes:
         level: The probability that the set is made for.
         least: The least log density of a pose in the set; minus infinity where every pose is in it.
-        samples: The particles in it (K, 4, 4), camera_from_object [m]; of more than 1,000 particles
+        samples: The particles in it (K, 4, 4), camera_from_object [m]; of more than 2,000 particles
             a selection.
         weights: Their weights (K,) in the belief.
         log_density: The belief's log density at poses; see `Belief.log_density`.

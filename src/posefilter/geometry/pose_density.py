@@ -35,7 +35,6 @@ _ISOTROPIC = 0.05  # share of a kernel's covariance that has no direction
 _NARROWEST = 5e-4  # [diameters] standard deviation
 _WIDEST = 0.6  # [rad] so that five standard deviations end before half a turn
 _LOG_UNITS = math.log(8.0)  # from rotation vectors, in which SO(3) has the volume 8 pi^2
-_MOST = 1000  # kernels
 _LOG_NONE = math.log(1e-12)  # where one pose has all the weight
 _JUDGED = 250  # heaviest poses, that the kernels' widths are chosen by
 _CHUNK = 1 << 17  # pairs of poses held at once
@@ -63,6 +62,7 @@ def fit_density(
     radius: float,
     diameter: float,
     symmetries: Tensor | None = None,
+    most: int = 2000,
 ) -> PoseDensity:
     """Fit a kernel density to weighted poses.
 
@@ -74,15 +74,16 @@ def fit_density(
         diameter: Of the object [m].
         symmetries: (S, 4, 4) object_from_object, a group: a pose and what a symmetry makes of it
             are one, and share the density equally.  None: the identity alone.
+        most: Number of kernels.  Of more poses the heaviest have kernels of their own, and an even
+            selection of the others stands for these.
 
     Returns:
-        The density, in float64.  Of more than 1,000 poses the heaviest have kernels of their own,
-        and an even selection of the others stands for these.
+        The density, in float64.
     """
     poses, log_weights, center = poses.double(), log_weights.double(), center.to(poses).double()
     group = torch.eye(4)[None] if symmetries is None else symmetries
     group = group.to(poses)
-    chosen, log_weights = _thin(log_weights)
+    chosen, log_weights = _thin(log_weights, most)
     poses = poses[chosen]
     canonical = _gather_copies(poses, log_weights, center, radius, group)
     parts = split_poses(canonical, center)
@@ -96,7 +97,8 @@ def fit_density(
     best, highest = None, -math.inf
     counts = sorted({min(count, max(_FEWEST, round(s * count))) for s in _SHARES})
     for shape in _measure_shapes(parts, log_weights.exp(), counts, unit):
-        whiten, log_scale = _whiten(shape, unit, diameter)
+        shape = shape + (_NARROWEST * diameter) ** 2 * torch.eye(6).to(shape)
+        whiten, log_scale = whiten_kernels(shape / (unit[:, None] * unit))
         kernels = PoseDensity(chosen, canonical, parts, log_weights, whiten, log_scale, *fixed)
         square, log_volume = _measure(kernels, twist)
         for factor in _FACTORS:
@@ -232,14 +234,13 @@ def _measure_shapes(
     return [torch.cat(one) for one in found]
 
 
-def _whiten(covariance: Tensor, unit: Tensor, diameter: float) -> tuple[Tensor, Tensor]:
+def whiten_kernels(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Return what maps twists of kernels to standard normal vectors, and the log normalizations.
 
-    (N, 6, 6) [m^2], (6,) -> (N, 6, 6), (N,).
+    Turns are limited to where a Gaussian would wrap round.
+
+    (N, 6, 6) [m^2, m rad, rad^2] -> (N, 6, 6) lower triangular, (N,).
     """
-    least = (_NARROWEST * diameter) ** 2
-    covariance = covariance + least * torch.eye(6).to(covariance)
-    covariance = covariance / (unit[:, None] * unit)
     size, axes = torch.linalg.eigh(covariance[:, 3:, 3:])
     limit = (_WIDEST / size.clamp_min(1e-20).sqrt()).clamp(max=1.0)
     narrow = torch.eye(6).to(covariance).repeat(len(covariance), 1, 1)
@@ -250,14 +251,14 @@ def _whiten(covariance: Tensor, unit: Tensor, diameter: float) -> tuple[Tensor, 
     return torch.linalg.solve_triangular(factor, eye, upper=False), log_scale
 
 
-def _thin(log_weights: Tensor) -> tuple[Tensor, Tensor]:
+def _thin(log_weights: Tensor, most: int) -> tuple[Tensor, Tensor]:
     """Return which poses have kernels, and the log weights of these, which sum to 1."""
     count = len(log_weights)
-    if count <= _MOST:
+    if count <= most:
         return torch.arange(count, device=log_weights.device), log_weights
     order = log_weights.argsort(descending=True, stable=True)
-    heavy, rest = order[: _MOST // 2], order[_MOST // 2 :]
-    few = rest[torch.linspace(0, len(rest) - 1, _MOST // 2, device=rest.device).round().long()]
+    heavy, rest = order[: most // 2], order[most // 2 :]
+    few = rest[torch.linspace(0, len(rest) - 1, most // 2, device=rest.device).round().long()]
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)

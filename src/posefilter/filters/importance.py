@@ -1,0 +1,108 @@
+"""A last pass of importance sampling: particles that carry the posterior given the image once."""
+
+from typing import ClassVar
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
+from posefilter.filters.refine import require_scorer
+from posefilter.geometry.pose_density import fit_density, log_density
+from posefilter.geometry.pose_sampling import draw_poses, widen
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.protocols import Method, Scene
+from posefilter.types import Belief
+
+
+class ImportanceSampling:
+    """Draw the particles anew from a density about the old ones, and weight them by the posterior.
+
+    The filter's own weights come of a search that reads one image many times. Here the old
+    particles only say where to look: q is their kernel density, widened and with a background that
+    reaches everywhere. With T temperature, l the log-likelihood and a flat prior, new particles
+    x ~ q have the weights
+
+        w = exp(l(x) / T) / q(x)
+
+    so that they carry the posterior exp(l / T), and the density that they were drawn from counts no
+    more. A second round draws from the density of the first one's weighted particles (population
+    Monte Carlo, Cappe et al. 2004). The estimate and its score are kept.
+
+    Args:
+        samples: Particles of a round.
+        rounds: Number of rounds.
+        widening: Factor of the first density's kernels.
+        temperature: T; 1 takes the likelihood at its word, more makes the belief wider.
+        sigma: Noise level of the likelihood [m].
+        pixels: Image points that each particle is scored from, the same for all.
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    requires: ClassVar[Capabilities] = ("pose_space", "score_poses")
+
+    def __init__(
+        self,
+        samples: int = 400,
+        rounds: int = 2,
+        widening: float = 2.0,
+        temperature: float = 1.0,
+        sigma: float = 0.004,
+        pixels: int = 256,
+    ) -> None:
+        if samples < 1 or rounds < 1 or not widening >= 1 or not temperature > 0:
+            raise UserError(
+                f"refine: importance sampling needs samples and rounds >= 1, widening >= 1 and "
+                f"temperature > 0, got {samples}, {rounds}, {widening} and {temperature}"
+            )
+        self.samples, self.rounds, self.widening = samples, rounds, widening
+        self.temperature, self.sigma, self.pixels = temperature, sigma, pixels
+
+    @torch.no_grad()
+    def __call__(
+        self, belief: Belief, scene: Scene, method: Method, generator: Generator
+    ) -> Belief:
+        """Return the belief with new particles; without gradient."""
+        poses, log_weights = belief.poses, belief.log_weights
+        for number in range(self.rounds):
+            widening = self.widening if number == 0 else 1.0
+            poses, log_q = self.propose(poses, log_weights, method, widening, generator)
+            score = require_scorer(method).score_poses(
+                scene, poses, self.sigma, generator, self.pixels
+            )
+            log_weights = (score.double() / self.temperature - log_q).log_softmax(1)
+        return belief._replace(poses=poses, log_weights=log_weights.to(belief.log_weights))
+
+    def propose(
+        self,
+        poses: Tensor,
+        log_weights: Tensor,
+        method: Method,
+        widening: float,
+        generator: Generator,
+    ) -> tuple[Tensor, Tensor]:
+        """Draw particles from the density of others.
+
+        Args:
+            poses: (B, N, 4, 4).
+            log_weights: (B, N), normalized.
+            method: Its space knows the object's center and size.
+            widening: Factor of the kernels.
+            generator: Source of randomness.
+
+        Returns:
+            Particles (B, samples, 4, 4), and their log density (B, samples), float64.
+        """
+        space = method.space
+        assert isinstance(space, PoseSpace)  # of what `requires` says
+        center = poses.new_tensor(space.center)
+        drawn, log_q = [], []
+        for own, weights in zip(poses, log_weights, strict=True):
+            # of a density's background alone the diameter counts: twice the radius will do
+            density = fit_density(own, weights, center, space.radius, 2 * space.radius)
+            density = widen(density, widening)
+            drawn.append(draw_poses(density, self.samples, generator))
+            log_q.append(log_density(density, drawn[-1]))
+        return torch.stack(drawn).to(poses), torch.stack(log_q)

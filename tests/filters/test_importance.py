@@ -1,0 +1,112 @@
+"""A last pass of importance sampling carries the posterior, whatever the search has left."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.filters.importance import ImportanceSampling
+from posefilter.geometry.pose import make_pose, move_about
+from posefilter.geometry.pose_density import fit_density, log_density
+from posefilter.geometry.pose_sampling import draw_poses, measure_kernels, widen
+from posefilter.geometry.pose_statistics import covariance_about, twist_between
+from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.types import Belief
+
+SCALE = torch.tensor([0.004, 0.003, 0.01, 0.03, 0.06, 0.04]).double()
+CENTER = torch.tensor([0.02, -0.01, 0.03]).double()
+
+
+class Known:
+    """A method whose likelihood is a Gaussian of twists about the identity, x going with ry."""
+
+    space = PoseSpace((0.02, -0.01, 0.03), 0.1)
+    mix = torch.eye(6).double()
+    mix[0, 4] = mix[4, 0] = 0.8
+    covariance = SCALE[:, None] * mix * SCALE
+
+    def score_poses(
+        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
+        twist = twist_between(torch.eye(4).double(), poses.double(), CENTER)
+        square = (twist @ torch.linalg.inv(self.covariance) * twist).sum(-1)
+        return (-0.5 * square).float()
+
+
+def search_result(width: float = 0.7, count: int = 200) -> Belief:
+    """Return what a search leaves: too narrow, beside the middle, without the correlation."""
+    g = torch.Generator().manual_seed(0)
+    twist = (torch.randn(1, count, 6, generator=g).double() + 0.4) * width * SCALE
+    poses = move_about(torch.eye(4).double().expand(1, count, 4, 4), twist, CENTER)
+    even = torch.full((1, count), -math.log(count))
+    return Belief(poses.float(), even, poses[:, 0].float(), torch.tensor([3.0]))
+
+
+def moments(belief: Belief) -> tuple[Tensor, Tensor]:
+    weights = belief.log_weights[0].double().exp()
+    poses, origin = belief.poses[0].double(), torch.eye(4).double()
+    mean = (weights[:, None] * twist_between(origin, poses, CENTER)).sum(0)
+    return mean, covariance_about(origin, poses, weights, CENTER)
+
+
+@pytest.mark.parametrize("temperature", [1.0, 2.0])
+def test_the_new_particles_have_the_moments_of_the_posterior(temperature: float) -> None:
+    before = search_result()
+    sampling = ImportanceSampling(400, rounds=2, temperature=temperature)
+    after = sampling(before, None, Known(), torch.Generator().manual_seed(1))  # type: ignore[arg-type]
+    mean, covariance = moments(after)
+    scale = SCALE * math.sqrt(temperature)
+    assert bool((mean.abs() < 0.3 * scale).all())
+    assert bool(((covariance.diagonal().sqrt() / scale - 1).abs() < 0.25).all())
+    deviation = covariance.diagonal().sqrt()
+    assert float(covariance[0, 4] / deviation[0] / deviation[4]) == pytest.approx(0.8, abs=0.12)
+    old = moments(before)[1]
+    assert float(old[0, 4] / old[0, 0].sqrt() / old[4, 4].sqrt()) < 0.5
+    assert float(after.log_weights.logsumexp(1)) == pytest.approx(0, abs=1e-5)
+    assert torch.equal(after.best, before.best)
+    assert torch.equal(after.score, before.score)
+
+
+def test_the_same_seed_gives_the_same_particles() -> None:
+    one, other = (
+        ImportanceSampling(50, 1)(search_result(), None, Known(), torch.Generator().manual_seed(s))  # type: ignore[arg-type]
+        for s in (2, 2)
+    )
+    assert torch.equal(one.poses, other.poses)
+    assert torch.equal(one.log_weights, other.log_weights)
+
+
+def test_drawn_poses_are_of_the_density_they_are_drawn_from() -> None:
+    """The mean of p / q over draws from q is 1, for a narrower p."""
+    g = torch.Generator().manual_seed(3)
+    start = make_pose(random_rotation(generator=g), torch.randn(3, generator=g)).double()
+    noise = torch.randn(60, 6, generator=g).double() * SCALE
+    poses = move_about(start.expand(60, 4, 4), noise, CENTER)
+    even = torch.full((60,), -math.log(60)).double()
+    density = fit_density(poses, even, CENTER, 0.1, 0.2)
+    wide = widen(density, 1.5)
+    drawn = draw_poses(wide, 4000, g)
+    ratio = (log_density(density, drawn) - log_density(wide, drawn)).exp()
+    assert float(ratio.mean()) == pytest.approx(1, abs=0.06)
+    assert torch.allclose(measure_kernels(wide), 2.25 * measure_kernels(density), rtol=1e-6)
+
+
+def test_widened_turns_end_before_they_wrap_round() -> None:
+    turns = exp_so3(torch.randn(40, 3, generator=torch.Generator().manual_seed(4)).double())
+    poses = make_pose(turns, torch.zeros(3).double())
+    even = torch.full((40,), -math.log(40)).double()
+    density = widen(fit_density(poses, even, torch.zeros(3).double(), 0.1, 0.2), 10.0)
+    size = torch.linalg.eigvalsh(measure_kernels(density)[:, 3:, 3:])
+    assert float(size.max()) <= 0.6**2 + 1e-6
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"samples": 0}, {"rounds": 0}, {"widening": 0.5}, {"temperature": 0.0}]
+)
+def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(UserError, match="importance sampling needs"):
+        ImportanceSampling(**wrong)  # type: ignore[arg-type]
