@@ -256,7 +256,8 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
         return None
     words = dict(word.split("=", 1) for word in run.words.split())
     start = _tell_start(words.get("warm_start", ""))
-    cost = own["training"]["steps"] * own["training"]["cpu_seconds_per_step"] / 60
+    step = own["training"]["cpu_seconds_per_step"]  # unknown where the test was made by itself
+    cost = "–" if step is None else f"{own['training']['steps'] * step / 60:.1f}"
     first = [
         f"`{run.name}`",
         run.object,
@@ -264,7 +265,7 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
         _tell_augment(run),
         start,
         str(run.steps),
-        f"{cost:.1f}",
+        cost,
     ]
     return [*first, *_figures(tested)]
 
