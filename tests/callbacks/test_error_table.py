@@ -23,7 +23,7 @@ from posefilter.metrics.scores import summarize
 from posefilter.types import ObjectModel
 
 ROW = ImageError(
-    1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125, 0.9, 0.8
+    1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125, 0.9, 0.8, 12.5, 0.25
 )
 
 
@@ -46,10 +46,10 @@ def test_rows_are_read_as_they_were_written(tmp_path: Path) -> None:
     rows = [ROW, ROW._replace(add_mm=math.inf, im_id=8, image='a "b", c', visibility=0.1 + 0.2)]
     write_errors(tmp_path / FILE, rows)
     assert read_errors(tmp_path / FILE) == rows
-    older = [line.rsplit(",", 2)[0] for line in (tmp_path / FILE).read_text().splitlines()]
+    older = [line.rsplit(",", 4)[0] for line in (tmp_path / FILE).read_text().splitlines()]
     (tmp_path / FILE).write_text("\n".join(older) + "\n")  # as before there were probabilities
     read = read_errors(tmp_path / FILE)
-    assert [row[:-2] for row in read] == [row[:-2] for row in rows]
+    assert [row[:-4] for row in read] == [row[:-4] for row in rows]
     assert all(math.isnan(row.probability) for row in read)
     (tmp_path / FILE).write_text((tmp_path / FILE).read_text().replace("add_mm", "other", 1))
     with pytest.raises(ValueError, match="add_mm is missing"):
@@ -90,7 +90,9 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     data = SimpleNamespace(records=lambda split: records)
     trainer: Any = SimpleNamespace(datamodule=data, is_global_zero=True, loggers=[], global_step=3)
     method: Any = Method()
-    method.model, method.capabilities, method.scores = object_model(), {"pose"}, {"poses": errors}
+    method.model, method.capabilities = object_model(), {"pose"}
+    at_truth = SimpleNamespace(log_density=torch.arange(3.0), rank=torch.full((3,), 0.5))
+    method.scores = {"poses": errors, "credibility": SimpleNamespace(last=lambda: at_truth)}
     method.seconds_per_image = [0.5]
     method.particle_pixels = lambda particles, batch: torch.full((len(batch.frame_id), 4, 2), 5.0)
     table = ErrorTable(tmp_path, best=2, worst=2)

@@ -51,7 +51,7 @@ def draw_health(
             _HEIGHT,
             thick=3,
         )
-        panels.append(add_caption(panel, info.label))
+        panels.append(add_caption(panel, info.short or info.label))
     return compose_figure(
         title,
         draw_text(f"means over {images} image{'s' * (images != 1)}", DETAIL),

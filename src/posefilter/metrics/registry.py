@@ -443,6 +443,7 @@ _METRICS = (
         ".0f",
         factor=100.0,
         limits=PERCENT,
+        short="relative ESS",
         meaning="1 / Σw² over the number of particles",
     ),
     MetricInfo("filter/spread_m", "spread of the centers", "mm", ".1f", factor=1000.0),
