@@ -48,7 +48,7 @@ def test_a_killed_run_goes_on_to_the_same_end(
         f"trainer.val_check_interval={interval}",
         f"trainer.max_steps={3 * interval}",
         *(SMALL_POSE_PF if model == "pose_pf" else []),
-        f"callbacks={'default' if (model, interval) == ('cnn_patch', 3) else 'none'}",
+        f"callbacks={'default' if (model, interval) == ('cnn_patch', 3) else 'checkpoints'}",
     ]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     training.train(tiny_job(whole, *settings))
