@@ -23,7 +23,22 @@ from posefilter.metrics.scores import summarize
 from posefilter.types import ObjectModel
 
 ROW = ImageError(
-    1, 7, 3, "carton", "scene_1/000007", 0.5, 1.25, 0.5, 270.0, 0.75, -3.5, 0.125, 0.9, 0.8, 12.5, 0.25
+    1,
+    7,
+    3,
+    "carton",
+    "scene_1/000007",
+    0.5,
+    1.25,
+    0.5,
+    270.0,
+    0.75,
+    -3.5,
+    0.125,
+    0.9,
+    0.8,
+    12.5,
+    0.25,
 )
 
 
