@@ -71,3 +71,14 @@ def test_lines_are_no_wider_than_the_picture() -> None:
     assert " ".join(lines).split() == words
     assert len(lines) > 5
     assert wrap_words(["a" * 500], 300) == ["a" * 500]
+
+
+def test_long_labels_have_lines_of_their_own_in_the_legend() -> None:
+    """A label that the picture's edge would cut is put below the one before."""
+    short, long = (
+        draw_detections(GREY, K, [Drawn(label, POSE, CUBE), Drawn(label, POSE, CUBE)])
+        for label in ("a", "003_cracker_box: found, probability 0.95")
+    )
+    assert len(long) > len(short)
+    legend = long[480:]
+    assert (legend[:, -4:] == legend[0, -1]).all()  # nothing at the right edge

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from posefilter.figures.canvas import Color, draw_row, draw_tag, full_view, load_font
+from posefilter.figures.layout import draw_legend
 from posefilter.figures.overlay import WIDTH, Shape, draw_pose, outline_object
 
 _LETTERS = 15  # [px] of a row
@@ -54,7 +55,7 @@ def draw_detections(
         draw_pose(picture, shown, pose, one.shape, colors[i], dashed=one.dashed)
     _draw_tags(picture, shown, detections, colors)
     entries = [(one.label, color) for one, color in zip(detections, colors, strict=True)]
-    rows = [draw_row(picture.shape[1], "", entries[i : i + 2]) for i in range(0, len(entries), 2)]
+    rows = [draw_legend(entries, picture.shape[1], _LETTERS)] if entries else []
     words = f"absent: {', '.join(absent)}".split() if absent else []
     texts = [*wrap_words(words, picture.shape[1] - 16), *([caption] if caption else [])]
     rows += [draw_row(picture.shape[1], text, size=_LETTERS) for text in texts]
