@@ -154,23 +154,23 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--draw", default=None, help="folder of a picture a frame")
     parser.add_argument("--csv", default=None, help="a file of all results in BOP's format")
     parser.add_argument("--out", default=None)
-    told = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    estimator = posefilter.load(told.weights or told.object, device="cpu")
-    meshes = open_meshes(told.meshes, None, "fat", told.object)
-    reader = open_reader("fat", told.root, told.object, meshes)
+    estimator = posefilter.load(options.weights or options.object, device="cpu")
+    meshes = open_meshes(options.meshes, None, "fat", options.object)
+    reader = open_reader("fat", options.root, options.object, meshes)
     rows, images, lines = list[dict[str, Any]](), list[tuple[Any, ...]](), list[PoseRow]()
-    for number, own in enumerate(list_frames(reader)[: told.limit]):
+    for number, own in enumerate(list_frames(reader)[: options.limit]):
         samples = [reader.read(i) for i in own]
         shares = [reader.visible_share(sample) for sample in samples]
-        row, results = judge(estimator, samples, shares, told.seed)
+        row, results = judge(estimator, samples, shares, options.seed)
         rows.append(row)
         records = reader.records()
         lines += list_lines(results, records[own[0]], reader, row["seconds"])
         images.append((samples[0].rgb, samples[0].depth, samples[0].intrinsics))
         print(json.dumps({"frame": number, **row}), flush=True)
-        if told.draw:
-            mesh = meshes.load(told.object)
+        if options.draw:
+            mesh = meshes.load(options.object)
             marks = [
                 Drawn(
                     one.describe(),
@@ -182,15 +182,15 @@ def main(arguments: list[str] | None = None) -> int:
                 for one in results
             ]
             picture = draw_detections(samples[0].rgb, samples[0].intrinsics, marks)
-            save_image(picture, Path(told.draw) / f"{number:03d}.png")
-    if told.csv:
-        write_poses_csv(Path(told.csv), lines)
-    summary = summarize(rows, told.visible)
-    if told.classes:
-        summary["classes"] = time_classes(told.classes, told.object, images[:5])
+            save_image(picture, Path(options.draw) / f"{number:03d}.png")
+    if options.csv:
+        write_poses_csv(Path(options.csv), lines)
+    summary = summarize(rows, options.visible)
+    if options.classes:
+        summary["classes"] = time_classes(options.classes, options.object, images[:5])
     print(json.dumps(summary, indent=1))
-    if told.out:
-        Path(told.out).write_text(json.dumps({"summary": summary, "frames": rows}, indent=1))
+    if options.out:
+        Path(options.out).write_text(json.dumps({"summary": summary, "frames": rows}, indent=1))
     return 0
 
 

@@ -4,25 +4,15 @@ python export.py checkpoint=RUN format=onnx out=drill          # of a patch_pf o
 python examples/onnx/pixels.py drill rgb.png depth.png fx,fy,cx,cy 10000
 """
 
-import json
-from pathlib import Path
-
 import numpy as np
-import onnxruntime
-from poses import draw, draw_poses, fit_rigid, read_arguments, resample, softmax
+from poses import draw, draw_poses, fit_rigid, open_export, read_arguments, resample, softmax
 
 
 class PixelFilter:
     """What `export.py format=onnx` wrote of a `patch_pf` or `pixel_pf`."""
 
     def __init__(self, folder, threads=1):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        self.settings = json.loads((Path(folder) / "filter.json").read_text())
-        self.encode, self.measure = (
-            onnxruntime.InferenceSession(Path(folder) / f"{name}.onnx", options)
-            for name in ("encode", "measure")
-        )
+        self.settings, self.encode, self.measure = open_export(folder, threads)
 
     def estimate(self, rgb, depth, intrinsics, seed=0, start=None):
         """RGB (H, W, 3) uint8, depth (H, W) [m], (3, 3) -> camera_from_object (4, 4), its score,

@@ -14,17 +14,22 @@ import numpy as np
 import onnxruntime
 
 
+def open_export(folder, threads):
+    """What `export.py format=onnx` wrote: its settings, and the networks `encode` and `measure`."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    networks = (
+        onnxruntime.InferenceSession(Path(folder) / f"{name}.onnx", options)
+        for name in ("encode", "measure")
+    )
+    return json.loads((Path(folder) / "filter.json").read_text()), *networks
+
+
 class PoseFilter:
     """What `export.py format=onnx` wrote of a `pose_pf`."""
 
     def __init__(self, folder, threads=1):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        self.settings = json.loads((Path(folder) / "filter.json").read_text())
-        self.encode, self.measure = (
-            onnxruntime.InferenceSession(Path(folder) / f"{name}.onnx", options)
-            for name in ("encode", "measure")
-        )
+        self.settings, self.encode, self.measure = open_export(folder, threads)
         self.center, self.radius = np.float32(self.settings["center"]), self.settings["radius"]
 
     def estimate(self, rgb, depth, intrinsics, seed=0):

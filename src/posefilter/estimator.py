@@ -15,7 +15,6 @@ from posefilter.belief import Belief, Mode, PoseSet
 from posefilter.belief.summaries import check_share
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.conformal import Conformal
-from posefilter.confidence.evidence import measure_depth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
@@ -312,15 +311,14 @@ class Estimator:
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
             method.seed = seed
-            start = time.perf_counter()
+            start, found, surface = time.perf_counter(), None, None
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
-                found = method.assess(trace, batch)
+                if method.calibration is not None:
+                    evidence = method.collect_evidence(trace, batch)
+                    found, surface = method.calibration.assess(evidence), evidence["surface"]
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            surface = None
-            if found is not None:
-                surface = measure_depth(trace.belief.best, batch, method.model)["surface"]
             runs.append(Run(method, batch, trace, seconds, found, surface))
         return runs
 
