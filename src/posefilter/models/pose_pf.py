@@ -13,6 +13,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
+from posefilter.nets.fused import make_tables
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
@@ -113,6 +114,9 @@ class PosePF(PoseEstimator):
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         context = coordinates if coordinates.features.shape[-1] else None
         image = flatten_images(batch.rgb, batch.depth, batch.intrinsics, context)
+        if context is not None and not torch.is_grad_enabled():
+            assert image.context is not None
+            image = image._replace(tables=make_tables(image.context))
         return PoseScene(image, coordinates, measure_cells(batch.depth, batch.intrinsics))
 
     def measure(
@@ -120,9 +124,7 @@ class PosePF(PoseEstimator):
     ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
         count = self.train_pixels if self.training else self.pixels
-        # bfloat16 halves the time of a step; its error is far below the noise of so few pixels
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)):
-            score = self._score(scene, particles.state, step.sigma, generator, count).float()
+        score = self._score_fast(scene, particles.state, step.sigma, generator, count)
         no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, particles.state, particles.latent)
 
@@ -141,7 +143,10 @@ class PosePF(PoseEstimator):
         Returns:
             Log-likelihoods up to a constant for each image, (B, N).
         """
-        return self._score(scene, poses, poses.new_tensor(sigma), generator, pixels)
+        at = poses.new_tensor(sigma)
+        # a gradient would be that of a rounded score
+        how = self._score if torch.is_grad_enabled() else self._score_fast
+        return how(scene, poses, at, generator, pixels)
 
     def propose_poses(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the votes of the proposal network.
@@ -224,9 +229,8 @@ class PosePF(PoseEstimator):
         scene = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
-        scores = self.score_poses(
-            scene, pair, self.comparison_sigma, generator, self.comparison_pixels
-        )
+        sigma = pair.new_tensor(self.comparison_sigma)
+        scores = self._score(scene, pair, sigma, generator, self.comparison_pixels)
         outscored = scores[:, 0] > scores[:, 1]
         wrong = (
             add(trace.belief.best, batch.camera_from_object, self.model.points)
@@ -267,3 +271,11 @@ class PosePF(PoseEstimator):
             scene.image, poses, sigma, self._center(), self.model.radius, pixels, generator
         )
         return score
+
+    def _score_fast(
+        self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int
+    ) -> Tensor:
+        """Score in bfloat16 where that is fast; its error is far below the noise of few pixels."""
+        fast = fast_bfloat16(self.device)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=fast):
+            return self._score(scene, poses, sigma, generator, pixels).float()

@@ -19,11 +19,11 @@ import torch.nn.functional as F
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.camera import project, rays
 from posefilter.geometry.lookup import gather_rows
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
+from posefilter.nets.fused import Tables, applies, missing_context, score
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
 
@@ -35,6 +35,7 @@ class Pixels(NamedTuple):
     size: tuple[int, int]  # H, W
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: Context | None = None  # output of the coordinate network
+    tables: Tables | None = None  # of the context, where poses are scored without gradient
 
     def first(self, count: int) -> "Pixels":
         """Return the first `count` images."""
@@ -185,11 +186,7 @@ class PoseLikelihood(nn.Module):
             UserError: The points have no context.
         """
         if points.context is None:
-            raise UserError(
-                "model/likelihood=contextual reads the proposal network; choose "
-                "model/proposals=dense or "
-                "model/likelihood=contrastive"
-            )
+            raise missing_context()
         log_share, predicted, logit, features = points.context.split(
             [1, 3, 1, points.context.shape[-1] - 5], dim=-1
         )
@@ -240,6 +237,11 @@ class PoseLikelihood(nn.Module):
             Log-likelihoods (B, N).
         """
         noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
+        if applies(poses, sigma):
+            half = torch.is_autocast_enabled("cpu")
+            dtype = torch.get_autocast_dtype("cpu") if half else poses.dtype
+            with torch.autocast("cpu", enabled=False):
+                return score(self, image, poses, sigma, center, radius, noise, dtype)
         # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
             points = sample_points(image, poses, center, radius, noise)
