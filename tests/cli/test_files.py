@@ -2,10 +2,10 @@
 broken.
 """
 
+import os
+import resource
 import shutil
-import subprocess
-import sys
-import textwrap
+import signal
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from posefilter.cli.best import Last
 from posefilter.cli.files import WholeCheckpoints, save_whole
+from posefilter.errors import UserError
 from posefilter.files import open_whole
 
 
@@ -71,22 +72,21 @@ def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> N
     """A process that may write no more than some bytes, as on a full disk."""
     file = tmp_path / "last.ckpt"
     save_whole({"weight": torch.ones(3)}, file)
-    script = f"""
-        import resource, signal, torch
-        from pathlib import Path
-        from posefilter.cli.files import save_whole
-        from posefilter.errors import UserError
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+    reader, writer = os.pipe()
+    number = os.fork()
+    if not number:
         try:
-            save_whole({{"weight": torch.ones(100_000)}}, Path({str(file)!r}))
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+            save_whole({"weight": torch.ones(100_000)}, file)
         except UserError as error:
-            print(error)
-    """
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == f"{file}: cannot be written (File too large)\n"
+            os.write(writer, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as said:
+        assert said.read() == f"{file}: cannot be written (File too large)"
+    os.waitpid(number, 0)
     assert torch.load(file, weights_only=True)["weight"].tolist() == [1, 1, 1]
     assert [path.name for path in tmp_path.iterdir()] == ["last.ckpt"]
 

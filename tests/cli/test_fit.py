@@ -3,11 +3,10 @@ fits.
 """
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from tests.cli.conftest import Cold
 from tests.models.toy import square
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
@@ -112,7 +111,7 @@ def test_a_class_that_is_typed_by_itself_is_named_so(tmp_path: Path) -> None:
     assert "Confidence" in said or "loss=confidence" in said
 
 
-def test_torch_is_not_imported_for_it() -> None:
+def test_torch_is_not_imported_for_it(cold: Cold, tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path;"
         "from posefilter.cli.command import compose_job; from posefilter.cli.fit import check_fit;"
@@ -120,7 +119,7 @@ def test_torch_is_not_imported_for_it() -> None:
         f"job = compose_job('train', Path({str(CONF)!r}), ['model=patch_pf'], Path());"
         "check_fit(job.cfg, job.choices, Scope.CONFIG); sys.exit('torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert cold.run(code, tmp_path).returncode == 0
 
 
 def test_parts_put_together_in_python_are_matched_too(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.cli.conftest import Cold
 
 import posefilter
 from posefilter.cli.main import COMMANDS, main
@@ -51,16 +52,10 @@ assert not heavy, heavy
 
 
 @pytest.mark.parametrize("arguments", REFUSED)
-def test_a_mistake_is_one_line_before_torch_is_imported(arguments: str, tmp_path: Path) -> None:
-    program = _PROGRAM.format(arguments=arguments, heavy=HEAVY)
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=OWN,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_a_mistake_is_one_line_before_torch_is_imported(
+    arguments: str, cold: Cold, tmp_path: Path
+) -> None:
+    done = cold.run(_PROGRAM.format(arguments=arguments, heavy=HEAVY), tmp_path)
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()
     assert len(lines) == 1
@@ -116,7 +111,7 @@ def test_each_command_has_its_script_and_its_settings() -> None:
         assert (HOME / "conf" / f"{name}.yaml").is_file()
 
 
-def test_a_command_says_something_before_torch_is_imported(tmp_path: Path) -> None:
+def test_a_command_says_something_before_torch_is_imported(cold: Cold, tmp_path: Path) -> None:
     """The first line of a report, which fails later: its folder holds no run."""
     program = (
         "import sys\n"
@@ -129,12 +124,6 @@ def test_a_command_says_something_before_torch_is_imported(tmp_path: Path) -> No
         "from posefilter.cli.main import main\n"
         f"main(['report', 'run={tmp_path}'])\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=OWN,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = cold.run(program, tmp_path)
+    assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[0] == "report: starting"

@@ -1,10 +1,9 @@
 """`--help` shows a command's own settings and choices on a page, from the files as they stand."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from tests.cli.conftest import Cold
 
 from posefilter.cli.command import register_resolvers, run_command
 from posefilter.cli.main import COMMANDS
@@ -56,9 +55,9 @@ def test_a_folder_of_ones_own_adds_its_choices(tmp_path: Path) -> None:
     assert "brier" not in describe_command("train", CONF).split()
 
 
-def test_torch_is_not_imported_for_it() -> None:
+def test_torch_is_not_imported_for_it(cold: Cold, tmp_path: Path) -> None:
     code = (
         "import sys; from posefilter.cli.command import run_command;"
         "sys.exit(run_command('train', arguments=['--help']) or 'torch' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    assert cold.run(code, tmp_path).returncode == 0
