@@ -2,17 +2,21 @@
 takes seconds, a fork takes a few hundredths.
 """
 
+import gc
 import os
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import omegaconf._utils
 import torch
+import yaml
 
 # what the commands import when they are called: before the fork, so that it is paid once
 import posefilter.cli.check_data
@@ -40,9 +44,30 @@ class Ended(NamedTuple):
 
 
 def prepare() -> None:
-    """Have no threads in this process, which a forked one would miss."""
+    """Have no threads in this process, which a forked one would miss, and parse settings by
+    libyaml, where there is one: that is a third of what a refusal takes.
+    """
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    if yaml.__with_libyaml__:
+        pure, yaml.SafeLoader = yaml.SafeLoader, yaml.CSafeLoader  # type: ignore[misc]
+        loader = omegaconf._utils.get_yaml_loader()
+        yaml.SafeLoader = pure  # type: ignore[misc]
+        omegaconf._utils.get_yaml_loader = lambda: loader
+
+
+def warm(lines: Mapping[str, Sequence[str]]) -> None:
+    """Run commands in this process, so that what they import and keep is paid once; what is there
+    afterwards is not looked at by a forked process's garbage collection.
+
+    Args:
+        lines: What is typed after each command's name; each must work.
+    """
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+        for command, arguments in lines.items():
+            assert run_command(command, HOME, list(arguments)) == 0, command
+    gc.collect()
+    gc.freeze()
 
 
 def start(

@@ -15,6 +15,7 @@ import resource
 import sys
 import tempfile
 from collections import Counter
+from contextlib import chdir
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ from omegaconf import OmegaConf
 HOME = Path(__file__).parents[1]
 sys.path.insert(0, str(HOME / "bench"))
 
-from forking import RAW, Ended, prepare, run  # noqa: E402
+from forking import RAW, Ended, prepare, run, warm  # noqa: E402
 
 import posefilter.cli.onboard  # noqa: E402
 from posefilter.cli.command import compose_job  # noqa: E402
@@ -72,16 +73,25 @@ def main(arguments: list[str] | None = None) -> int:
     prepare()
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
+        place, scratch = Path(folder), Path(folder) / "scratch"
+        scratch.mkdir()
         lines = make_lines(place)
         commands = [given.command] if given.command else [*lines, "train", "train", "predict"]
         keys = {name: list_keys(name, place) for name in lines}
+        warm(
+            {
+                name: [word.replace("NEW", f"warm_{name}") for word in line]
+                for name, line in lines.items()
+                if name != "onboard"  # which would take minutes
+            }
+        )
         for number in range(given.count):
             rng = random.Random(f"{given.seed} {number}")
             command = commands[number % len(commands)]
             own = [word.replace("NEW", f"new{number}") for word in lines[command]]
             typed = change(own, keys[command], place, rng)
-            ended = run(command, typed, place / "log", PATIENCE, limit)
+            with chdir(scratch):  # what is typed may name files of the working folder
+                ended = run(command, typed, place / "log", PATIENCE, limit)
             outcome = judge(ended)
             counts[outcome] += 1
             if given.list or outcome in FAILURES:

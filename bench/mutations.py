@@ -18,6 +18,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -131,7 +132,8 @@ def try_one(base: Base, work: Path, rng: random.Random) -> tuple[str, str, str]:
     shutil.copytree(base.root, work)
     what = spoil(work, rng)
     try:
-        with limited(SECONDS):
+        with limited(SECONDS), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # no line of NumPy's on the console
             return what, *judge(base, work)
     except Hang:
         return what, FAILURES[1], ""

@@ -63,8 +63,11 @@ def _spoil_bytes(path: Path, rng: Rng) -> str:
     elif way == "noise":
         data = bytearray(rng.randbytes(len(data)))
     elif way == "other":
-        others = sorted(p for p in path.parent.rglob("*") if p.is_file() and p != path)
-        other = rng.choice(others)
+        near, far = (
+            sorted(p for p in folder.rglob("*") if p.is_file() and p != path)
+            for folder in (path.parent, path.parent.parent)
+        )
+        other = rng.choice(near or far)
         path.write_bytes(other.read_bytes())
         return f"bytes of {other.name}"
     elif way == "append":

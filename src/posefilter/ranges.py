@@ -320,6 +320,11 @@ def check_ranges(settings: Mapping[str, Any], command: str) -> None:
         if isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"{key}={value}: must be a finite number")
 
+    for key, ours in list_mappings(settings):
+        allowed = find_range(f"{command}.{key}") if ours else None
+        if allowed is not None:
+            raise UserError(f"{key}: must be {allowed}, and is a mapping")
+
 
 def find_range(place: str) -> Range | None:
     """Return the range of a setting, None where the table has none.
@@ -346,3 +351,14 @@ def list_values(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[s
             yield from list_values(value, f"{key}[{i}]", ours)
     else:
         yield key, node, ours
+
+
+def list_mappings(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, bool]]:
+    """Yield (key, ours) of each setting that is a mapping; `ours` as in `list_values`."""
+    if isinstance(node, Mapping):
+        if key:
+            yield key, ours
+        target = node.get("_target_")
+        ours = ours if target is None else str(target).startswith(_OURS)
+        for name, value in node.items():
+            yield from list_mappings(value, f"{key}.{name}" if key else str(name), ours)

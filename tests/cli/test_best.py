@@ -1,6 +1,7 @@
 """Which of a run's validations is tested."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -8,7 +9,8 @@ from lightning import LightningModule, Trainer
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from posefilter.cli.best import Best
+from posefilter.cli.best import Best, Last, check_kept
+from posefilter.errors import UserError
 
 
 class Scored(LightningModule):
@@ -56,3 +58,28 @@ def test_of_equal_validations_the_latest_is_kept(
     trainer.fit(Scored(scores), one, one)
     assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] == step
     assert [path.name for path in tmp_path.iterdir()] == ["best.ckpt"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"dirpath": "elsewhere"}, "callbacks.best.dirpath=.*elsewhere: .*checkpoints"),
+        ({"filename": "good"}, "callbacks.best.filename=good: must be best"),
+        ({"save_top_k": 3}, "callbacks.best.save_top_k=3: must be 1"),
+        ({"save_top_k": 0}, "callbacks.best.save_top_k=0: must be 1"),
+        ({"monitor": "None"}, "callbacks.best.monitor=None: must be .*val/score"),
+    ],
+)
+def test_a_run_whose_best_checkpoint_would_not_be_found_is_refused_before_it(
+    wrong: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "checkpoints"
+    right = {"dirpath": folder, "filename": "best", "monitor": "val/score"}
+    last = Last(str(folder))
+    check_kept([last, Best(**right)], tmp_path)
+    with pytest.raises(UserError, match=told):
+        check_kept([last, Best(**(right | wrong))], tmp_path)
+    with pytest.raises(UserError, match=r"callbacks\.best: is missing"):
+        check_kept([last], tmp_path)
+    with pytest.raises(UserError, match=r"callbacks\.last\.dirpath"):
+        check_kept([Last(str(tmp_path)), Best(**right)], tmp_path)

@@ -125,6 +125,21 @@ def test_a_value_that_makes_no_sense_is_named(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("command", ["train", "onboard", "generate"])
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [({"a": 1}, "is a mapping"), ({}, "is a mapping"), ([1], "is a list")],
+)
+def test_a_number_is_neither_a_mapping_nor_a_list(
+    command: str, value: Any, told: str, composed: dict[str, DictConfig]
+) -> None:
+    cfg = composed[command].copy()
+    OmegaConf.set_readonly(cfg, False)
+    OmegaConf.update(cfg, "seed", value, merge=False)
+    with pytest.raises(UserError, match=f"^seed.*{told}"):
+        check_settings(cfg, command)
+
+
 @pytest.mark.parametrize(
     ("command", "typed"), [("train", "optimizer.lr=nan"), ("predict", "threads=0")]
 )

@@ -79,6 +79,8 @@ WRONG = {
     "factor 1": ({"factor_depth": lambda m: m * 1e-4}, "depth is not plausible"),
     "behind": ({"poses": moved(-0.5)}, "behind the camera"),
     "1e30 m": ({"poses": moved(1e30)}, "wrong unit"),
+    "1e300 m": ({"poses": moved(1e300)}, "wrong unit"),
+    "fx, fy = 1e300": ({"intrinsic_matrix": lambda m: m * [[1e300], [1e300], [1]]}, "focal"),
     "classes of text": ({"cls_indexes": lambda m: np.array(["box"])}, "cls_indexes"),
     "classes complex": ({"cls_indexes": lambda m: m + 1j}, "complex"),
     "poses complex": ({"poses": lambda m: m + 1j}, "complex"),
@@ -86,6 +88,7 @@ WRONG = {
 }
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("case", WRONG)
 def test_numbers_that_cannot_be_are_refused_and_counted(tmp_path, case):
     for frame in (1, 2):
@@ -155,6 +158,7 @@ BOP = {
     "a ragged list": lambda c: {**c, "0": [{**c["0"][0], "cam_t_m2c": [0, [1], 2]}]},
     "null record": lambda c: {**c, "0": [None]},
     "text": lambda c: {**c, "0": "x"},
+    "a nested number": lambda c: {**c, "0": [{**c["0"][0], "obj_id": [[2]]}]},
     "no number": lambda c: {**c, "0": [{**c["0"][0], "obj_id": None}]},
     "a superscript": lambda c: {**c, "\u00b2": c["0"]},
     "a long number": lambda c: {**c, "1" * 5000: c["0"]},

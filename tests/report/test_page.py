@@ -1,8 +1,6 @@
 """The page holds what it should, holds all of it itself, and shows in a real browser."""
 
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
@@ -14,6 +12,7 @@ from PIL import Image
 from tests.report.browser import CHROMIUM, browser
 from tests.report.conftest import MARK
 
+from posefilter.cli import run_command
 from posefilter.report.blocks import Paragraph, Section, Text, Tile, show_images
 from posefilter.report.charts import DARK, LIGHT, Line, Panel, draw_chart, smooth
 from posefilter.report.gather import read_run
@@ -225,30 +224,28 @@ def test_the_browser_notices(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command(run: Path, sweep: Path) -> None:
+def test_the_command(
+    run: Path,
+    sweep: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
     """`report.py` writes the page beside the run; a mistake is one line, and leaves nothing
     behind.
     """
-
-    def call(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, str(HOME / "report.py"), *arguments]
-        return subprocess.run(
-            command, capture_output=True, text=True, cwd=run.parent, timeout=280, check=False
-        )
-
-    done = call(f"run={run}")
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(run.parent)
+    assert run_command("report", HOME, [f"run={run}"]) == 0
     page = (run / "report" / "report.html").read_text()
     assert "filter.particles" in page
     assert "differ from the defaults" in page  # the defaults were composed
     assert (run / "report" / "training-loss-training-step.png").is_file()
-    wrong = call("run=missing")
-    assert wrong.returncode == 2
-    assert wrong.stderr.strip() == "report: run=missing: no such folder"
+    capfd.readouterr()
+    assert run_command("report", HOME, ["run=missing"]) == 2
+    assert capfd.readouterr().err.strip() == "report: run=missing: no such folder"
     assert not (run.parent / "missing").exists()
     there = sweep.rename(sweep.parent / "a=1,b=2")  # as the folders of a sweep's runs are named
-    done = call(f"sweep={there}", f"out={there / 'elsewhere'}")
-    assert done.returncode == 0, done.stderr
+    typed = [f"sweep={there}", f"out={there / 'elsewhere'}"]
+    assert run_command("report", HOME, typed) == 0
     assert "Sweep over filter.particles (2)" in (there / "elsewhere" / "report.html").read_text()
 
 

@@ -3,16 +3,19 @@
 import math
 import os
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lightning import LightningModule, Trainer
+from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
 from posefilter.cli.stopping import asked_to_stop
+from posefilter.errors import UserError
 
+_KEPT = {"filename": "best", "save_top_k": 1}  # as the test and later commands expect them
 _NONE_DONE = {"ready": 0, "started": 0, "processed": 0, "completed": 0}
 
 
@@ -136,3 +139,33 @@ class Last(Checkpoint):
                 self.path.replace(self.path.with_name(BEFORE))
             new.replace(self.path)
         self._saved_at, self._whole = time.monotonic(), True
+
+
+def check_kept(callbacks: Sequence[Callback], folder: Path) -> None:
+    """Refuse settings by which a run's checkpoints would not be where its test, `resume=` and
+    reports look for them: now, not after the training.
+
+    Raises:
+        UserError: The key, and what it has to be.
+    """
+    best = [one for one in callbacks if isinstance(one, Best)]
+    if not best:
+        raise UserError("callbacks.best: is missing; a run is tested on its best checkpoint")
+    places = {f"best.dirpath={one.dirpath}": one.dirpath for one in best}
+    last = (one.path.parent for one in callbacks if isinstance(one, Last))
+    places |= {f"last.dirpath={path}": path for path in last}
+    for setting, path in places.items():
+        if os.path.realpath(path or "") != os.path.realpath(folder / "checkpoints"):
+            raise UserError(
+                f"callbacks.{setting}: a run's checkpoints lie in {folder / 'checkpoints'}; out= "
+                "names another run's folder"
+            )
+    for one in best:
+        for name, due in _KEPT.items():
+            if getattr(one, name) != due:
+                raise UserError(f"callbacks.best.{name}={getattr(one, name)}: must be {due}")
+        if not str(one.monitor).startswith("val/"):
+            raise UserError(
+                f"callbacks.best.monitor={one.monitor}: must be a number of the validation, such "
+                "as val/score"
+            )

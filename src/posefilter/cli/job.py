@@ -109,6 +109,9 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
+    for key in ("seed", "threads"):
+        if isinstance(plain.get(key), list):
+            raise UserError(f"{key}={plain[key]}: must be one number, and is a list")
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:
         raise UserError(

@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import torch
 from lightning import Trainer
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from torch.utils.data import default_collate
 
+from posefilter.cli.best import check_kept
 from posefilter.cli.build import build_data, build_trainer
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.console import is_installed, say, typed
@@ -20,7 +22,7 @@ from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import finished, learned_from, start_from, take_over
 from posefilter.cli.warm_start import warm_start
 from posefilter.data.module import PoseDataModule
-from posefilter.errors import Stopped
+from posefilter.errors import Stopped, UserError
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
 from posefilter.paths import stays_inside
@@ -98,7 +100,9 @@ def fit(run: Run) -> dict[str, Any]:
 
     Raises:
         Stopped: The run was told to stop; the console says how to go on.
+        UserError: Lightning refuses a setting of the trainer or of a callback.
     """
+    check_kept(run.trainer.callbacks, run.job.folder)  # type: ignore[attr-defined]
     start, before = start_from(run.job)
     began = time.perf_counter(), time.process_time()
     try:
@@ -106,6 +110,8 @@ def fit(run: Run) -> dict[str, Any]:
     except Stopped:
         say_stopped(run)
         raise
+    except MisconfigurationException as error:
+        raise UserError(f"trainer or callbacks: {' '.join(str(error).split())}") from error
     taken = cost(run.trainer.global_step, before, *began)
     return {**taken, "learned_from": learned_from(run.job)}
 

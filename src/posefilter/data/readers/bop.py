@@ -23,7 +23,7 @@ from posefilter.data.readers.decode import (
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects
-from posefilter.data.readers.plausible import check_camera, check_sample, check_units
+from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.meshes import ycb
@@ -165,7 +165,7 @@ class BopReader(BaseReader):
         if not mask.any():
             raise NotShown(mask_path, "listed, but not in the label", entry.record.object)
         object_id = self.objects.index(entry.record.object)
-        K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
+        K, pose = narrow(entry.K), narrow(entry.camera_from_object)
         sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
         native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
         return check_sample(sample, native, (camera_path, gt_path, depth_path, mask_path))

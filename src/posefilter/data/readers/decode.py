@@ -116,6 +116,8 @@ def numbers(
     value = need(record, key, path, where)
     if isinstance(value, np.ndarray) and np.iscomplexobj(value):
         raise BadData(path, f"'{where}{key}' is not numbers", "they are complex")
+    if shape == () and isinstance(value, list):  # JSON's; MATLAB's numbers are arrays
+        raise BadData(path, f"'{where}{key}' is not a number", f"found {str(value)[:40]}")
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:

@@ -36,7 +36,7 @@ from posefilter.data.readers.fat_settings import (
     scene_folders,
 )
 from posefilter.data.readers.naming import choose_objects
-from posefilter.data.readers.plausible import check_camera, check_sample
+from posefilter.data.readers.plausible import check_camera, check_sample, narrow
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
@@ -153,8 +153,8 @@ class FatReader(BaseReader):
             rgb,
             depth,
             mask,
-            camera.K.astype(np.float32),
-            entry.camera_from_object.astype(np.float32),
+            narrow(camera.K),
+            narrow(entry.camera_from_object),
             self.objects.index(record.object),
             i,
             float("nan"),

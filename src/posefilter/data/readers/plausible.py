@@ -1,5 +1,6 @@
 """Refuse what a camera cannot have seen: intrinsics, poses, depth and labels that cannot be."""
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,14 @@ def check_units(units: float, path: Path, key: str) -> None:
         raise BadData(path, "depth scale is not plausible", f"{key}: {units:g} units a meter")
 
 
+def narrow(matrix: np.ndarray) -> np.ndarray:
+    """Return a matrix as float32; a number that is too large becomes infinite, without a warning:
+    `check_sample` refuses it.
+    """
+    with np.errstate(over="ignore"):
+        return matrix.astype(np.float32)
+
+
 def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Path, ...]) -> Sample:
     """Return a sample as it is, where a camera can have seen it.
 
@@ -93,7 +102,7 @@ def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Pa
         detail = f"({cx:g}, {cy:g}) of {width}x{height}; another resolution's, or swapped with fx?"
         raise Implausible(camera, "principal point is far outside of the image", detail, sample)
     z = float(camera_from_native[2, 3])
-    if not (z > 0 and np.linalg.norm(camera_from_native[:3, 3]) <= FARTHEST):
+    if not (z > 0 and math.hypot(*camera_from_native[:3, 3]) <= FARTHEST):
         where = "behind the camera" if z <= 0 else f"{z:.3g} m away; wrong unit?"
         raise Implausible(truth, "the object cannot be seen where its pose is", where, sample)
     middle = float(np.median(known))

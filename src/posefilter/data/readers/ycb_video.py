@@ -19,7 +19,7 @@ from posefilter.data.readers.decode import (
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects
-from posefilter.data.readers.plausible import check_camera, check_sample, check_units
+from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
 from posefilter.data.readers.ycb_video_files import (
     FRAME,
     SYNTHETIC,
@@ -137,7 +137,7 @@ class YCBVideoReader(BaseReader):
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(label_path, label, height, width, color_path.name)
         object_id = self.objects.index(entry.record.object)
-        K, pose = entry.K.astype(np.float32), entry.camera_from_object.astype(np.float32)
+        K, pose = narrow(entry.K), narrow(entry.camera_from_object)
         mask = self._mask(entry, label)
         sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
         native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
