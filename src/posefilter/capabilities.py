@@ -13,7 +13,9 @@ from typing import Any, Literal, NamedTuple
 from posefilter.errors import UserError
 
 Capability = Literal[
+    "belief_maps",
     "candidates",
+    "correspondences",
     "displacement",
     "free_latent",
     "image_patches",
@@ -35,7 +37,9 @@ Capabilities = tuple[Capability, ...]
 
 # what is needed where a name is required, after "needs"
 MEANINGS: Mapping[str, str] = {
+    "belief_maps": "a training on maps of keypoints alone",
     "candidates": "scored candidate poses",
+    "correspondences": "a training on dense object coordinates alone",
     "displacement": "particles with a learned displacement",
     "free_latent": "a latent that is no input of the network",
     "image_patches": "particles that see a patch of the image",

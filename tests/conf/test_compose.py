@@ -29,6 +29,10 @@ HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
 MODELS = list_choices(CONF / "model")
 VARIANTS = list_choices(CONF / "variant")
+COMPARISONS = ("dense_coordinates", "keypoints")  # no filters, and not of the paper
+PRESETS = [
+    (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
+]
 EXPERIMENTS = list_choices(CONF / "experiment")
 SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect"]
 BUILT = (
@@ -44,7 +48,7 @@ def compose(tmp_path: Path, *overrides: str, name: str = "train") -> Job:
     return compose_job(name, CONF, list(overrides), tmp_path)
 
 
-@pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
+@pytest.mark.parametrize(("model", "variant"), PRESETS)
 def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, variant: str) -> None:
     job = compose_once(f"model={model}", f"variant={variant}")
     method = build_method(recipe(job))
@@ -52,7 +56,7 @@ def test_every_variant_of_every_model_builds_with_a_legal_loss(model: str, varia
     assert method.filter.particles == job.cfg.filter.particles
 
 
-@pytest.mark.parametrize(("model", "variant"), list(product(MODELS, VARIANTS)))
+@pytest.mark.parametrize(("model", "variant"), PRESETS)
 def test_what_a_preset_sets_holds(model: str, variant: str) -> None:
     """No choice later in the list of defaults may undo it."""
     cfg = compose_once(f"model={model}", f"variant={variant}").cfg
@@ -64,7 +68,25 @@ def test_what_a_preset_sets_holds(model: str, variant: str) -> None:
         assert OmegaConf.select(cfg, key) == value, key
 
 
-@pytest.mark.parametrize("model", [m for m in MODELS if m != "pose_pf"])
+def test_all_but_comparisons_have_both_variants() -> None:
+    both = set(product(set(MODELS) - {*COMPARISONS}, VARIANTS))
+    assert {*PRESETS} == both | {(model, "working") for model in COMPARISONS}
+
+
+@pytest.mark.parametrize("model", COMPARISONS)
+@pytest.mark.parametrize("typed", ["model={} variant=paper", "-m model=patch_pf,{} variant=paper"])
+def test_a_comparison_has_no_variant_of_the_paper(
+    model: str, typed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, [*typed.format(model).split(), f"out={tmp_path / 'x'}"]) == 2
+    said = capfd.readouterr().err.strip().splitlines()
+    assert said == [
+        f"train: variant=paper: model={model} has no such variant; choose variant=working"
+    ]
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("model", sorted({*MODELS} - {"pose_pf", *COMPARISONS}))
 def test_a_papers_choices_are_had_at_the_working_size(model: str) -> None:
     """`preset/size` changes numbers alone, and makes them those of the working preset."""
     paper = compose_once(f"model={model}", "variant=paper")

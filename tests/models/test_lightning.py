@@ -5,6 +5,8 @@ from lightning import LightningModule
 
 import posefilter
 from posefilter import models
+from posefilter.cli.arguments import list_choices
+from posefilter.paths import find_conf
 
 
 @pytest.mark.parametrize("name", models.__all__)
@@ -15,7 +17,7 @@ def test_each_method_is_a_lightning_module(name: str) -> None:
     assert getattr(models, name) is kind  # made once
 
 
-@pytest.mark.parametrize("model", ["pose_pf", "pixel_pf", "patch_pf", "cnn_patch", "downsized"])
+@pytest.mark.parametrize("model", list_choices(find_conf() / "model"))
 def test_so_is_what_is_built(model: str) -> None:
     method = posefilter.build(posefilter.compose([f"model={model}"]))
     assert isinstance(method, LightningModule)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -67,6 +67,22 @@ def check_choices(arguments: list[str], conf: Path) -> None:
         now = None if own and (conf / group / f"{value}.yaml").is_file() else rename(argument)
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
+    check_variants(arguments, conf)
+
+
+def check_variants(arguments: Sequence[str], conf: Path) -> None:
+    """Raise UserError where a method is asked for a variant that it has not: Hydra would leave the
+    method without any preset.
+    """
+    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    for model, variant in product(*(typed.get(k, "").split(",") for k in ("model", "variant"))):
+        known = list_choices(conf / "preset" / model) if re.fullmatch(r"\w+", model) else []
+        real = re.fullmatch(r"\w+", variant) and (conf / "variant" / f"{variant}.yaml").is_file()
+        if known and real and variant not in known and "preset" not in typed:
+            raise UserError(
+                f"variant={variant}: model={model} has no such variant; choose "
+                f"variant={' or '.join(known)}"
+            )
 
 
 def check_preset(name: str, folders: Sequence[Path]) -> None:

@@ -10,16 +10,28 @@ from posefilter.lazy import import_lazily
 
 if TYPE_CHECKING:
     from posefilter.models.cnn_patch import CnnPatch
+    from posefilter.models.dense_coordinates import DenseCoordinates
     from posefilter.models.downsized import Downsized
+    from posefilter.models.keypoints import Keypoints
     from posefilter.models.patch_pf import PatchPF
     from posefilter.models.pixel_pf import PixelPF
     from posefilter.models.pose_pf import PosePF
 
-__all__ = ["CnnPatch", "Downsized", "PatchPF", "PixelPF", "PosePF"]
+__all__ = [
+    "CnnPatch",
+    "DenseCoordinates",
+    "Downsized",
+    "Keypoints",
+    "PatchPF",
+    "PixelPF",
+    "PosePF",
+]
 
 _HOMES = {
     "CnnPatch": "cnn_patch",
+    "DenseCoordinates": "dense_coordinates",
     "Downsized": "downsized",
+    "Keypoints": "keypoints",
     "PatchPF": "patch_pf",
     "PixelPF": "pixel_pf",
     "PosePF": "pose_pf",

@@ -9,9 +9,8 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.confidence.evidence import measure_coordinates
 from posefilter.errors import UserError
-from posefilter.geometry.spaces import PoseSpace
-from posefilter.models.base import PoseEstimator
 from posefilter.models.candidate_samplers import CandidateSampler
+from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
 from posefilter.nets.fused import make_tables
 from posefilter.nets.layers import fast_bfloat16
@@ -49,7 +48,7 @@ class PoseScene(NamedTuple):
         return PoseScene(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
 
 
-class PosePF(PoseEstimator):
+class PosePF(PoseParticles):
     """A particle filter over SE(3) with a learned likelihood.
 
     Args:
@@ -92,20 +91,6 @@ class PosePF(PoseEstimator):
             likelihood_batch_size,
         )
         self.proposal_weight = proposal_weight
-        self._space: PoseSpace | None = None
-
-    @property
-    def space(self) -> PoseSpace:
-        """SE(3) about the object's center."""
-        if self._space is None:
-            x, y, z = self.model.center.tolist()
-            self._space = PoseSpace((x, y, z), self.model.radius, points=self.model.points)
-        return self._space
-
-    @property
-    def latent_width(self) -> int:
-        """0: particles have no latent."""
-        return 0
 
     def encode(self, batch: Batch) -> PoseScene:
         """Flatten the images, and run the proposal network once."""
@@ -162,10 +147,8 @@ class PosePF(PoseEstimator):
                 "filter/initialize=from_proposals needs the proposal network; "
                 "choose model/proposals=dense"
             )
-        if not self.training and not bool(scene.cells.valid.flatten(1).any(1).all()):
-            raise UserError(
-                "depth: not one pixel of an image has a known depth, so no pose can be proposed"
-            )
+        if not self.training:
+            require_depth(scene.cells.valid)
         return draw_poses(
             scene.coordinates.detach(),
             scene.cells,
@@ -206,7 +189,6 @@ class PosePF(PoseEstimator):
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the proposal network too."""
         super().set_object(model)
-        self._space = None
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
 

@@ -5,12 +5,13 @@ each, as in EPOS (Hodan et al. 2020). Regression alone averages over ambiguous p
 lies inside the object. A distribution over fragments keeps several modes.
 """
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from posefilter.capabilities import Capabilities
 from posefilter.geometry.fragments import (
     fragment_errors,
     gather_fragment,
@@ -18,6 +19,7 @@ from posefilter.geometry.fragments import (
     within_bounds,
 )
 from posefilter.geometry.lookup import gather_rows
+from posefilter.types import Batch, ObjectModel, Trace
 
 STRIDE = 8  # pixels a cell
 
@@ -126,6 +128,38 @@ def coordinate_loss(
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
     return 5 * bce + mean(surprise + 0.3 * error), mean(distance)
+
+
+class HasCoordinates(Protocol):
+    """An encoded image with dense object coordinates."""
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """The network's output."""
+        ...
+
+    @property
+    def cells(self) -> Cells:
+        """What was measured."""
+        ...
+
+    @property
+    def reach(self) -> Tensor:
+        """() the fragments' mean radius, in radii of the object."""
+        ...
+
+
+class CoordinateLoss:
+    """`coordinate_loss` as the loss of a method that learns nothing else."""
+
+    requires: ClassVar[Capabilities] = ("correspondences",)
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return the loss of each image, (B,); the trace's scene is `HasCoordinates`."""
+        scene: HasCoordinates = trace.scene
+        size = (model.center.to(batch.depth), model.radius, float(scene.reach))
+        pose = batch.camera_from_object
+        return coordinate_loss(scene.coordinates, scene.cells, batch.mask, pose, *size)[0]
 
 
 class Context(NamedTuple):

@@ -1,0 +1,58 @@
+"""The loss of belief maps."""
+
+from typing import ClassVar, Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
+from posefilter.types import Batch, ObjectModel, Trace
+
+
+class HasBeliefMaps(Protocol):
+    """An encoded image with belief maps."""
+
+    @property
+    def logits(self) -> Tensor:
+        """(B, 9, h, w)."""
+        ...
+
+    @property
+    def keypoints(self) -> Tensor:
+        """(9, 3) in the object's frame [m]."""
+        ...
+
+    @property
+    def stride(self) -> int:
+        """Pixels of a cell."""
+        ...
+
+
+class BeliefMaps:
+    """Cross-entropy of each cell against a Gaussian about the keypoint, summed over each map.
+
+    Keypoints out of the frame have an empty map; hidden ones are drawn as any other. DOPE has the
+    squared error, whose gradient is near zero while a new network takes all cells for empty.
+
+    Args:
+        sigma: Standard deviation of the Gaussian [cells].
+    """
+
+    requires: ClassVar[Capabilities] = ("belief_maps",)
+
+    def __init__(self, sigma: float = 1.5) -> None:
+        self.sigma = sigma
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return the loss of each image, (B,); the trace's scene is `HasBeliefMaps`."""
+        scene: HasBeliefMaps = trace.scene
+        pixels, ahead = project_keypoints(
+            batch.camera_from_object[:, None], scene.keypoints, batch.intrinsics
+        )
+        h, w = scene.logits.shape[-2:]
+        target = draw_gaussians(pixels[:, 0], ahead[:, 0], h, w, scene.stride, self.sigma)
+        loss = F.binary_cross_entropy_with_logits(scene.logits, target, reduction="none")
+        entropy = torch.special.entr(target) + torch.special.entr(1 - target)
+        return (loss - entropy).sum((2, 3)).mean(1)  # 0 where the maps are right

@@ -1,0 +1,91 @@
+"""What methods share whose particles are poses, and those of them that are no filter."""
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+from torch import Generator, Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
+
+_LEAST = 1e-6  # score whose logarithm is finite
+
+
+class PoseParticles(PoseEstimator):
+    """A method whose particles are poses.
+
+    Args:
+        **base: Arguments of `PoseEstimator`.
+    """
+
+    provides: ClassVar[Capabilities] = ("pose", "pose_space")
+
+    def __init__(self, **base: Any) -> None:
+        super().__init__(**base)
+        self._space: PoseSpace | None = None
+
+    @property
+    def space(self) -> PoseSpace:
+        """SE(3) about the object's center."""
+        if self._space is None:
+            x, y, z = self.model.center.tolist()
+            self._space = PoseSpace((x, y, z), self.model.radius, points=self.model.points)
+        return self._space
+
+    @property
+    def latent_width(self) -> int:
+        """0: particles have no latent."""
+        return 0
+
+    def set_object(self, model: ObjectModel) -> None:
+        """Set the object, and forget the space about another's center."""
+        super().set_object(model)
+        self._space = None
+
+
+class Hypotheses(PoseParticles):
+    """A method that is no filter: a network, pose hypotheses from its output, and the best of them.
+
+    The filter's loop is run for one step: it draws the hypotheses (`propose_poses`), scores each
+    once, and takes the one of highest score. Nothing is resampled or moved. So the belief is the
+    hypotheses, each weighted by its score.
+    """
+
+    provides: ClassVar[Capabilities] = ("pose", "pose_space", "propose_poses")
+    # training rolls out no filter
+    test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_filter")
+
+    @abstractmethod
+    def propose_poses(self, scene: Any, particles: int, generator: Generator) -> Tensor:
+        """Return hypotheses (B, particles, 4, 4), camera_from_object [m]."""
+
+    @abstractmethod
+    def score(self, scene: Any, poses: Tensor) -> Tensor:
+        """Return how well the network's output agrees with poses, (B, N, 4, 4) -> (B, N) in [0,
+        1].
+        """
+
+    def measure(
+        self, scene: Any, particles: Particles, step: Step, generator: Generator
+    ) -> ParticleOutput:
+        """Return the logarithms of the scores."""
+        score = self.score(scene, particles.state).clamp_min(_LEAST).log()
+        no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
+        return ParticleOutput(score, no_move, particles.state, particles.latent)
+
+    def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
+        """Return the loss of the network's output, one value for each image."""
+        scene = self.encode(batch)
+        none = Belief(*(batch.depth.new_zeros(0) for _ in Belief._fields))
+        return {"loss": self.loss(Trace((), (), (), none, scene=scene), batch, self.model)}
+
+
+def require_depth(valid: Tensor) -> None:
+    """Raise UserError where an image has no known depth.  (B, ...) bool."""
+    if not bool(valid.flatten(1).any(1).all()):
+        raise UserError(
+            "depth: not one pixel of an image has a known depth, so no pose can be proposed"
+        )

@@ -1,0 +1,92 @@
+"""Maps of a planted box give back its pose; broken ones give none."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from posefilter.geometry.camera import intrinsics
+from posefilter.geometry.keypoints import (
+    box_keypoints,
+    draw_gaussians,
+    find_peaks,
+    project_keypoints,
+    solve_pnp,
+)
+from posefilter.geometry.pose import make_pose
+from posefilter.geometry.rotation import random_rotation
+
+K = intrinsics(270.0, 270.0, 79.5, 59.5)
+BOX = box_keypoints(torch.tensor([[-0.1, -0.05, 0.0], [0.1, 0.05, 0.3], [0.0, 0.0, 0.1]]))
+STRIDE = 4
+
+
+def planted(count: int = 8) -> tuple[Tensor, Tensor]:
+    """Return poses (count, 4, 4), and the keypoints' pixels (count, 9, 2), well within the frame."""
+    g = torch.Generator().manual_seed(0)
+    turn = random_rotation(count, generator=g)
+    center = torch.tensor([0.0, 0.0, 1.1]) - (turn @ BOX[-1])
+    pose = make_pose(turn, center)
+    pixels, ahead = project_keypoints(pose[:, None], BOX, K.expand(count, 3, 3))
+    assert bool(ahead.all())
+    return pose, pixels[:, 0]
+
+
+def test_the_box_has_eight_corners_and_its_center() -> None:
+    assert len({tuple(row) for row in BOX[:8].tolist()}) == 8
+    torch.testing.assert_close(BOX[:8].mean(0), BOX[8])
+    torch.testing.assert_close(BOX.amin(0), torch.tensor([-0.1, -0.05, 0.0]))
+    torch.testing.assert_close(BOX.amax(0), torch.tensor([0.1, 0.05, 0.3]))
+
+
+def test_peaks_of_gaussians_are_where_they_were_drawn() -> None:
+    _, pixels = planted()
+    maps = draw_gaussians(pixels, torch.ones(8, 9, dtype=torch.bool), 30, 40, STRIDE, 1.5)
+    found, heights = find_peaks(maps, 1, STRIDE)
+    torch.testing.assert_close(found[:, :, 0], pixels, atol=0.02, rtol=0)
+    assert heights.min() > 0.85  # at most half a cell off
+
+
+def test_peaks_are_sorted_and_flat_maps_have_none() -> None:
+    at = torch.tensor([[[20.0, 20.0]], [[100.0, 80.0]]])
+    there = torch.ones(2, 1, dtype=torch.bool)
+    low, high = draw_gaussians(at, there, 30, 40, STRIDE, 1.5)[:, :, None]
+    pixels, heights = find_peaks(0.5 * low + high, 2, STRIDE)
+    torch.testing.assert_close(pixels[0, 0], at[[1, 0], 0], atol=0.05, rtol=0)
+    ratio = heights[0, 0, 1] / heights[0, 0, 0]
+    torch.testing.assert_close(ratio, torch.tensor(0.5), atol=0.1, rtol=0)
+    assert find_peaks(torch.zeros(1, 1, 8, 8), 2, STRIDE)[1].tolist() == [[[0.0, 0.0]]]
+
+
+def test_maps_of_a_planted_box_give_back_its_pose() -> None:
+    pose, pixels = planted()
+    maps = draw_gaussians(pixels, torch.ones(8, 9, dtype=torch.bool), 30, 40, STRIDE, 1.5)
+    peaks = find_peaks(maps, 1, STRIDE)[0][:, :, 0]
+    for truth, image in zip(pose, peaks, strict=True):
+        found = solve_pnp(BOX.numpy(), image.numpy(), K.numpy(), 2.0)
+        assert found is not None
+        np.testing.assert_allclose(found, truth.numpy(), atol=2e-3)
+
+
+def test_ransac_leaves_wrong_keypoints_out() -> None:
+    pose, pixels = planted(1)
+    wrong = pixels[0].clone()
+    wrong[:3] += torch.tensor([30.0, -25.0])
+    found = solve_pnp(BOX.numpy(), wrong.numpy(), K.numpy(), 2.0)
+    assert found is not None
+    np.testing.assert_allclose(found, pose[0].numpy(), atol=2e-3)
+    all_of_them = solve_pnp(BOX.numpy(), wrong.numpy(), K.numpy())
+    assert all_of_them is None or np.abs(all_of_them - pose[0].numpy()).max() > 0.02
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((3, 2)), np.full((9, 2), np.nan), np.zeros((9, 2))])
+def test_no_pose_is_made_up(pixels: np.ndarray) -> None:
+    found = solve_pnp(BOX.numpy()[: len(pixels)], pixels, K.numpy(), 2.0)
+    assert found is None or np.isfinite(found).all()
+
+
+def test_a_keypoint_that_is_not_there_has_an_empty_map() -> None:
+    there = torch.tensor([[True, False]])
+    maps = draw_gaussians(torch.full((1, 2, 2), 50.0), there, 30, 40, STRIDE, 1.5)
+    assert maps[0, 0].max() > 0.8
+    assert maps[0, 1].max() == 0
