@@ -22,7 +22,7 @@ STRIDE = 4
 
 
 def planted(count: int = 8) -> tuple[Tensor, Tensor]:
-    """Return poses (count, 4, 4), and the keypoints' pixels (count, 9, 2), well within the frame."""
+    """Return poses (count, 4, 4), and the pixels of keypoints in the frame (count, 9, 2)."""
     g = torch.Generator().manual_seed(0)
     turn = random_rotation(count, generator=g)
     center = torch.tensor([0.0, 0.0, 1.1]) - (turn @ BOX[-1])
