@@ -109,8 +109,8 @@ class MeanShift:
 
     def __init__(
         self,
-        iterations: int = 8,
-        antithetic_pairs: int = 32,
+        iterations: int = 4,
+        antithetic_pairs: int = 24,
         start: float = 0.012,
         end: float = 0.007,
         sigma: float = 0.004,
