@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
 import posefilter
-from posefilter.estimator import Result
+from posefilter.result import Result
 from posefilter.ros.detections import list_shown, make_quaternion, to_ros_covariance
 from posefilter.ros.messages import decode_color, decode_depth, decode_intrinsics
 

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from posefilter.cli.trust import trust
     from posefilter.confidence.verdicts import Costs
     from posefilter.errors import UserError
-    from posefilter.estimator import Estimator, Result
+    from posefilter.estimator import Estimator
+    from posefilter.result import Result
     from posefilter.tracking.settings import TrackerSettings
     from posefilter.tracking.track import TrackResult
     from posefilter.tracking.tracker import Tracker
@@ -56,7 +57,7 @@ _HOMES = {
     "Estimator": "estimator",
     "Mode": "belief",
     "PoseSet": "belief",
-    "Result": "estimator",
+    "Result": "result",
     "TrackResult": "tracking.track",
     "Tracker": "tracking.tracker",
     "TrackerSettings": "tracking.settings",

@@ -11,7 +11,8 @@ from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_costs
 from posefilter.errors import UserError
-from posefilter.estimator import Estimator, Result
+from posefilter.estimator import Estimator
+from posefilter.result import Result
 from posefilter.ros.bags import BagFrame, BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections
 from posefilter.tracking.tracker import Tracker

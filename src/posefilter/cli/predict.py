@@ -19,7 +19,7 @@ from posefilter.cli.results import write_json
 from posefilter.confidence.verdicts import Costs
 from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import NotThere, UserError
-from posefilter.estimator import Estimator, Result, Run, collect_results
+from posefilter.estimator import Estimator
 from posefilter.figures.canvas import save_image
 from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
@@ -29,6 +29,7 @@ from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
 from posefilter.metrics.bop_results import PoseRow, write_poses_csv
+from posefilter.result import Result, Run, collect_results
 from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.estimator import Result
 from posefilter.geometry.rotation import hat, quat_xyzw_from_matrix
+from posefilter.result import Result
 from posefilter.ros.messages import DETECTIONS, make_message
 
 

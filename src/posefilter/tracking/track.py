@@ -9,7 +9,6 @@ from torch import Tensor
 
 from posefilter.confidence.calibration import Assessment
 from posefilter.data.resize import network_size
-from posefilter.estimator import Result, Run, make_result
 from posefilter.filters.loop import ParticleFilter, make_particles
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
@@ -20,6 +19,7 @@ from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images, make_batch
 from posefilter.models.base import PoseEstimator
+from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough

@@ -1,0 +1,228 @@
+"""What an estimate amounts to: `posefilter.Result`."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from posefilter.belief import Belief, Mode, PoseSet
+from posefilter.belief.summaries import check_share
+from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.verdicts import Costs, Verdict, decide
+from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
+from posefilter.plausibility import find_warnings
+from posefilter.types import Batch, ObjectModel, Trace
+from posefilter.types import Belief as BeliefTensors
+
+if TYPE_CHECKING:
+    from posefilter.figures.overlay import Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Where one object is in one image, and how sure that is.
+
+    Attributes:
+        object: The object's name.
+        pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
+            OpenCV's (x right, y down, z ahead), the object's that of its mesh file.  It is the best
+            guess, also where the object is not there: see `verdict`.
+        score: The estimate's log-likelihood.  It ranks poses of one image; between images its level
+            is arbitrary, so it is no measure of confidence: `probability` is.
+        probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
+            object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
+            not calibrated; `calibration_note` says why.
+        presence: That the object is there, whatever the pose: at least `probability`, or None.
+        belief: Every particle and its weight.
+        warnings: What makes the estimate implausible, in words; empty where nothing does.
+        seconds: The filter's time for this image, its share of a batch.
+        model: The object's center, size, surface points and hull.
+        costs: What errors cost, which the verdict goes by.
+        calibration_note: In words, why there is no probability; empty where there is one.
+        conformal: What `conformal_set` goes by; None where the calibration has none.
+        surface: The share of the object's surface points at which the depth shows a surface, by
+            which the group of a conformal set is chosen.
+        instance: Which of its class it is, from 0, the most probable first.
+        mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
+            else None.
+    """
+
+    object: str
+    pose: np.ndarray
+    score: float
+    probability: float | None
+    presence: float | None
+    belief: Belief
+    warnings: tuple[str, ...]
+    seconds: float
+    model: ObjectModel
+    costs: Costs = field(default_factory=Costs, kw_only=True)
+    calibration_note: str = field(default="", kw_only=True)
+    conformal: Conformal | None = field(default=None, kw_only=True)
+    surface: float = field(default=math.nan, kw_only=True)
+    instance: int = field(default=0, kw_only=True)
+    mask: np.ndarray | None = field(default=None, kw_only=True)
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What to go by: "found", "unsure" or "absent", whichever costs least on average.
+
+        None where there is no probability.  `decide` takes other costs.
+        """
+        return self.decide(self.costs)
+
+    def decide(self, costs: Costs) -> Verdict | None:
+        """Return the verdict at other costs of errors; None where there is no probability."""
+        if self.probability is None or self.presence is None:
+            return None
+        return decide(self.presence, self.probability, costs)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`."""
+        return self.belief.covariance
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """The belief's modes, the heaviest first; see `Belief.modes`."""
+        return self.belief.modes
+
+    def conformal_set(self, level: float = 0.9) -> PoseSet:
+        """Return a set of poses that holds the truth with a guaranteed probability.
+
+        Of frames like the calibration's that show the object, at least `level` have the truth in
+        this set, whatever the belief is worth; see `posefilter.confidence.conformal`.  It is the
+        set of all poses where calibration frames are too few for the level.
+
+        Args:
+            level: Least probability, in [0, 1].
+
+        Raises:
+            UserError: The checkpoint was not calibrated for sets.
+        """
+        if self.conformal is None:
+            why = self.calibration_note or "it was calibrated by an earlier version, without sets"
+            raise UserError(f"{self.object}: has no conformal sets ({why})")
+        check_share(level)
+        limit = self.conformal.find_limit(level, self.surface)
+        return self.belief.level_set(level, -self.belief.differential_entropy - limit)
+
+    def draw_overlay(
+        self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
+    ) -> np.ndarray:
+        """Draw the object's outline and axes on the image that it was found in: full where it is
+        found, dashed where the verdict is unsure, none where it is absent.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+            shape: A mesh, for the exact outline; None: the convex hull.
+
+        Returns:
+            The picture (h, w, 3) uint8.
+        """
+        from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
+
+        shape = self.model.hull if shape is None else shape
+        pose = None if self.verdict == "absent" else self.pose
+        unsure = self.verdict == "unsure"
+        K, said = np.asarray(intrinsics), self.describe()
+        return draw_overlay(rgb, K, pose, shape, caption=said, dashed=unsure)
+
+    def describe(self) -> str:
+        """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""
+        if self.verdict is None:
+            return f"{self.object}, score {self.score:.2f}"
+        if self.verdict == "absent":
+            return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
+        return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
+
+    def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+        """Draw the belief: rotations on a map, centers on the image, marginals.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+
+        Returns:
+            The picture (h, w, 3) uint8.
+        """
+        from posefilter.figures.belief import draw_belief  # slow to import, needed for pictures
+
+        tensors = BeliefTensors(
+            torch.from_numpy(self.belief.samples),
+            torch.from_numpy(self.belief.weights).log(),
+            torch.from_numpy(self.pose),
+            torch.tensor(self.score),
+        )
+        return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
+
+
+class Run(NamedTuple):
+    """One object's filter on a batch of images."""
+
+    method: PoseEstimator
+    batch: Batch  # at the network's resolution
+    trace: Trace
+    seconds: float  # an image
+    found: Assessment | None = None  # None where there is no probability
+    surface: torch.Tensor | None = None  # (B,) evidence; None where there is no probability
+
+
+def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:
+    """Return the results of runs on the same images: a list an image, of a result an object.
+
+    Args:
+        runs: A run an object.
+        costs: What errors cost; None: the default.
+    """
+    count = len(runs[0].batch.rgb)
+    return [[make_result(run, i, costs) for run in runs] for i in range(count)]
+
+
+def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
+    """Return what a run amounts to for one image of its batch."""
+    model, belief, found = run.method.model, run.trace.belief, run.found
+    calibration = run.method.calibration
+    weights = belief.log_weights[image].double().cpu().exp().numpy()
+    center = model.center.detach().cpu().double().numpy()
+    pose = belief.best[image].double().cpu().numpy()
+    return Result(
+        object=model.name,
+        pose=pose,
+        score=float(belief.score[image]),
+        probability=None if found is None else float(found.probability[image]),
+        presence=None if found is None else float(found.presence[image]),
+        belief=Belief(
+            belief.poses[image].double().cpu().numpy(),
+            weights / weights.sum(),
+            center,
+            float(model.radius),
+            float(model.diameter),
+            model.name,
+            model.symmetries.detach().cpu().double().numpy(),
+        ),
+        warnings=find_warnings(
+            pose,
+            model,
+            run.batch.depth[image, 0].cpu().numpy(),
+            run.batch.intrinsics[image].double().cpu().numpy(),
+        ),
+        seconds=run.seconds,
+        model=model,
+        costs=costs or Costs(),
+        calibration_note="" if found is not None else explain_missing(run.method),
+        conformal=None if found is None or calibration is None else calibration.conformal,
+        surface=math.nan if run.surface is None else float(run.surface[image]),
+    )
+
+
+def explain_missing(method: PoseEstimator) -> str:
+    """Return why an estimate has no probability."""
+    known = method.calibration is not None
+    return "no pixel of the frame has depth" if known else method.calibration_note
