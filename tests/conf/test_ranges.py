@@ -140,6 +140,22 @@ def test_a_number_is_neither_a_mapping_nor_a_list(
         check_settings(cfg, command)
 
 
+@pytest.mark.parametrize("command", ["train", "onboard", "predict"])
+def test_a_number_that_is_made_of_other_settings_is_checked(
+    command: str, composed: dict[str, DictConfig]
+) -> None:
+    cfg = composed[command].copy()
+    OmegaConf.set_readonly(cfg, False)
+    for typed, told in (("${seed}.5", r"threads=3\.5: must be"), ("${seed}", None)):
+        OmegaConf.update(cfg, "seed", 3)
+        OmegaConf.update(cfg, "threads", typed)
+        if told is None:
+            check_settings(cfg, command)
+        else:
+            with pytest.raises(UserError, match=told):
+                check_settings(cfg, command)
+
+
 @pytest.mark.parametrize(
     ("command", "typed"), [("train", "optimizer.lr=nan"), ("predict", "threads=0")]
 )

@@ -144,7 +144,7 @@ def test_a_little_teaching_brings_particles_onto_the_object_and_finds_it(
     before = method.compute_metrics()
     assert before["particles_on_object"] < 0.4
     method._reset()
-    teach(method, 240)
+    teach(method, 120)
     with torch.no_grad():
         method.test_step(scenes(4), 0)
     after = method.compute_metrics()

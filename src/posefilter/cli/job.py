@@ -109,9 +109,11 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for key in ("seed", "threads"):
-        if isinstance(plain.get(key), list):
-            raise UserError(f"{key}={plain[key]}: must be one number, and is a list")
+    for key in ("seed", "threads"):  # read before anything is built, which would check its kind
+        value = cfg.get(key)
+        if isinstance(value, ListConfig):
+            raise UserError(f"{key}={value}: must be one number, and is a list")
+        check_ranges({key: value}, command)  # where it is made of other settings
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:
         raise UserError(
