@@ -36,7 +36,8 @@ def jobs(words: str) -> list[tuple[str, ...]]:
     ids=lambda line: line.words,
 )
 def test_every_line_composes(line, tmp_path: Path) -> None:
-    for overrides in (jobs(line.words)[0], jobs(line.words)[-1]):
+    every = jobs(line.words)
+    for overrides in {every[0], every[-1]}:
         job = compose_job("train", HOME / "conf", list(overrides), tmp_path)
         assert job.cfg.seed in range(5)
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tests.smoke.conftest import SMALL_POSE_PF
 
 from posefilter import Costs, load
 from posefilter.cli import run_command
@@ -27,7 +28,7 @@ TINY = ["debug=smoke", *QUIET, "logger=none", "data.progress=false", "filter.par
 def weights(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return an untrained checkpoint of the pose-space method."""
     folder = tmp_path_factory.mktemp("untrained")
-    words = [*TINY, f"data.root={tiny_scenes}", "filter.steps=3"]
+    words = [*TINY, f"data.root={tiny_scenes}", "filter.steps=3", *SMALL_POSE_PF]
     job = compose_job("train", HOME / "conf", words, folder)
     data = build_data(job.cfg.data, "json")
     method = build_method(recipe(job), data.object_model(0), lightning=False)

@@ -41,7 +41,8 @@ def test_two_images_are_memorized(tiny_scenes: Path, tmp_path: Path) -> None:
 
 
 def test_a_profile_is_written(tiny_scenes: Path, tmp_path: Path) -> None:
-    typed = ["debug=profiler", *TOY, "filter.particles=4", "filter.steps=2", "trainer.max_steps=4"]
+    typed = ["debug=profiler", *TOY, "filter.particles=4", "filter.steps=2", "trainer.max_steps=2"]
+    typed += ["model=cnn_patch", "callbacks=checkpoints"]
     typed += [*TINY[1:], f"data.root={tiny_scenes}", f"out={tmp_path}", "data.generate=null"]
     assert run_command("train", HOME, typed) == 0
     profile = (tmp_path / "fit-profile.txt").read_text()
