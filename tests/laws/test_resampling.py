@@ -11,6 +11,7 @@ from posefilter.filters.loop import inherit, make_particles
 from posefilter.filters.resample import (
     BelowESS,
     InverseCDF,
+    Islands,
     Multinomial,
     NoResampling,
     Soft,
@@ -33,6 +34,7 @@ RESAMPLERS = {
     "multinomial": Multinomial(),
     "soft": Soft(0.5),
     "below ess": BelowESS(Systematic(), 0.5),
+    "islands": Islands(Systematic(), 8),
     "sampled transport": SampledTransport(),
     "ensemble transform": EnsembleTransform(),
 }
@@ -229,3 +231,30 @@ def test_poses_stay_poses(resampler: Resample) -> None:
     )
     space = PoseSpace((0.01, 0.0, 0.02), 0.1)
     assert is_rigid(inherit(particles.state, resampler(particles, 30, space, g), space), 1e-4)
+
+
+def test_islands_never_mix() -> None:
+    resampled = Islands(Systematic(), 10)(cloud_of(3, 40), 80, SPACE, Generator().manual_seed(2))
+    island = torch.arange(80) // 20
+    assert torch.equal(resampled.ancestors // 10, island.expand(3, -1))
+
+
+def test_islands_keep_a_mode_that_one_population_loses() -> None:
+    """Two equal modes, the weights noisy: after 120 steps one population has drifted to one."""
+    kept = {}
+    for name, scheme in (("one", Systematic()), ("islands", Islands(Systematic(), 10))):
+        g = Generator().manual_seed(3)
+        state = (torch.arange(80) % 2).float()[None, :, None].expand(200, -1, 2)
+        for _ in range(120):
+            noisy = torch.log_softmax(torch.randn(200, 80, generator=g), 1)
+            particles = make_particles(state, 0)._replace(log_weights=noisy)
+            state = inherit(state, scheme(particles, 80, SPACE, g), SPACE)
+        share = state[..., 0].mean(1)
+        kept[name] = float(((share > 0) & (share < 1)).float().mean())
+    assert kept["one"] < 0.5
+    assert kept["islands"] > 0.9
+
+
+def test_an_island_is_not_empty() -> None:
+    with pytest.raises(UserError, match="size=0"):
+        Islands(Systematic(), 0)

@@ -7,6 +7,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.filters.modes import find_pose_modes
 from posefilter.filters.refine import require_scorer
 from posefilter.geometry.pose_density import fit_density, log_density
 from posefilter.geometry.pose_sampling import draw_poses, widen
@@ -101,7 +102,9 @@ class ImportanceSampling:
         drawn, log_q = [], []
         for own, weights in zip(poses, log_weights, strict=True):
             # of a density's background alone the diameter counts: twice the radius will do
-            density = fit_density(own, weights, center, space.radius, 2 * space.radius)
+            diameter = 2 * space.radius
+            member = find_pose_modes(own, weights, space, diameter).member
+            density = fit_density(own, weights, center, space.radius, diameter, member=member)
             density = widen(density, widening)
             drawn.append(draw_poses(density, self.samples, generator))
             log_q.append(log_density(density, drawn[-1]))

@@ -179,3 +179,49 @@ class BelowESS:
             )
         ancestors = torch.where(low, new.ancestors, kept.ancestors)
         return Resampled(ancestors, torch.where(low, new.log_weights, kept.log_weights), shares)
+
+
+class Islands:
+    """Resample within groups of particles that never mix (Verge et al. 2015).
+
+    Between equal modes, resampling is a random walk of their masses that ends with one of them
+    (genetic drift).  Islands drift independently, so that what one loses another may keep.  A child
+    has its island's weight over the number of the island's children, which keeps weighted means in
+    expectation.
+
+    Verge, Dubarry, Del Moral, Moulines: On parallel implementation of sequential Monte Carlo
+    methods: the island particle model. Statistics and Computing 25 (2015).
+
+    Args:
+        resampler: The scheme that draws the ancestors in each island.
+        size: Particles of an island, at least: the islands' number divides those of the particles
+            before and after.
+
+    Raises:
+        UserError: The size is below 1.
+    """
+
+    def __init__(self, resampler: Resample, size: int = 50) -> None:
+        if size < 1:
+            raise UserError(f"filter.resample.size={size} must be 1 or more")
+        self.resampler, self.size = resampler, size
+
+    def __call__(
+        self, particles: Particles, count: int, space: Space, generator: Generator
+    ) -> Resampled:
+        """Return children; those of an island follow one another."""
+        B, M = particles.log_weights.shape
+        most = max(1, min(M, count) // self.size)
+        islands = max(n for n in range(1, most + 1) if not (M % n or count % n))
+        log_w = particles.log_weights.reshape(B * islands, M // islands)
+        log_island = log_w.logsumexp(1, keepdim=True)
+        own = Particles(*(x.reshape(B * islands, M // islands, *x.shape[2:]) for x in particles))
+        # of an island without weight any particle will do
+        own = own._replace(log_weights=(log_w - log_island).nan_to_num(0.0).log_softmax(1))
+        new = self.resampler(own, count // islands, space, generator)
+        if new.shares is not None:
+            raise UserError("filter/resample=islands needs a scheme that draws ancestors")
+        first = torch.arange(islands, device=log_w.device)[:, None] * (M // islands)
+        ancestors = new.ancestors.view(B, islands, -1) + first
+        log_weights = (new.log_weights + log_island).view(B, count)
+        return Resampled(ancestors.flatten(1), log_weights)

@@ -19,21 +19,23 @@ References:
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from posefilter.geometry.pose_kernels import (
+    measure_modes,
+    measure_neighbors,
+    whiten_kernels,
+)
 from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
 
 BACKGROUND = 0.01  # of the mass
 _SHARES = (0.1, 0.3, 1.0)  # of the poses that are neighbors
 _FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0)
 _FEWEST = 40  # neighbors
-_ISOTROPIC = 0.05  # share of a kernel's covariance that has no direction
 _NARROWEST = 5e-4  # [diameters] standard deviation
-_WIDEST = 0.6  # [rad] so that five standard deviations end before half a turn
 _LOG_UNITS = math.log(8.0)  # from rotation vectors, in which SO(3) has the volume 8 pi^2
 _LOG_NONE = math.log(1e-12)  # where one pose has all the weight
 _JUDGED = 250  # heaviest poses, that the kernels' widths are chosen by
@@ -63,6 +65,7 @@ def fit_density(
     diameter: float,
     symmetries: Tensor | None = None,
     most: int = 2000,
+    member: Tensor | None = None,
 ) -> PoseDensity:
     """Fit a kernel density to weighted poses.
 
@@ -76,6 +79,8 @@ def fit_density(
             are one, and share the density equally.  None: the identity alone.
         most: Number of kernels.  Of more poses the heaviest have kernels of their own, and an even
             selection of the others stands for these.
+        member: (N,) int64, the mode of each pose.  A kernel's covariance may then be that of its
+            mode, too, however few poses the mode has, if the likelihood says so.
 
     Returns:
         The density, in float64.
@@ -96,7 +101,10 @@ def fit_density(
     share = log_weights[judged].softmax(0)
     best, highest = None, -math.inf
     counts = sorted({min(count, max(_FEWEST, round(s * count))) for s in _SHARES})
-    for shape in _measure_shapes(parts, log_weights.exp(), counts, unit):
+    shapes = measure_neighbors(parts, log_weights.exp(), counts, unit)
+    if member is not None:
+        shapes.append(measure_modes(parts, log_weights.exp(), member[chosen], unit))
+    for shape in shapes:
         shape = shape + (_NARROWEST * diameter) ** 2 * torch.eye(6).to(shape)
         whiten, log_scale = whiten_kernels(shape / (unit[:, None] * unit))
         kernels = PoseDensity(chosen, canonical, parts, log_weights, whiten, log_scale, *fixed)
@@ -194,61 +202,6 @@ def _measure(density: PoseDensity, twist: Tensor) -> tuple[Tensor, Tensor]:
     # dR = 2 (1 - cos a) / a^2 d(rotation vector) = sinc^2(a / 2) d(rotation vector)
     half = torch.sinc(angle / (2 * math.pi)).clamp_min(1e-9)
     return square, 2 * half.log() - _LOG_UNITS
-
-
-def _measure_shapes(
-    parts: TwistParts, weights: Tensor, counts: Sequence[int], unit: Tensor
-) -> list[Tensor]:
-    """Return the covariances of each pose's twists to its nearest neighbors, itself among them.
-
-    Taken about their mean, and partly without a direction, since neighbors are few.
-
-    Args:
-        parts: N poses.
-        weights: (N,).
-        counts: Numbers of neighbors, rising.
-        unit: (6,) that turns twists into meters.
-
-    Returns:
-        (N, 6, 6) for each number of neighbors, in m^2: turns times the radius.
-    """
-    found: list[list[Tensor]] = [[] for _ in counts]
-    rows = torch.arange(len(weights), device=weights.device)
-    # the weights of far tails are too few to give a shape
-    weights = weights + 0.01 * weights.max()
-    for some in rows.split(max(1, _CHUNK // len(weights))):
-        twist = pair_twists(parts.select(some), parts) * unit
-        order = twist.square().sum(-1).argsort(dim=1)
-        for number, neighbors in enumerate(counts):
-            near = order[:, :neighbors]
-            own = twist
-            share = weights.expand(len(some), -1)
-            if neighbors < len(weights):
-                own, share = own.gather(1, near[..., None].expand(-1, -1, 6)), weights[near]
-            share = (share / share.sum(1, keepdim=True))[..., None]
-            own = own - (share * own).sum(1, keepdim=True)
-            covariance = (share * own).mT @ own
-            size = covariance.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
-            blunt = _ISOTROPIC * size * torch.eye(6).to(covariance)
-            found[number].append((1 - _ISOTROPIC) * covariance + blunt)
-    return [torch.cat(one) for one in found]
-
-
-def whiten_kernels(covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what maps twists of kernels to standard normal vectors, and the log normalizations.
-
-    Turns are limited to where a Gaussian would wrap round.
-
-    (N, 6, 6) [m^2, m rad, rad^2] -> (N, 6, 6) lower triangular, (N,).
-    """
-    size, axes = torch.linalg.eigh(covariance[:, 3:, 3:])
-    limit = (_WIDEST / size.clamp_min(1e-20).sqrt()).clamp(max=1.0)
-    narrow = torch.eye(6).to(covariance).repeat(len(covariance), 1, 1)
-    narrow[:, 3:, 3:] = (axes * limit[:, None]) @ axes.mT
-    factor = torch.linalg.cholesky(narrow @ covariance @ narrow.mT)
-    log_scale = -factor.diagonal(dim1=1, dim2=2).log().sum(1) - 3 * math.log(2 * math.pi)
-    eye = torch.eye(6).to(factor).expand_as(factor)
-    return torch.linalg.solve_triangular(factor, eye, upper=False), log_scale
 
 
 def _thin(log_weights: Tensor, most: int) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,8 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.geometry.pose import move_about
-from posefilter.geometry.pose_density import PoseDensity, whiten_kernels
+from posefilter.geometry.pose_density import PoseDensity
+from posefilter.geometry.pose_kernels import whiten_kernels
 
 
 def widen(density: PoseDensity, factor: float) -> PoseDensity:
