@@ -9,9 +9,9 @@ of its own, with other poses, widths, correlations and masses, and its own seed.
 with any rotation and within 10 cm, and is annealed as pose_pf is.
 
 Ways: `search` weights as the filter does by default (`filter/reweight=current_likelihood`), which
-reads the likelihood at every step; `islands` does too, and resamples within 20 islands
-(`filter/resample=islands`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is
-a last pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves
+reads the likelihood at every step; `islands` does too, and resamples within islands
+(`filter/resample=islands`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is a last
+pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves
 that leave the posterior unchanged (`filter/refine=mean_shift_and_moves`).  `exact draws` are what a
 perfect sampler would give: their gap is the kernel density's own.
 
