@@ -47,7 +47,6 @@ class Tested(NamedTuple):
     model: str
     at: int  # training images, or distractors
     rows: list[ImageError]
-    cpu_seconds_per_step: float | None
 
 
 def list_trainings() -> list[str]:
@@ -95,12 +94,10 @@ def read_tests() -> tuple[list[Tested], list[Tested]]:
     """Return the tests of the learning curve, and those of the clutter."""
     curve, clutter = [], []
     for folder, model, size in find_runs(ROOT / "learning_curve"):
-        training = json.loads((HOME / folder / "metrics.json").read_text())["training"]
-        rows = read_errors(HOME / folder / FILE)
-        curve.append(Tested(model, size, rows, training.get("cpu_seconds_per_step")))
+        curve.append(Tested(model, size, read_errors(HOME / folder / FILE)))
     for file in sorted((HOME / ROOT / "clutter").glob(f"*/{FILE}")):
         model, _, count = file.parent.name.rpartition("_")
-        clutter.append(Tested(model, int(count), read_errors(file), None))
+        clutter.append(Tested(model, int(count), read_errors(file)))
     return curve, clutter
 
 
@@ -166,16 +163,6 @@ def tabulate_visibility(tests: Sequence[Tested]) -> str:
     return make_table(["", *head], rows)
 
 
-def tabulate_cost(tests: Sequence[Tested]) -> str:
-    """Return the processor's time of a step and of a test image, the least of a method's runs."""
-    rows = []
-    for model in MODELS:
-        own = [test for test in tests if test.model == model]
-        steps = [test.cpu_seconds_per_step for test in own if test.cpu_seconds_per_step]
-        rows.append([f"`{model}`", f"{min(steps):.2f}" if steps else "–"])
-    return make_table(["", "CPU s a step"], rows)
-
-
 def fill(page: str, tables: dict[str, str]) -> str:
     """Return a page with each table between its marks made anew."""
     for name, table in tables.items():
@@ -196,7 +183,6 @@ def write_tables() -> None:
         "recall": tabulate(curve, sizes, measure_recall),
         "visibility": tabulate_visibility(curve),
         "distractors": tabulate(clutter, DISTRACTORS, measure_auc),
-        "cost": tabulate_cost(curve),
     }
     PAGE.write_text(fill(PAGE.read_text(), tables))
 

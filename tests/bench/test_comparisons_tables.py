@@ -44,7 +44,7 @@ def test_an_interval_is_over_scenes_and_not_over_images(bench: ModuleType) -> No
 
 
 def test_tables_have_a_dash_where_nothing_was_run(bench: ModuleType) -> None:
-    tests = [bench.Tested("keypoints", 1000, rows([0.0] * 4) + rows([500.0] * 4, 1, 0.4), 0.2)]
+    tests = [bench.Tested("keypoints", 1000, rows([0.0] * 4) + rows([500.0] * 4, 1, 0.4))]
     table = bench.tabulate(tests[:1], [50, 1000], bench.measure_recall)
     assert "| `keypoints` | – | 50.0 [" in table
     assert "| `pose_pf` | – | – |" in table
