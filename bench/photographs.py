@@ -180,8 +180,8 @@ def plan() -> list[Run]:
         shipped("mustard_d", mustard, 1000),
         shipped("chef_e", chef, 900),
         run("foam_h", foam, 900, _best("foam_g"), "model.likelihood_batch_size=16"),
+        run("foam_i", foam, 900, _best("foam_h"), "model.likelihood_batch_size=16"),
         shipped("meat_e", meat, 700),
-        shipped("tuna_d", "007_tuna_fish_can", 800),
     ]
 
 
