@@ -12,7 +12,7 @@ from posefilter.errors import UserError
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
-from posefilter.nets.fused import make_tables
+from posefilter.nets.fused import applies, make_tables
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
@@ -99,7 +99,7 @@ class PosePF(PoseParticles):
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         context = coordinates if coordinates.features.shape[-1] else None
         image = flatten_images(batch.rgb, batch.depth, batch.intrinsics, context)
-        if context is not None and not torch.is_grad_enabled():
+        if context is not None and applies(batch.rgb.device):
             assert image.context is not None
             image = image._replace(tables=make_tables(image.context))
         return PoseScene(image, coordinates, measure_cells(batch.depth, batch.intrinsics))

@@ -35,12 +35,12 @@ class Tables(NamedTuple):
     smooth: Tensor  # (B * H / 2 * W / 2, 2 + C) membership, logit / 8, features
 
 
-def applies(poses: Tensor, sigma: Tensor) -> bool:
-    """Return whether poses can be scored here: without gradient, at one noise level, on a CPU, not
-    traced for export.  A GPU has no use for operations on so small parts.
+def applies(device: torch.device) -> bool:
+    """Return whether poses can be scored here: without gradient, on a CPU, not traced for export.
+    A GPU has no use for operations on so small parts.
     """
     plain = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
-    return plain and poses.device.type == "cpu" and sigma.numel() == 1
+    return plain and device.type == "cpu"
 
 
 def missing_context() -> UserError:
@@ -98,10 +98,7 @@ def score(
     weights = _Weights(likelihood, sigma, dtype)
     context = None if tables is None else tables.smooth
     scores = weights.score(inputs.flatten(1), context, cells).view(inside.shape)
-    outside: Tensor = likelihood.outside(likelihood.level(sigma.reshape(1)))
-    scores = torch.where(inside, scores, outside)
-    too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])
-    return likelihood.scale * scores.mean(-1) - 200 * too_near
+    return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
 
 
 def _inputs(
@@ -293,7 +290,7 @@ class _Weights:
 
 def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """relu(x W^T + b), in one operation where oneDNN has it.  (m, k), (n, k), (n,) -> (m, n)."""
-    if _FUSES and x.device.type == "cpu":
+    if _FUSES:
         out: Tensor = torch.ops.mkldnn._linear_pointwise(x, weight, bias, "relu", [], "")
         return out
     return torch.addmm(bias, x, weight.t()).relu_()

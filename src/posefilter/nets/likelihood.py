@@ -237,7 +237,7 @@ class PoseLikelihood(nn.Module):
             Log-likelihoods (B, N).
         """
         noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
-        if applies(poses, sigma):
+        if applies(poses.device) and sigma.numel() == 1:
             half = torch.is_autocast_enabled("cpu")
             dtype = torch.get_autocast_dtype("cpu") if half else poses.dtype
             with torch.autocast("cpu", enabled=False):
@@ -252,9 +252,25 @@ class PoseLikelihood(nn.Module):
     ) -> Tensor:
         """Score poses by points that are drawn already; arguments as of `forward`.  -> (B, N)."""
         level = self.level(sigma.expand(len(poses)))
-        scores = torch.where(
-            points.inside, self.score_at_level(points, level, radius), self.outside(level)[:, None]
-        )
+        scores = self.score_at_level(points, level, radius)
+        return self.pool(scores, points.inside, level, poses, center)
+
+    def pool(
+        self, scores: Tensor, inside: Tensor, level: Tensor, poses: Tensor, center: Tensor
+    ) -> Tensor:
+        """Return the poses' scores from those of their points.
+
+        Args:
+            scores: (B, N, P) of the points.
+            inside: (B, N, P) bool, which of them lie in the frame.
+            level: (B, 9) or (1, 9) encoded noise levels.
+            poses: (B, N, 4, 4) camera_from_object [m].
+            center: (3,) the object's center [m].
+
+        Returns:
+            Log-likelihoods (B, N).
+        """
+        scores = torch.where(inside, scores, self.outside(level)[:, None])
         # penalize centers closer than 0.15 m
         too_near = torch.relu(0.15 - origin_of(poses, center)[..., 2])
         return self.scale * scores.mean(-1) - 200 * too_near
