@@ -1,12 +1,15 @@
 """Test checkpoints of one object on the same held-out renders, with intervals over scenes.
 
-    python bench/held_out.py --root DIR --meshes DIR [--images 48] [--out ROWS.json] \
-        A.ckpt [B.ckpt ...]
-    python bench/held_out.py --table ROWS.json     # only rewrites the table of photographs.md
+    python bench/held_out.py --root DIR --meshes DIR [--part test] [--images 48] \
+        [--out ROWS.json] A.ckpt [B.ckpt ...]
+    python bench/held_out.py --table ROWS.json     # only writes rows into photographs.md
 
 The scenes are those that training with data.split={train: 0.8, val: 0.05, test: 0.15} and seed 0
-holds out. Frames of a scene are alike, so that intervals resample scenes, not images (95 %,
-percentile bootstrap). With --out, rows are added to those of the file.
+holds out; with --part train, those that it learns from, without augmentation: the difference is
+what was learned by heart. Frames of a scene are alike, so that intervals resample scenes, not
+images (95 %, percentile bootstrap). With --out, rows are added to those of the file.
+
+Objects that the frame cuts off, and those whose pixels are few, have figures of their own.
 
 Errors are of the surface points that a checkpoint carries, 200 in those that ship. ADD-S of few
 points is lower than of many: compare files that carry as many.
@@ -32,19 +35,25 @@ from posefilter.metrics.scores import auc
 
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "photographs.md"
-MARK, END = "<!-- table: held-out -->", "<!-- end -->"
+MARK, END = "<!-- table: {} -->", "<!-- end -->"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
 LEAST = 0.3  # visible share
 HEAD = ("object", "weights", "images", "scenes", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
 HEAD += ("ADD-S < 0.1 d %", "median mm")
+SMALL = 1500  # pixels of the object, of an image of 320 x 240
+KINDS = ("whole", "cut", "small")  # the last: whole and of fewer pixels than SMALL
+PARTS = ("object", "weights", "scenes of", "images", "whole: images", "ADD AUC", "ADD-S AUC")
+PARTS += ("cut off: images", "ADD AUC", "ADD-S AUC", "small: images", "ADD AUC", "ADD-S AUC")
 
 
-def read_held_out(root: str, meshes: str, name: str, images: int) -> list[tuple[str, Sample]]:
-    """Return the scene and the sample of evenly chosen held-out frames that show the object."""
+def read_frames(
+    root: str, meshes: str, name: str, images: int, part: str = "test"
+) -> list[tuple[str, Sample]]:
+    """Return the scene and the sample of evenly chosen frames of a part that show the object."""
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", [name]))
     records: Sequence[FrameRecord] = reader.records()
-    held_out = split_records(records, SPLIT, 0, Path(root))["test"]
-    own = [i for i in held_out if records[i].object == name]
+    chosen = split_records(records, SPLIT, 0, Path(root))[part]
+    own = [i for i in chosen if records[i].object == name]
     out = []
     for i in np.random.default_rng(0).permutation(own):  # the objects' folders follow each other
         try:
@@ -68,6 +77,26 @@ def bootstrap(scenes: Sequence[str], errors: torch.Tensor, draws: int = 1000) ->
         chosen = rng.integers(len(names), size=len(names))
         found.append(auc(errors[[i for one in chosen for i in rows[one]]]))
     return [float(x) for x in np.percentile(found, [2.5, 97.5])]
+
+
+def kind_of(mask: np.ndarray[Any, Any]) -> str:
+    """Return whether the frame cuts an object off, and whether it is small.  (H, W) bool."""
+    edge = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+    if edge.any():
+        return "cut"
+    return "small" if mask.sum() * (320 * 240 / mask.size) < SMALL else "whole"
+
+
+def measure_kinds(
+    kinds: Sequence[str], plain: torch.Tensor, symmetric: torch.Tensor
+) -> dict[str, Any]:
+    """Return images, ADD AUC and ADD-S AUC of each kind.  (N,) kinds, (N,) and (N,) errors [m]."""
+    out: dict[str, Any] = {}
+    for kind in KINDS:
+        at = [i for i, one in enumerate(kinds) if one == kind]
+        areas = [auc(errors[at]) if at else None for errors in (plain, symmetric)]
+        out[kind] = [len(at), *areas]
+    return out
 
 
 def test(checkpoint: str, frames: Sequence[tuple[str, Sample]]) -> dict[str, Any]:
@@ -94,6 +123,7 @@ def test(checkpoint: str, frames: Sequence[tuple[str, Sample]]) -> dict[str, Any
         "add_recall": recall[0],
         "add_s_recall": recall[1],
         "median_mm": 1000 * float(plain.median()),
+        "kinds": measure_kinds([kind_of(s.mask > 0) for _, s in frames], plain, symmetric),
     }
 
 
@@ -110,13 +140,32 @@ def make_line(row: dict[str, Any]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
-    """Put the rows into the page, by object."""
-    before, rest = page.read_text().split(MARK, 1)
-    _, after = rest.split(END, 1)
-    head = [f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD))]
-    lines = [make_line(row) for row in sorted(rows, key=lambda row: str(row["object"]))]
-    page.write_text(before + "\n".join([MARK, *head, *lines, END]) + after)
+def make_part_line(row: dict[str, Any]) -> str:
+    """Return a row of the table of whole, cut and small objects."""
+    cells = [row["object"], f"`{row['weights']}`", row["part"], str(row["images"])]
+    for kind in KINDS:
+        count, *areas = row["kinds"][kind]
+        cells += [str(count), *("–" if area is None else f"{area:.1f}" for area in areas)]
+    return f"| {' | '.join(cells)} |"
+
+
+def _put(text: str, title: str, heads: Sequence[str], lines: Sequence[str]) -> str:
+    """Put rows into a table: those of the same first cells are replaced, others stay."""
+    keys = 3 if "scenes of" in heads else 2
+    before, rest = text.split(MARK.format(title), 1)
+    old, after = rest.split(END, 1)
+    rows = {tuple(line.split(" | ")[:keys]): line for line in old.splitlines()[3:]}
+    rows |= {tuple(line.split(" | ")[:keys]): line for line in lines}
+    head = [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads))]
+    table = [*head, *(rows[key] for key in sorted(rows))]
+    return before + "\n".join([MARK.format(title), *table, END]) + after
+
+
+def write_tables(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
+    """Put rows into the page's two tables."""
+    held_out = [make_line(row) for row in rows if row["part"] == "test"]
+    text = _put(page.read_text(), "held-out", HEAD, held_out)
+    page.write_text(_put(text, "parts", PARTS, [make_part_line(row) for row in rows]))
 
 
 def main() -> int:
@@ -128,11 +177,12 @@ def main() -> int:
     parser.add_argument("--root", help="a dataset of bench/photographs.py, in FAT's format")
     parser.add_argument("--meshes", help="its meshes")
     parser.add_argument("--images", type=int, default=48)
+    parser.add_argument("--part", default="test", choices=list(SPLIT))
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
     parser.add_argument("--table", type=Path, help="a file of rows to write into the page")
     options = parser.parse_args()
     if options.table:
-        write_table(json.loads(options.table.read_text()))
+        write_tables(json.loads(options.table.read_text()))
         return 0
     if not (options.root and options.meshes and options.checkpoints):
         parser.error("--root, --meshes and a checkpoint are needed")
@@ -142,9 +192,10 @@ def main() -> int:
     for checkpoint in options.checkpoints:
         name = posefilter.load(checkpoint, device="cpu").objects[0]
         if name not in frames:
-            frames[name] = read_held_out(options.root, options.meshes, name, options.images)
-        row = test(checkpoint, frames[name])
-        print(make_line(row), flush=True)
+            where = (options.root, options.meshes)
+            frames[name] = read_frames(*where, name, options.images, options.part)
+        row = test(checkpoint, frames[name]) | {"part": options.part}
+        print(make_line(row), make_part_line(row), sep="\n", flush=True)
         if options.out:
             rows = json.loads(options.out.read_text()) if options.out.is_file() else []
             options.out.write_text(json.dumps([*rows, row], indent=1))

@@ -182,6 +182,15 @@ def plan() -> list[Run]:
         run("foam_h", foam, 900, _best("foam_g"), "model.likelihood_batch_size=16"),
         run("foam_i", foam, 900, _best("foam_h"), "model.likelihood_batch_size=16"),
         shipped("meat_e", meat, 700),
+        shipped("tuna_d", "007_tuna_fish_can", 1000),
+        shipped("banana_d", "011_banana", 1000),
+        shipped("bowl_d", "024_bowl", 1000),
+        shipped("hammer_d", "048_hammer", 1000),
+        shipped("gelatin_d", gelatin, 1000),
+        shipped("cracker_c", "003_cracker_box", 1000),
+        shipped("chef_f", chef, 1000),
+        shipped("soup_h", soup, 1000),
+        shipped("drill_g", drill, 1000),
     ]
 
 

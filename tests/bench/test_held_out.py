@@ -1,0 +1,57 @@
+"""The bench of held-out renders: kinds of objects, and rows that stay in the page."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
+import held_out
+
+
+def test_an_object_at_the_edge_is_cut_off_and_one_of_few_pixels_is_small() -> None:
+    mask = np.zeros((240, 320), dtype=bool)
+    mask[100:150, 100:150] = True
+    assert held_out.kind_of(mask) == "whole"
+    assert held_out.kind_of(np.roll(mask, -100, axis=1)) == "cut"
+    mask[120:] = False
+    assert held_out.kind_of(mask) == "small"
+    # the same object in an image of twice the size has four times the pixels
+    assert held_out.kind_of(np.kron(mask, np.ones((2, 2), dtype=bool))) == "small"
+
+
+def test_each_kind_has_the_area_of_its_own_images() -> None:
+    plain, symmetric = torch.tensor([0.0, 0.2, 0.05]), torch.tensor([0.0, 0.0, 0.2])
+    found = held_out.measure_kinds(["whole", "cut", "whole"], plain, symmetric)
+    assert found["small"] == [0, None, None]
+    assert found["cut"] == [1, pytest.approx(0.0), pytest.approx(100.0)]
+    assert found["whole"][0] == 2
+    assert found["whole"][1] > found["whole"][2] == pytest.approx(50.0)
+
+
+def _row(name: str, weights: str, part: str, area: float) -> dict[str, object]:
+    areas = {"add_auc": area, "add_interval": [1, 2], "add_s_auc": 3.0, "add_s_interval": [2, 4]}
+    shares = {"add_recall": 0.5, "add_s_recall": 0.5, "median_mm": 1.0}
+    kinds = {"whole": [1, area, area], "cut": [0, None, None], "small": [0, None, None]}
+    first = {"object": name, "weights": weights, "part": part, "images": 1, "scenes": 1}
+    return first | areas | shares | {"kinds": kinds}
+
+
+def test_rows_of_other_weights_stay_in_the_page(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    marks = [held_out.MARK.format(title) for title in ("held-out", "parts")]
+    page.write_text("".join(f"text\n\n{mark}\n{held_out.END}\n\n" for mark in marks))
+    held_out.write_tables(
+        [_row("mug", "old", "test", 10.0), _row("bowl", "old", "test", 20.0)], page
+    )
+    held_out.write_tables(
+        [_row("mug", "old", "test", 30.0), _row("mug", "old", "train", 40.0)], page
+    )
+    first, second = page.read_text().split(marks[1])
+    assert first.count("| mug |") == first.count("| bowl |") == 1  # learned scenes are not held out
+    assert "30.0 (1 to 2)" in first
+    assert "10.0" not in first
+    assert second.count("| mug |") == 2
+    assert "| mug | `old` | train | 1 | 1 | 40.0 | 40.0 | 0 | – | – |" in second
