@@ -207,6 +207,13 @@ def nan_location(folder):
     path.write_text(json.dumps(content))
 
 
+def huge_quaternion(folder):
+    path = folder / "000007.left.json"
+    content = json.loads(path.read_text())
+    content["objects"][0]["quaternion_xyzw"][3] = 1e308  # its square is infinite
+    path.write_text(json.dumps(content))
+
+
 BROKEN = {
     "cut color": (cut("000007.left.jpg"), "000007.left.jpg", "truncated or corrupt"),
     "cut depth": (cut("000007.left.depth.png"), "000007.left.depth.png", "truncated or corrupt"),
@@ -220,6 +227,7 @@ BROKEN = {
     ),
     "no class": (spoil_json("class"), "000007.left.json", "missing key 'objects\\[0\\].class'"),
     "nan location": (nan_location, "000007.left.json", "holds NaN"),
+    "huge quaternion": (huge_quaternion, "000007.left.json", "not a unit quaternion .norm 1e.308"),
     "nan depth": (nan_depth, "000007.left.depth.png", "NaN"),
     "wrong size": (
         lambda f: write_png(f / "000007.left.seg.png", np.full((60, 80), 255, np.uint8)),
@@ -242,6 +250,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("case", BROKEN)
 def test_broken_files_are_named_with_their_cause_in_one_line(tmp_path, case):
     spoil, file, cause = BROKEN[case]

@@ -125,6 +125,7 @@ class Onboarding:
             *(f"{key}='{value}'" for key, value in quoted.items()),
             f"data.generate.frames={self.frames}",
             f"data.generate.workers={self.cfg.workers}",
+            "data.generate.frames_per_scene=2",  # few scenes would be learned by heart
             f"data.generate.seed={self.cfg.seed}",
             "data.split={train: 0.7, val: 0.1, test: 0.2}",
             f"data.limit_val={_VALIDATED}",

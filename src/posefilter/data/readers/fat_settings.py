@@ -1,5 +1,6 @@
 """Parse the JSON files of the Falling Things format."""
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -133,13 +134,12 @@ def camera_settings(path: Path) -> dict[str, FatCamera]:
 def camera_from_aligned(record: Any, path: Path, where: str) -> np.ndarray:
     """Return an object's pose in FAT's aligned frame.  -> (4, 4) [m]."""
     quat = numbers(record, "quaternion_xyzw", path, (4,), where)
-    if abs(np.linalg.norm(quat) - 1) > 0.01:  # four decimals leave it 1e-4 off
+    norm = math.hypot(*quat)  # of huge numbers infinite, where a sum of squares would warn
+    if abs(norm - 1) > 0.01:  # four decimals leave it 1e-4 off
         raise BadData(
-            path,
-            f"'{where}quaternion_xyzw' is not a unit quaternion",
-            f"norm {np.linalg.norm(quat):.3f}",
+            path, f"'{where}quaternion_xyzw' is not a unit quaternion", f"norm {norm:.3g}"
         )
     pose = np.eye(4)
-    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / np.linalg.norm(quat))).numpy()
+    pose[:3, :3] = matrix_from_quat_xyzw(torch.from_numpy(quat / norm)).numpy()
     pose[:3, 3] = numbers(record, "location", path, (3,), where) * CM
     return pose
