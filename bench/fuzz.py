@@ -97,7 +97,9 @@ def main(arguments: list[str] | None = None) -> int:
             if given.list or outcome in FAILURES:
                 error = ended.err.strip().splitlines()
                 added = [word for word in typed if word not in own]
-                print(f"{number} {command} {added}: {outcome}: {error[-1][:300] if error else ''}")
+                without = [word for word in own if word not in typed]
+                said = error[-1][:300] if error else ""
+                print(f"{number} {command} {added} without {without}: {outcome}: {said}")
     for outcome in (ACCEPTED, REFUSED, USAGE, *FAILURES):
         print(f"{counts[outcome]:6d}  {outcome}")
     return 1 if any(counts[outcome] for outcome in FAILURES) else 0
