@@ -52,7 +52,10 @@ import pytest
 
 HOME = Path(__file__).parents[1]
 PACKAGES = ("metrics", "geometry", "filters", "losses")
-TESTS = (*(f"tests/{name}" for name in PACKAGES), "tests/laws")
+TESTS = (
+    *(f"tests/{name}" for name in PACKAGES), "tests/laws", "tests/data/test_parts.py",
+    "tests/cli/test_bop_scores.py",
+)  # fmt: skip
 KILLED, SURVIVED, SLOW, BROKEN = "killed", "survived", "timed out", "not importable"
 _LIMIT = 20  # of processor time, to which five times that of the tests is added [s]
 _NOT_IMPORTED = 90  # exit status
