@@ -2,6 +2,8 @@
 frame.
 """
 
+import math
+
 import torch
 from tests.models.toy import scenes, square
 
@@ -37,6 +39,28 @@ def test_candidates_hold_the_truth_and_every_kind() -> None:
     assert (origin_of(placed, MODEL.center) - batch.camera_from_object[:, None, :3, 3]).norm(
         dim=-1
     ).median() < 0.15
+
+
+def test_each_kind_is_as_far_from_the_truth_as_it_is_said_to_be() -> None:
+    batch, count = scenes(1), 4000
+    poses = sample_around_truth(
+        batch, MODEL, SPACE, count, (0.02, 0.02), generator(), HalfTurns(1.0)
+    )
+    offset = (poses - batch.camera_from_object[:, None])[0, :, :3, 3]
+    nearby, shifted, turned = (
+        offset[1 : 1 + count],
+        offset[-count * 3 // 2 : -count],
+        offset[-count:],
+    )
+    for moved, share in ((nearby, 0.6), (shifted, 0.5), (turned, 0.3)):
+        torch.testing.assert_close(moved.std(0), torch.full((3,), 0.02 * share), atol=0, rtol=0.05)
+    # levels are drawn log-uniformly: their median is the geometric mean of the bounds
+    poses = sample_around_truth(
+        batch, MODEL, SPACE, count, (1e-4, 0.1), generator(), HalfTurns(1.0)
+    )
+    size = (poses - batch.camera_from_object[:, None])[0, 1 : 1 + count, :3, 3].norm(dim=-1)
+    # the noise is 0.6 of the level, and the length of three normal numbers has the median 1.538
+    assert abs(size.median().item() / (0.6 * 1.538 * math.sqrt(1e-4 * 0.1)) - 1) < 0.15
 
 
 def test_half_turns_are_half_turns_about_the_center() -> None:

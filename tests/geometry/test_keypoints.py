@@ -47,6 +47,18 @@ def test_peaks_of_gaussians_are_where_they_were_drawn() -> None:
     assert heights.min() > 0.85  # at most half a cell off
 
 
+@pytest.mark.parametrize(("column", "row"), [(38, 28), (1, 1), (38, 1)])
+def test_only_the_outermost_cells_have_peaks_in_their_middles(column: int, row: int) -> None:
+    one = torch.ones(1, 1, dtype=torch.bool)
+    inside = torch.tensor([[[column + 0.3, row - 0.2]]]) * STRIDE + (STRIDE - 1) / 2
+    maps = draw_gaussians(inside, one, 30, 40, STRIDE, 1.5)
+    torch.testing.assert_close(find_peaks(maps, 1, STRIDE)[0][:, :, 0], inside, atol=0.01, rtol=0)
+    edge = torch.tensor([39 if column > 1 else 0, 29 if row > 1 else 0])
+    middle = (edge * STRIDE + (STRIDE - 1) / 2).view(1, 1, 2)
+    maps = draw_gaussians(middle + 0.8, one, 30, 40, STRIDE, 1.5)
+    torch.testing.assert_close(find_peaks(maps, 1, STRIDE)[0][:, :, 0], middle)
+
+
 def test_peaks_are_sorted_and_flat_maps_have_none() -> None:
     at = torch.tensor([[[20.0, 20.0]], [[100.0, 80.0]]])
     there = torch.ones(2, 1, dtype=torch.bool)

@@ -25,3 +25,11 @@ def test_each_range_has_its_own_instances() -> None:
     assert abs(got["0.5-1"]["add"]["recall_01d"] - 50) < 1e-6
     metric.reset()
     assert metric.compute() == {}
+
+
+def test_a_share_between_two_ranges_is_of_the_higher_one() -> None:
+    metric = ErrorsByVisibility([square()], ranges=((0.25, 0.5), (0.5, 0.75), (0.75, 1.0)))
+    truth = torch.eye(4).expand(4, 4, 4)
+    metric.collect(truth, truth, torch.tensor([0.25, 0.5, 0.75, 1.0]))
+    counted = {name: found["instances"] for name, found in metric.compute().items()}
+    assert counted == {"0.25-0.5": 1, "0.5-0.75": 1, "0.75-1": 2}
