@@ -78,10 +78,13 @@ class ConvNorm(nn.Sequential):
     def _fold(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return weight and bias with batch norm in them, kept until a parameter changes."""
         conv, norm = self._layers
-        parts = (conv.weight, norm.weight, norm.bias, norm.running_mean, norm.running_var)
+        mean, variance, count = norm.running_mean, norm.running_var, norm.num_batches_tracked
+        assert mean is not None
+        assert variance is not None
+        assert count is not None
+        parts = (conv.weight, norm.weight, norm.bias, mean, variance)
         # training updates the statistics without a new version, but it counts its batches
-        watched = (*parts, norm.num_batches_tracked)
-        of = (dtype, *((part.data_ptr(), part._version) for part in watched))
+        of = (dtype, *((part.data_ptr(), part._version) for part in (*parts, count)))
         if self._folded is None or self._folded[0] != of:
             weight, gain, bias, mean, variance = (part.detach() for part in parts)
             gain = gain * (variance + norm.eps).rsqrt()
