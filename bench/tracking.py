@@ -4,7 +4,7 @@
 
     python bench/tracking.py --sequences DIR [DIR ...] --meshes DIR --only 003_cracker_box
 
-For each object whose weights ship and that is in the scenes: every frame by itself, then the same
+For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself, then the same
 frames tracked, in one process. Times are the processor's of this process, so that other work on the
 machine changes them little; the ratio of the two is what to go by. Then the frames once more, of
 which six are replaced by those of another scene: how many are said to show the object, and after
@@ -26,6 +26,7 @@ import posefilter
 from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.meshes import ycb
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 from posefilter.metrics.tracks import measure_jitter
@@ -227,7 +228,7 @@ def main() -> None:
     options = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(options.threads)
-    names = options.only or list(list_shipped())
+    names = options.only or [name for name in list_shipped() if name in ycb.CLASSES]
     if options.sequences:
         run_sequences(options.sequences, options.meshes, names[0])
         return

@@ -140,6 +140,15 @@ def test_a_number_is_neither_a_mapping_nor_a_list(
         check_settings(cfg, command)
 
 
+def test_a_number_of_one_command_is_no_list_either(composed: dict[str, DictConfig]) -> None:
+    cfg = composed["export"].copy()
+    OmegaConf.set_readonly(cfg, False)
+    for value in ([1], [[1]]):
+        OmegaConf.update(cfg, "max_mb", value, merge=False)
+        with pytest.raises(UserError, match="^max_mb=.*must be one number, and is a list"):
+            check_settings(cfg, "export")
+
+
 @pytest.mark.parametrize("command", ["train", "onboard", "predict"])
 def test_a_number_that_is_made_of_other_settings_is_checked(
     command: str, composed: dict[str, DictConfig]

@@ -149,7 +149,10 @@ def test_the_box_is_where_it_was_rendered(estimator: posefilter.Estimator) -> No
     found = result.pose[:3, :3] @ result.belief.center + result.pose[:3, 3]
     assert np.linalg.norm(found - truth) < 0.02
     assert np.sqrt(np.diag(result.covariance))[:3].max() < 0.02
-    assert result.modes[0].mass > 0.9
+    belief = result.belief
+    centers = belief.samples[:, :3, :3] @ belief.center + belief.samples[:, :3, 3]
+    near = np.linalg.norm(centers - found, axis=-1) < 0.03
+    assert belief.weights[near].sum() > 0.9  # in one mode or two that touch
 
 
 def test_a_wrong_depth_scale_is_reported(estimator: posefilter.Estimator) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
-from posefilter.ranges import check_ranges
+from posefilter.ranges import check_ranges, find_range
 
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 # settings that a command cannot do without
@@ -84,6 +84,10 @@ def run_of(path: Any) -> str:
     )
 
 
+# settings of a command itself that are several numbers
+_LISTS = ("size", "camera", "distractors", "intrinsics")
+
+
 def check_out(cfg: DictConfig) -> None:
     """Raise UserError where `out` is something that cannot name a folder or file."""
     out = cfg.get("out")
@@ -109,11 +113,12 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for key in ("seed", "threads"):  # read before anything is built, which would check its kind
-        value = cfg.get(key)
-        if isinstance(value, ListConfig):
+    for key, value in plain.items():  # below, what is built checks the kind of its settings
+        number = find_range(f"{command}.{key}") is not None and key not in _LISTS
+        if number and isinstance(value, list):
             raise UserError(f"{key}={value}: must be one number, and is a list")
-        check_ranges({key: value}, command)  # where it is made of other settings
+    for key in ("seed", "threads"):
+        check_ranges({key: cfg.get(key)}, command)  # where it is made of other settings
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:
         raise UserError(

@@ -75,12 +75,23 @@ def open_reader(
         ) from error
 
 
+def _names(objects: str | Sequence[str] | None) -> list[str]:
+    """Return the classes asked for, none where all are.
+
+    Raises UserError for what is no text, such as a name that YAML reads as a number.
+    """
+    names = [objects] if isinstance(objects, str) else objects or []
+    if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        raise UserError(f"data.object={objects}: must be a name, or a list of names, or null")
+    return list(names)
+
+
 def _asked_part(objects: str | Sequence[str] | None, meshes: MeshStore | None) -> str | None:
     """Return the part of an object (`hammer.head`) that is asked for; None for whole objects.
 
     Raises UserError for a part beside other objects.
     """
-    names = [objects] if isinstance(objects, str) else list(objects or [])
+    names = _names(objects)
     parts = [] if meshes is None else [name for name in names if meshes.is_part(name)]
     if parts and len(names) > 1:
         raise UserError(f"data.object: '{parts[0]}' is a part, which is read by itself")
@@ -91,7 +102,7 @@ def default_mesh_scale(source: str, objects: str | Sequence[str] | None) -> floa
     """Return meters a unit of the mesh files that belong to a dataset: BOP's own models are in
     millimeters.
     """
-    names = [objects] if isinstance(objects, str) else list(objects or [])
+    names = _names(objects)
     return 0.001 if source == "bop" and all(name.startswith("obj_") for name in names) else 1.0
 
 
