@@ -4,12 +4,13 @@
 
     python bench/tracking.py --sequences DIR [DIR ...] --meshes DIR --only 003_cracker_box
 
-For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself, then the same
-frames tracked, in one process. Times are the processor's of this process, so that other work on the
-machine changes them little; the ratio of the two is what to go by. Then the frames once more, of
-which six are replaced by those of another scene: how many are said to show the object, and after
-how many frames it is found again. Sequences are folders of generate.py with moving= and
-covered_frames=: there the losses are in the frames. Writes the tables of docs/results/tracking.md.
+For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself,
+then the same frames tracked, in one process. Times are the processor's of this process, so that
+other work on the machine changes them little; the ratio of the two is what to go by. Then the
+frames once more, of which six are replaced by those of another scene: how many are said to show the
+object, and after how many frames it is found again. Sequences are folders of generate.py with
+moving= and covered_frames=: there the losses are in the frames. Writes the tables of
+docs/results/tracking.md.
 """
 
 import argparse

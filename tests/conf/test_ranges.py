@@ -145,7 +145,7 @@ def test_a_number_of_one_command_is_no_list_either(composed: dict[str, DictConfi
     OmegaConf.set_readonly(cfg, False)
     for value in ([1], [[1]]):
         OmegaConf.update(cfg, "max_mb", value, merge=False)
-        with pytest.raises(UserError, match="^max_mb=.*must be one number, and is a list"):
+        with pytest.raises(UserError, match=r"^max_mb=.*must be one number, and is a list"):
             check_settings(cfg, "export")
 
 
