@@ -113,10 +113,10 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for key, value in plain.items():  # below, what is built checks the kind of its settings
-        number = find_range(f"{command}.{key}") is not None and key not in _LISTS
+    for name, value in plain.items():  # below, what is built checks the kind of its settings
+        number = find_range(f"{command}.{name}") is not None and name not in _LISTS
         if number and isinstance(value, list):
-            raise UserError(f"{key}={value}: must be one number, and is a list")
+            raise UserError(f"{name}={value}: must be one number, and is a list")
     for key in ("seed", "threads"):
         check_ranges({key: cfg.get(key)}, command)  # where it is made of other settings
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
