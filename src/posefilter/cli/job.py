@@ -108,12 +108,13 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     """
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
-    check_ranges({str(key): value for key, value in plain.items()}, command)
+    settings = {str(key): value for key, value in plain.items()}
+    check_ranges(settings, command)
     check_out(cfg)
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for name, value in plain.items():  # below, what is built checks the kind of its settings
+    for name, value in settings.items():  # below, what is built checks the kind of its settings
         number = find_range(f"{command}.{name}") is not None and name not in _LISTS
         if number and isinstance(value, list):
             raise UserError(f"{name}={value}: must be one number, and is a list")
