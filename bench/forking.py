@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -17,6 +16,7 @@ import cv2
 import omegaconf._utils
 import torch
 import yaml
+from forked import end_with
 
 # what the commands import when they are called: before the fork, so that it is paid once
 import posefilter.cli.check_data
@@ -84,28 +84,22 @@ def start(
     Returns:
         The process's number.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    number = os.fork()
-    if number:
-        return number
-    status = RAW
-    try:
+
+    def begin() -> int:
         os.setsid()
         for name, stream in (("out", 1), ("err", 2)):
             file = os.open(f"{log}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(file, stream)
         if before is not None:
             before()
-        status = run_command(command, HOME, list(arguments))
-    except SystemExit as asked:
-        status = asked.code if isinstance(asked.code, int) else 1
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+        return run_command(command, HOME, list(arguments))
+
+    sys.stdout.flush()
+    sys.stderr.flush()
+    number = os.fork()
+    if not number:
+        end_with(begin, RAW)
+    return number
 
 
 def wait(number: int, log: Path, seconds: float) -> Ended:

@@ -1,17 +1,22 @@
 """The bench of held-out renders: kinds of objects, and rows that stay in the page."""
 
-import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
-import held_out
+
+@pytest.fixture
+def held_out(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("bench/held_out.py")
 
 
-def test_an_object_at_the_edge_is_cut_off_and_one_of_few_pixels_is_small() -> None:
+def test_an_object_at_the_edge_is_cut_off_and_one_of_few_pixels_is_small(
+    held_out: ModuleType,
+) -> None:
     mask = np.zeros((240, 320), dtype=bool)
     mask[100:150, 100:150] = True
     assert held_out.kind_of(mask) == "whole"
@@ -22,7 +27,7 @@ def test_an_object_at_the_edge_is_cut_off_and_one_of_few_pixels_is_small() -> No
     assert held_out.kind_of(np.kron(mask, np.ones((2, 2), dtype=bool))) == "small"
 
 
-def test_each_kind_has_the_area_of_its_own_images() -> None:
+def test_each_kind_has_the_area_of_its_own_images(held_out: ModuleType) -> None:
     plain, symmetric = torch.tensor([0.0, 0.2, 0.05]), torch.tensor([0.0, 0.0, 0.2])
     found = held_out.measure_kinds(["whole", "cut", "whole"], plain, symmetric)
     assert found["small"] == [0, None, None]
@@ -39,7 +44,7 @@ def _row(name: str, weights: str, part: str, area: float) -> dict[str, object]:
     return first | areas | shares | {"kinds": kinds}
 
 
-def test_rows_of_other_weights_stay_in_the_page(tmp_path: Path) -> None:
+def test_rows_of_other_weights_stay_in_the_page(held_out: ModuleType, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     marks = [held_out.MARK.format(title) for title in ("held-out", "parts")]
     page.write_text("".join(f"text\n\n{mark}\n{held_out.END}\n\n" for mark in marks))
