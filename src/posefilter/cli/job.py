@@ -11,6 +11,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from posefilter.errors import UserError
 from posefilter.ranges import check_ranges, find_range
 
+# settings of a command itself that are several numbers
+_LISTS = ("size", "camera", "distractors", "intrinsics")
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 # settings that a command cannot do without
 _NEEDED = {
@@ -82,10 +84,6 @@ def run_of(path: Any) -> str:
         if file.parent.name == "checkpoints"
         else f"outputs/evaluations/{file.stem}"
     )
-
-
-# settings of a command itself that are several numbers
-_LISTS = ("size", "camera", "distractors", "intrinsics")
 
 
 def check_out(cfg: DictConfig) -> None:
