@@ -68,7 +68,7 @@ def generate(
     occluded_share: float = 0.4,
     distractors: tuple[int, int] = (2, 8),
     tabletop_share: float = 0.65,
-    frames_per_scene: int = 50,
+    frames_per_scene: int | None = None,
     settle: bool = False,
     renderer: str = "embree",
     progress: bool = True,
@@ -100,7 +100,8 @@ def generate(
         occluded_share: The share of frames in which something stands right in front of it.
         distractors: The least and most objects beside it.
         tabletop_share: The share of frames on a table; in the rest objects float.
-        frames_per_scene: Frames that share surroundings and distractors.
+        frames_per_scene: Frames that share surroundings and distractors. None: 2, since filters
+            learn few scenes by heart; 30 where something moves from frame to frame.
         settle: Let objects fall and come to rest (mujoco).
         renderer: "embree" or "opengl".
         progress: Draw a bar.
@@ -142,7 +143,7 @@ def generate(
         rows,
         stereo,
         sensor,
-        int(frames_per_scene),
+        _frames_per_scene(frames_per_scene, moving),
         renderer,
         scenes,
         1.0 if mesh_scale is None else float(mesh_scale),
@@ -166,6 +167,13 @@ def generate(
             release(out)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
+
+
+def _frames_per_scene(typed: int | None, moving: str) -> int:
+    """Return how many frames share a scene: what was typed, or what suits still or moving scenes."""
+    if typed is not None:
+        return int(typed)
+    return 2 if moving == "none" else 30
 
 
 def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
