@@ -170,7 +170,7 @@ def generate(
 
 
 def _frames_per_scene(typed: int | None, moving: str) -> int:
-    """Return how many frames share a scene: what was typed, or what suits still or moving scenes."""
+    """Return how many frames share a scene: as typed, or what suits still or moving scenes."""
     if typed is not None:
         return int(typed)
     return 2 if moving == "none" else 30
