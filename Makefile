@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized dense_coordinates keypoints
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format smoke bench methods board report tour pictures weights docs tables clean
+.PHONY: help setup train test test-all check format smoke bench methods board report tour pictures weights docs tables clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,7 +21,10 @@ $(STAMP): pyproject.toml
 train: $(STAMP) ## render scenes if there are none, train on them, test, print the table
 	$(PY) train.py $(ARGS)
 
-test: $(STAMP) ## run the tests, two at a time, one thread each
+test: $(STAMP) ## run the tests but for the slow ones, two at a time, one thread each
+	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist worksteal -m "not slow" $(ARGS)
+
+test-all: $(STAMP) ## run all tests, also those of whole workflows
 	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist worksteal $(ARGS)
 
 check: $(STAMP) ## check format, lint, types and import floors

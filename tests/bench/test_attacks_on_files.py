@@ -47,6 +47,7 @@ def test_what_nobody_notices_is_told(
     assert mutations.try_one(base, work, None)[1] == "raw traceback"
 
 
+@pytest.mark.slow
 def test_killed_trainings_end_with_the_same_bits(load: Load, tmp_path: Path) -> None:
     kills = load("kills")
     kills.prepare()

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from tests.smoke.conftest import TINY
 
 HOME = Path(__file__).parents[2]
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path) -> None:
     out = tmp_path / "run"
     words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]

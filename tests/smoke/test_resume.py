@@ -35,6 +35,7 @@ def state(folder: Path) -> dict:
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "interval"),
     [("cnn_patch", 4), ("cnn_patch", 3), ("pose_pf", 3)],
@@ -112,6 +113,7 @@ def uninterrupted(
     return settings, whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hook", "step", "number"),
     [

@@ -22,6 +22,7 @@ def read_csv(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(lines))
 
 
+@pytest.mark.slow
 def test_two_images_are_memorized(tiny_scenes: Path, tmp_path: Path) -> None:
     """And every logger is told the loss and the settings, tags among them."""
     typed = ["debug=overfit", "logger=csv", "tags=[first,two words]", "trainer.log_every_n_steps=1"]
@@ -72,6 +73,7 @@ def test_tags_are_words(typed: str, tmp_path: Path, capfd: pytest.CaptureFixture
     assert "must be a list of words" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_search_maximizes_the_score(tiny_scenes: Path, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
     search = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.direction=maximize"]
