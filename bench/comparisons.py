@@ -35,7 +35,10 @@ SIZES, MOST = ("50,1000", "200", "100,400"), 1000
 SCENES = "data.generate.frames=1600 data.split={train:0.7,val:0.1,test:0.2}"
 STEPS = "trainer.max_steps=300 trainer.val_check_interval=300 scheduler.warm_up=30"
 # half of the preset's particles and no mean shift, for time: it changes the test alone
-SMALL = "filter.particles=100 filter.first_particles=200 filter.steps=8 filter/refine=rescore"
+SMALL = (
+    "filter.particles=100 filter.first_particles=200 filter.steps=8 filter/refine=rescore "
+    "data/augment=strong"  # as the others have it
+)
 DISTRACTORS = (0, 8, 16)
 VISIBLE = ((0.3, 0.5), (0.5, 0.8), (0.8, 1.01))
 RESAMPLED = 2000  # bootstrap samples of the scenes
