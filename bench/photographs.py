@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from marked import format_row, put_table, read_rows
+
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "photographs.md"
-MARK, END = "<!-- table: {} -->", "<!-- end -->"
 HEAD = ["run", "object", "method", "augment", "warm start", "steps", "CPU min", "images", "ADD AUC"]
 HEAD += ["ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm", "outscored %"]
 FEW = 10  # images, at least: with fewer, "photographs" are YCB-Video's own renders
@@ -172,6 +173,7 @@ def plan() -> list[Run]:
         more("drill_d", drill, 600, "drill_c"),
         more("mustard_c", mustard, 500, "mustard_b"),
         more("sugar_c", sugar, 500, "sugar_b"),
+        more("drill_e", drill, 1200, "drill_d"),  # the control of drill_f
         shipped("soup_g", soup, 1200),
         shipped("foam_g", foam, 1000),
         shipped("drill_f", drill, 1200),
@@ -339,17 +341,13 @@ def write_tables(root: Path, page: Path = PAGE) -> None:
     """
     text = page.read_text()
     for title, where, few in TABLES:
-        before, rest = text.split(MARK.format(title), 1)
-        old, after = rest.split(END, 1)
-        rows = {line.split("`")[1]: line for line in old.splitlines() if line.startswith("| `")}
-        lines = [f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD))]
+        rows = {line.split("`")[1]: line for line in read_rows(text, title)}
         for run in plan():
             cells = row(run, root, where)
             if cells is not None and (int(cells[7]) < FEW) == few:
-                rows[run.name] = f"| {' | '.join(cells)} |"
-            if run.name in rows:
-                lines.append(rows[run.name])
-        text = before + "\n".join([MARK.format(title), *lines, END]) + after
+                rows[run.name] = format_row(cells)
+        planned = (rows[run.name] for run in plan() if run.name in rows)
+        text = put_table(text, title, HEAD, planned)
     page.write_text(text)
 
 

@@ -4,6 +4,7 @@ under.
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +16,7 @@ from posefilter.cli.command import compose_job
 from posefilter.data.frames import Sample
 
 HOME = Path(__file__).parents[2]
+sys.path.insert(0, str(HOME / "bench"))  # scripts import their neighbors
 
 
 def load(name: str) -> ModuleType:
@@ -77,10 +79,10 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
 ) -> None:
     run, gone = photographs.plan()[:2]
     page = tmp_path / "page.md"
-    marks = [photographs.MARK.format(title) for title, _, _ in photographs.TABLES]
+    marks = [f"<!-- table: {title} -->" for title, _, _ in photographs.TABLES]
     kept = f"| `{gone.name}` | a run that is no longer there |"
-    old = f"old\n| `{run.name}` | old |\n{kept}\n"
-    page.write_text("Above.\n" + "".join(f"{m}\n{old}{photographs.END}\nBelow.\n" for m in marks))
+    old = f"| run |\n| --- |\n| `{run.name}` | old |\n{kept}\n"
+    page.write_text("Above.\n" + "".join(f"{m}\n{old}<!-- end -->\nBelow.\n" for m in marks))
     values = {
         f"runs/{run.name}": metrics(99.0, 2),
         f"evals/{run.name}/renders": metrics(88.0, 60),
