@@ -29,12 +29,13 @@ def load(name: str) -> ModuleType:
 
 
 photographs, color_shift = load("photographs"), load("color_shift")
+photograph_runs = load("photograph_runs")
 
 
 def kinds() -> list[Any]:
     """Return one run of each kind: those that differ in more than object, steps and start."""
     found = {}
-    for run in photographs.plan():
+    for run in photograph_runs.plan():
         words = [word for word in run.words.split() if not word.startswith("warm_start=")]
         found.setdefault((run.model, *words), run)
     return list(found.values())
@@ -51,12 +52,12 @@ def test_every_kind_of_training_composes(run: Any, tmp_path: Path) -> None:
 
 def test_a_warm_start_comes_after_the_run_that_it_starts_from() -> None:
     done = []
-    for run in photographs.plan():
-        if photographs._best("drill_patch_camera") in run.words:
+    for run in photograph_runs.plan():
+        if photograph_runs._best("drill_patch_camera") in run.words:
             assert "drill_patch_camera" in done
-        if photographs.CRACKER in run.words:
-            assert (HOME / photographs.CRACKER).is_file()
-        assert run.object in photographs.TARGETS
+        if photograph_runs.CRACKER in run.words:
+            assert (HOME / photograph_runs.CRACKER).is_file()
+        assert run.object in photograph_runs.TARGETS
         assert run.name not in done
         done.append(run.name)
 
@@ -77,7 +78,7 @@ def metrics(auc: float, instances: int) -> dict[str, Any]:
 def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     tmp_path: Path,
 ) -> None:
-    run, gone = photographs.plan()[:2]
+    run, gone = photograph_runs.plan()[:2]
     page = tmp_path / "page.md"
     marks = [f"<!-- table: {title} -->" for title, _, _ in photographs.TABLES]
     kept = f"| `{gone.name}` | a run that is no longer there |"
