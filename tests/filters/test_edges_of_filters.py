@@ -205,3 +205,9 @@ def test_the_estimate_and_the_heaviest_are_scored_again_all_there_are_at_most() 
     all_of_them = Rescore(top_k=9)(belief(4), None, method, Generator())  # type: ignore[arg-type]
     assert method.counts == [3, 5]
     assert float(few.best[0, 0, 3]) <= float(all_of_them.best[0, 0, 3]) == pytest.approx(0.003)
+
+
+def test_modes_reach_three_bandwidths() -> None:
+    state = torch.tensor([[0.0, 0.0], [2.9, 0.0], [10.0, 0.0], [13.1, 0.0]])
+    found = find_modes(state, torch.tensor([0.4, 0.1, 0.3, 0.2]).log(), PIXELS, 1.0)
+    assert found.member.tolist() == [0, 0, 1, 2]

@@ -143,3 +143,10 @@ def test_a_map_has_height_one_at_its_point_and_falls_as_a_gaussian() -> None:
     assert maps[3, 5] == 1
     assert float(maps[3, 8]) == pytest.approx(np.exp(-0.5 * (12 / 6) ** 2))
     assert float(maps[7, 5]) == pytest.approx(np.exp(-0.5 * (16 / 6) ** 2))
+
+
+def test_the_corners_lie_along_the_objects_axes() -> None:
+    found = box_keypoints(torch.tensor([[-1.0, 0.0, 2.0], [1.0, 3.0, 4.0], [0.0, 1.0, 3.0]]))
+    corners = [[x, y, z] for x in (-1, 1) for y in (0, 3) for z in (2, 4)]
+    assert found[:8].tolist() == corners
+    assert found[8].tolist() == [0, 1.5, 3]
