@@ -60,9 +60,8 @@ def walk(node: ast.AST, path: tuple[ast.AST, ...]) -> Iterator[tuple[ast.AST, tu
         if field in ("annotation", "returns", "decorator_list", "type_params", "bases", "msg"):
             continue
         for child in value if isinstance(value, list) else [value]:
-            plain = isinstance(child, ast.AST)
-            guard = isinstance(child, ast.keyword) and child.arg == "strict"
-            if plain and not guard and not isinstance(child, ast.Raise | ast.JoinedStr):
+            left = isinstance(child, ast.Raise | ast.JoinedStr) or _is_for_speed(child)
+            if isinstance(child, ast.AST) and not left and not _is_unseen(child):
                 yield from walk(child, (*path, node))
 
 
@@ -101,13 +100,36 @@ def vary(node: ast.AST, path: tuple[ast.AST, ...]) -> Iterator[ast.AST]:
             yield ast.Pass()
     if isinstance(node, ast.Call):
         for at, keyword in enumerate(node.keywords):
-            if keyword.arg not in (None, "strict"):
+            if keyword.arg is not None and not _is_unseen(keyword):
                 yield with_change(node, lambda new, at=at: new.keywords.pop(at))
             if keyword.arg == "dim" and (other := _other_dim(keyword.value)) is not None:
                 yield with_change(node, lambda new, at=at, o=other: _set(new.keywords[at], o))
             if keyword.arg in ("min", "max"):
                 other = _OPPOSITE[keyword.arg]
                 yield with_change(node, lambda new, at=at, o=other: _name(new.keywords[at], o))
+
+
+def _is_unseen(node: object) -> bool:
+    """Tell whether a keyword is one that no test on a CPU could notice, or a text for readers."""
+    if not isinstance(node, ast.keyword):
+        return False
+    text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    words = text and " " in node.value.value  # type: ignore[attr-defined]
+    return words or node.arg in ("strict", "device", "repr")
+
+
+def _is_for_speed(node: object) -> bool:
+    """Tell whether a node decides how much is held at once: `chunk`, and `max(1, chunk // n)`."""
+    match node:
+        case ast.Assign(targets=[ast.Name(id=name)]) | ast.AnnAssign(target=ast.Name(id=name)):
+            return name.lower().endswith("chunk")
+        case ast.Call(func=ast.Name(id="max"), args=[ast.Constant(value=1), ast.BinOp() as size]):
+            names = [n.id for n in ast.walk(size) if isinstance(n, ast.Name)]
+            names += [n.attr for n in ast.walk(size) if isinstance(n, ast.Attribute)]
+            return any(name.lower().endswith("chunk") for name in names)
+        case ast.BinOp(op=ast.LShift(), left=ast.Constant(value=1), right=ast.Constant()):
+            return True
+    return False
 
 
 def _is_number(path: tuple[ast.AST, ...]) -> bool:

@@ -11,7 +11,6 @@ the rows of docs/results/runs.csv are written, and the tables of docs/results/co
 
 import argparse
 import json
-import re
 import shlex
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from marked import format_row, put_table
 
 from posefilter.metrics.image_errors import FILE, ImageError, read_errors
 from posefilter.metrics.scores import auc, recall
@@ -42,6 +42,7 @@ SMALL = (
 DISTRACTORS = (0, 8, 16)
 VISIBLE = ((0.3, 0.5), (0.5, 0.8), (0.8, 1.01))
 RESAMPLED = 2000  # bootstrap samples of the scenes
+Table = tuple[list[str], list[str]]  # headings, and lines
 
 
 class Tested(NamedTuple):
@@ -129,24 +130,18 @@ def bootstrap(rows: Sequence[ImageError], measure: Callable[[Sequence[ImageError
     return f"{measure(rows):.1f} [{low:.0f}, {high:.0f}]"
 
 
-def make_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [list(head), ["---"] * len(head), *[list(row) for row in rows]]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def tabulate(
     tests: Sequence[Tested],
     columns: Sequence[int],
     measure: Callable[[Sequence[ImageError]], float],
-) -> str:
+) -> Table:
     """Return a row a method and a column a setting; a dash where there is no test."""
     found = {(test.model, test.at): bootstrap(test.rows, measure) for test in tests}
-    rows = [[f"`{m}`", *[found.get((m, at), "–") for at in columns]] for m in MODELS]
-    return make_table(["", *[f"{at:,}" for at in columns]], rows)
+    rows = [format_row([f"`{m}`", *[found.get((m, at), "–") for at in columns]]) for m in MODELS]
+    return ["", *[f"{at:,}" for at in columns]], rows
 
 
-def tabulate_visibility(tests: Sequence[Tested]) -> str:
+def tabulate_visibility(tests: Sequence[Tested]) -> Table:
     """Return a row a method trained on the most images, and a column a range of visibility."""
     rows, counts = [], [0] * len(VISIBLE)
     for model in MODELS:
@@ -158,23 +153,12 @@ def tabulate_visibility(tests: Sequence[Tested]) -> str:
                 ]
                 cells = [bootstrap(part, measure_auc) if part else "–" for part in parts]
                 counts = [len(part) for part in parts]
-        rows.append([f"`{model}`", *cells])
+        rows.append(format_row([f"`{model}`", *cells]))
     head = [
         f"{low:g} to {min(high, 1):g} ({count} images)"
         for (low, high), count in zip(VISIBLE, counts, strict=True)
     ]
-    return make_table(["", *head], rows)
-
-
-def fill(page: str, tables: dict[str, str]) -> str:
-    """Return a page with each table between its marks made anew."""
-    for name, table in tables.items():
-        mark = f"<!-- comparisons {name} -->"
-        pattern = re.compile(re.escape(mark) + r"\n.*?<!-- end -->", re.DOTALL)
-        if not pattern.search(page):
-            raise ValueError(f"the page has no {mark}")
-        page = pattern.sub(lambda _, m=mark, t=table: f"{m}\n\n{t}\n\n<!-- end -->", page)
-    return page
+    return ["", *head], rows
 
 
 def write_tables() -> None:
@@ -187,7 +171,10 @@ def write_tables() -> None:
         "visibility": tabulate_visibility(curve),
         "distractors": tabulate(clutter, DISTRACTORS, measure_auc),
     }
-    PAGE.write_text(fill(PAGE.read_text(), tables))
+    page = PAGE.read_text()
+    for title, (head, rows) in tables.items():
+        page = put_table(page, title, head, rows)
+    PAGE.write_text(page)
 
 
 def main() -> int:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
+from marked import put_table
 
 import posefilter
 from posefilter.cli.checkpoints import build_method, recipe
@@ -148,23 +149,13 @@ def choose_values(name: str, key: str, most: int) -> tuple[int, ...]:
     return tuple(value for value in SWEEPS[key] if value <= limit)
 
 
-def make_table(key: str, rows: Sequence[str]) -> str:
-    """Return the table of a setting."""
+def make_head(key: str) -> list[str]:
+    """Return the headings of the table of a setting."""
     head = ["method", *(f"{value:,}" for value in SWEEPS[key]), "last / first", "exponent"]
     head += ["of the last two"]
     if key == "width":
         head += [f"encoder at {SWEEPS[key][0]}", f"at {SWEEPS[key][-1]}", "its exponent"]
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *rows])
-
-
-def write_table(page: Path, key: str, table: str) -> None:
-    """Replace a table between its marks."""
-    text = page.read_text()
-    begin, end = f"<!-- table: {key} -->\n", "<!-- end -->"
-    before, _, rest = text.partition(begin)
-    _, _, after = rest.partition(end)
-    page.write_text(f"{before}{begin}{table}\n{end}{after}")
+    return head
 
 
 def main() -> None:
@@ -187,7 +178,7 @@ def main() -> None:
             values = choose_values(name, key, typed.most)
             rows.append(describe(name, key, values, sweep(method, key, values)))
             print(key, rows[-1], flush=True)
-        write_table(PAGE, key, make_table(key, rows))
+        PAGE.write_text(put_table(PAGE.read_text(), key, make_head(key), rows))
 
 
 if __name__ == "__main__":

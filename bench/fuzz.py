@@ -1,19 +1,23 @@
 """Type command lines that make no sense, and see that each ends in one line.
 
     python bench/fuzz.py [COUNT] [--seed SEED] [--command NAME] [--list]
+        [--first NUMBER] [--minutes MINUTES]
 
 Each line is one that works, with one or two settings changed: to values that are no numbers, out
 of range, of another kind, or not in Hydra's grammar; to keys, choices, files and folders that there
 are not. It runs in a process of its own, forked from this one; trainings are cut to four steps. A
 line may be accepted, or be refused in one line with a status that is not 0. Prints the counts; the
-exit status is 1 where a line ended otherwise.
+exit status is 1 where a line ended otherwise. Line n of a seed is always the same: a run that was
+stopped, by --minutes say, goes on with `--first` the number that it tells.
 """
 
 import argparse
+import math
 import random
 import resource
 import sys
 import tempfile
+import time
 from collections import Counter
 from contextlib import chdir
 from pathlib import Path
@@ -68,8 +72,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--command")
     parser.add_argument("--list", action="store_true", help="print each line")
+    parser.add_argument("--first", type=int, default=0, help="line to begin with")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which it stops")
     given = parser.parse_args(arguments)
     print(f"{given.count} command lines, seed {given.seed}")
+    began = time.monotonic()
     prepare()
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -85,7 +92,10 @@ def main(arguments: list[str] | None = None) -> int:
                 if name != "onboard"  # which would take minutes
             }
         )
-        for number in range(given.count):
+        for number in range(given.first, given.first + given.count):
+            if time.monotonic() - began > 60 * given.minutes:
+                print(f"stopped before line {number}")
+                break
             rng = random.Random(f"{given.seed} {number}")
             command = commands[number % len(commands)]
             own = [word.replace("NEW", f"new{number}") for word in lines[command]]

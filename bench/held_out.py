@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from marked import format_row, put_table, read_rows
 
 import posefilter
 from posefilter.cli.machine import keep_freed_memory
@@ -35,7 +36,6 @@ from posefilter.metrics.scores import auc
 
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "photographs.md"
-MARK, END = "<!-- table: {} -->", "<!-- end -->"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
 LEAST = 0.3  # visible share
 HEAD = ("object", "weights", "images", "scenes", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
@@ -137,7 +137,7 @@ def make_line(row: dict[str, Any]) -> str:
     shares = [f"{100 * row[name]:.0f}" for name in ("add_recall", "add_s_recall")]
     first = [row["object"], f"`{row['weights']}`", str(row["images"]), str(row["scenes"])]
     cells = [*first, *areas, *shares, f"{row['median_mm']:.1f}"]
-    return f"| {' | '.join(cells)} |"
+    return format_row(cells)
 
 
 def make_part_line(row: dict[str, Any]) -> str:
@@ -146,19 +146,15 @@ def make_part_line(row: dict[str, Any]) -> str:
     for kind in KINDS:
         count, *areas = row["kinds"][kind]
         cells += [str(count), *("–" if area is None else f"{area:.1f}" for area in areas)]
-    return f"| {' | '.join(cells)} |"
+    return format_row(cells)
 
 
 def _put(text: str, title: str, heads: Sequence[str], lines: Sequence[str]) -> str:
     """Put rows into a table: those of the same first cells are replaced, others stay."""
     keys = 3 if "scenes of" in heads else 2
-    before, rest = text.split(MARK.format(title), 1)
-    old, after = rest.split(END, 1)
-    rows = {tuple(line.split(" | ")[:keys]): line for line in old.splitlines()[3:]}
-    rows |= {tuple(line.split(" | ")[:keys]): line for line in lines}
-    head = [f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads))]
-    table = [*head, *(rows[key] for key in sorted(rows))]
-    return before + "\n".join([MARK.format(title), *table, END]) + after
+    all_lines = [*read_rows(text, title), *lines]
+    rows = {tuple(line.split(" | ")[:keys]): line for line in all_lines}
+    return put_table(text, title, heads, (rows[key] for key in sorted(rows)))
 
 
 def write_tables(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:

@@ -1,6 +1,6 @@
 """Kill trainings at random times, go on with them, and compare them with trainings that were not.
 
-    python bench/kills.py [COUNT] [--seed SEED] [--models A,B] [--workers 0,2]
+    python bench/kills.py [COUNT] [--seed SEED] [--models A,B] [--workers 0,2] [--minutes MINUTES]
 
 Each training is a process of its own, forked from this one, and is killed by SIGKILL at a random
 time of its length; it writes a checkpoint after every batch, so that many kills fall into the
@@ -12,6 +12,7 @@ was not.
 
 import argparse
 import json
+import math
 import os
 import random
 import signal
@@ -52,18 +53,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("--workers", default="0,2")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="after which it stops")
     given = parser.parse_args(arguments)
-    print(f"{given.count} kills, seed {given.seed}")
+    print(f"at most {given.count} kills, seed {given.seed}", flush=True)
     prepare()
     kinds = [(m, w) for w in given.workers.split(",") for m in given.models.split(",")]
     with tempfile.TemporaryDirectory() as folder:
-        counts = kill_many(Path(folder), kinds[: given.count], given.count, given.seed)
+        counts = kill_many(
+            Path(folder), kinds[: given.count], given.count, given.seed, given.minutes
+        )
+    print(f"{counts.total()} kills")
     for what, count in sorted(counts.items()):
         print(f"{count:5d}  {what}")
     return 1 if any(what.startswith("NOT") for what in counts) else 0
 
 
-def kill_many(folder: Path, kinds: list[tuple[str, str]], count: int, seed: int) -> Counter[str]:
+def kill_many(
+    folder: Path,
+    kinds: list[tuple[str, str]],
+    count: int,
+    seed: int,
+    minutes: float = math.inf,
+) -> Counter[str]:
     """Kill trainings of each kind in turn.
 
     Args:
@@ -71,16 +82,20 @@ def kill_many(folder: Path, kinds: list[tuple[str, str]], count: int, seed: int)
         kinds: Methods, each with a number of loader processes.
         count: How many kills.
         seed: Decides when.
+        minutes: After which no further training is begun.
 
     Returns:
         How many ended how.
     """
+    began = time.monotonic()
     frames = ["frames=24", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=4"]
     data = [*frames, "object=carton", "workers=1", "console=json", f"out={folder / 'data'}"]
     assert run("generate", data, folder / "log").status == 0
     wholes: dict[tuple[str, str], Whole] = {}
     counts: Counter[str] = Counter()
     for number in range(count):
+        if time.monotonic() - began > 60 * minutes:
+            break
         kind = kinds[number % len(kinds)]
         settings = [*_SMALL, f"data.root={folder / 'data'}", f"model={kind[0]}"]
         settings.append(f"data.workers={kind[1]}")

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -34,7 +35,9 @@ def parse_settings_by_libyaml() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def load_script() -> Callable[[str], ModuleType]:
-    """Return a function that imports a script outside the package, by its path in the project."""
+    """Return a function that imports a script outside the package, by its path in the project;
+    what lies beside it can be imported, as when it is run.
+    """
 
     def load(path: str) -> ModuleType:
         file = Path(__file__).parents[1] / path
@@ -42,7 +45,11 @@ def load_script() -> Callable[[str], ModuleType]:
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
+        sys.path.insert(0, str(file.parent))
+        try:
+            spec.loader.exec_module(module)
+        finally:
+            sys.path.remove(str(file.parent))
         return module
 
     return load

@@ -23,6 +23,7 @@ class Range(NamedTuple):
     above: bool = False  # the least value itself is too small
     share: bool = False  # also a share of all: a number with a point, in [0, 1]
     words: tuple[Any, ...] = ()  # other values that have a meaning
+    many: bool = False  # a list of such numbers, too
 
     def holds(self, value: Any) -> bool:
         """Tell whether a value lies within; NaN does not."""
@@ -84,24 +85,26 @@ RANGES: dict[str, Range] = {
     "uniform_roll_probability": SHARE,
     "probability": SHARE,
     "augment.steps.strength": Range(0, 10),
-    "zoom": POSITIVE,
-    "augment.steps.size": Range(0, MOST_SIDE, above=True),  # pixels of a crop, or a share
+    "zoom": Range(0, 1e6, above=True, many=True),
+    "augment.steps.size": Range(
+        0, MOST_SIDE, above=True, many=True
+    ),  # pixels of a crop, or a share
     "hue_deg": Range(0, 180),
     "mixing": SHARE,
     "tint": SHARE,
     "steps.gamma": Range(0, 10),
-    "gain": Range(0, 10),
+    "gain": Range(0, 10, many=True),
     "length": SHARE,
-    "quality": _whole(1, 100),
+    "quality": _whole(1, 100, many=True),
     # generate, and data.generate
     "generate.frames": _whole(1, 10_000_000),
     "generate.seed": LONG_SEED,
     "generate.workers": _whole(1, 256),
-    "generate.size": _whole(32, MOST_SIDE),
-    "generate.camera": Range(-1e6, 1e6, words=("ycb_video", "fat")),
+    "generate.size": _whole(32, MOST_SIDE, many=True),
+    "generate.camera": Range(-1e6, 1e6, words=("ycb_video", "fat"), many=True),
     "generate.occlusion": Range(0, 0.999_999),
     "generate.occluded_share": SHARE,
-    "generate.distractors": _whole(0, 1000),
+    "generate.distractors": _whole(0, 1000, many=True),
     "generate.tabletop_share": SHARE,
     "generate.absent_share": SHARE,
     "generate.instances": _whole(1, 100),
@@ -132,8 +135,8 @@ RANGES: dict[str, Range] = {
     "onboard.test_frames": COUNT,
     "onboard.workers": _whole(1, 256),
     # tracker
-    "motion.shift_mm": Range(0, 10_000),
-    "motion.turn_deg": Range(0, 180),
+    "motion.shift_mm": Range(0, 10_000, many=True),  # or by axis
+    "motion.turn_deg": Range(0, 180, many=True),
     "motion.momentum": SHARE,
     **{
         f"tracker.{effort}.{name}": allowed
@@ -179,7 +182,7 @@ RANGES: dict[str, Range] = {
     "trainer.limit_predict_batches": BATCHES,
     "trainer.overfit_batches": BATCHES,
     "trainer.num_nodes": COUNT,
-    "trainer.devices": _whole(1, 1024, words=("auto", -1)),
+    "trainer.devices": _whole(1, 1024, words=("auto", -1), many=True),
     "every_n_validations": COUNT,
     "save_top_k": _whole(-1, 1000),
     "last.minutes": Range(0, 1e6),
@@ -189,14 +192,14 @@ RANGES: dict[str, Range] = {
     "weight_decay": Range(0, 10),
     "momentum": SHARE,
     "optimizer.eps": Range(0, 1, above=True),
-    "betas": Range(0, 0.999_999_999),
+    "betas": Range(0, 0.999_999_999, many=True),
     "scheduler.warm_up": _whole(0, 10**12),
     "scheduler.floor": SHARE,
     # filter
     "particles": _whole(1, 100_000),
     "first_particles": _whole(1, 100_000),
     "filter.steps": _whole(1, 10_000),
-    "depth_offset": Range(-10, 10),
+    "depth_offset": Range(-10, 10, many=True),
     "uniform_fraction": SHARE,
     "object_fraction": SHARE,
     "sigma_px": PIXELS,
@@ -244,7 +247,7 @@ RANGES: dict[str, Range] = {
     "truncate": COUNT,
     "relevance_weight": WEIGHT,
     "width": WIDTH,
-    "widths": WIDTH,
+    "widths": _whole(1, 65_536, many=True),
     "hidden": _whole(0, 65_536),
     "latent_width": _whole(0, 65_536),
     "layers": _whole(1, 1000),
@@ -268,7 +271,7 @@ RANGES: dict[str, Range] = {
     "candidate_sampler.particles": _whole(0, 100_000),
     "candidate_sampler.levels": _whole(2, 1000),
     "candidate_sampler.persistent_sigma_probability": SHARE,
-    "candidate_sampler.sigma": METERS,
+    "candidate_sampler.sigma": Range(0, 100, above=True, many=True),
     "box_head.quantile": SHARE,
     "model.cells": _whole(3, 1_000_000),
     "model.inlier": POSITIVE,
@@ -318,22 +321,23 @@ def check_ranges(settings: Mapping[str, Any], command: str) -> None:
         UserError: A setting is outside of its range, or no number where one is due; or any number
             is not finite.
     """
-    for key, value, ours in list_values(settings):
+    for key, value, ours in _list_nodes(settings):
         if value is None or (isinstance(value, str) and "${" in value) or value == "???":
             continue
         place = f"{command}.{key}"
         allowed = find_range(place) if ours else None
-        if allowed is not None and not allowed.holds(value):
-            shown = (place if command == "data" else key).removesuffix("]")
-            shown = re.sub(r"\[\d+$", "", shown)  # of a list that is a setting's value
+        shown = place if command == "data" else key
+        if isinstance(value, Mapping):
+            if allowed is not None:
+                raise UserError(f"{shown}: must be {allowed}, and is a mapping")
+        elif isinstance(value, list | tuple):
+            if allowed is not None and (not allowed.many or key.endswith("]")):
+                raise UserError(f"{shown}={list(value)}: must be one number, and is a list")
+        elif allowed is not None and not allowed.holds(value):
+            shown = re.sub(r"\[\d+\]$", "", shown)  # of a list that is a setting's value
             raise UserError(f"{shown}={value}: must be {allowed}")
-        if isinstance(value, float) and not math.isfinite(value):
+        elif isinstance(value, float) and not math.isfinite(value):
             raise UserError(f"{key}={value}: must be a finite number")
-
-    for key, ours in list_mappings(settings):
-        allowed = find_range(f"{command}.{key}") if ours else None
-        if allowed is not None:
-            raise UserError(f"{key}: must be {allowed}, and is a mapping")
 
 
 def find_range(place: str) -> Range | None:
@@ -347,28 +351,23 @@ def find_range(place: str) -> Range | None:
     return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
-def list_values(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, Any, bool]]:
+def list_values(settings: Any) -> Iterator[tuple[str, Any, bool]]:
     """Yield (key, value, ours) of each value that is no mapping or list; `ours` is False below a
     class of a plug-in, whose settings may mean anything.
     """
+    for key, node, ours in _list_nodes(settings):
+        if not isinstance(node, Mapping | list | tuple):
+            yield key, node, ours
+
+
+def _list_nodes(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, Any, bool]]:
+    if key:
+        yield key, node, ours
     if isinstance(node, Mapping):
         target = node.get("_target_")
         ours = ours if target is None else str(target).startswith(_OURS)
         for name, value in node.items():
-            yield from list_values(value, f"{key}.{name}" if key else str(name), ours)
+            yield from _list_nodes(value, f"{key}.{name}" if key else str(name), ours)
     elif isinstance(node, list | tuple):
         for i, value in enumerate(node):
-            yield from list_values(value, f"{key}[{i}]", ours)
-    else:
-        yield key, node, ours
-
-
-def list_mappings(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, bool]]:
-    """Yield (key, ours) of each setting that is a mapping; `ours` as in `list_values`."""
-    if isinstance(node, Mapping):
-        if key:
-            yield key, ours
-        target = node.get("_target_")
-        ours = ours if target is None else str(target).startswith(_OURS)
-        for name, value in node.items():
-            yield from list_mappings(value, f"{key}.{name}" if key else str(name), ours)
+            yield from _list_nodes(value, f"{key}[{i}]", ours)

@@ -47,6 +47,8 @@ def find_weights(weights: str | Path | None) -> Path:
     url = os.environ.get(URL, "")
     if url and is_plain_name(name) and not path.suffix:
         return fetch_weights(name, url)
+    if path.suffix == ".ckpt" and path.stem in shipped:  # as in a clone, typed elsewhere
+        raise UserError(f"checkpoint={weights}: no such file; did you mean checkpoint={path.stem}?")
     known = ", ".join(sorted(shipped)) or "none"
     raise UserError(f"checkpoint={weights}: no such file, and no weights of that name ({known})")
 

@@ -45,18 +45,11 @@ def test_an_interval_is_over_scenes_and_not_over_images(bench: ModuleType) -> No
 
 def test_tables_have_a_dash_where_nothing_was_run(bench: ModuleType) -> None:
     tests = [bench.Tested("keypoints", 1000, rows([0.0] * 4) + rows([500.0] * 4, 1, 0.4))]
-    table = bench.tabulate(tests[:1], [50, 1000], bench.measure_recall)
-    assert "| `keypoints` | – | 50.0 [" in table
+    head, table = bench.tabulate(tests[:1], [50, 1000], bench.measure_recall)
+    assert head == ["", "50", "1,000"]
+    assert any(line.startswith("| `keypoints` | – | 50.0 [") for line in table)
     assert "| `pose_pf` | – | – |" in table
-    seen = bench.tabulate_visibility(tests)
+    head, seen = bench.tabulate_visibility(tests)
     assert "| `keypoints` | 0.0 [0, 0] | – | 100.0 [100, 100] |" in seen
-    assert "0.3 to 0.5 (4 images) | 0.5 to 0.8 (0 images) | 0.8 to 1 (4 images)" in seen
-
-
-def test_a_page_is_filled_between_its_marks_again_and_again(bench: ModuleType) -> None:
-    page = "a\n<!-- comparisons x -->\n<!-- end -->\nb\n"
-    once = bench.fill(page, {"x": "| 1 |"})
-    assert once == "a\n<!-- comparisons x -->\n\n| 1 |\n\n<!-- end -->\nb\n"
-    assert bench.fill(once, {"x": "| 1 |"}) == once
-    with pytest.raises(ValueError, match="comparisons y"):
-        bench.fill(page, {"y": ""})
+    images = ["0.3 to 0.5 (4 images)", "0.5 to 0.8 (0 images)", "0.8 to 1 (4 images)"]
+    assert head == ["", *images]

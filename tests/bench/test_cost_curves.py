@@ -1,7 +1,6 @@
 """The cost bench: exponents of planted curves, and the encoder told apart from the filter."""
 
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -37,13 +36,8 @@ def test_what_is_measured_is_what_was_asked_for(cost: ModuleType) -> None:
     assert "encode" not in vars(method)
 
 
-def test_a_table_takes_the_place_of_the_one_before(cost: ModuleType, tmp_path: Path) -> None:
-    page = tmp_path / "cost.md"
-    page.write_text("a\n<!-- table: steps -->\nold\n<!-- end -->\nb\n")
-    table = cost.make_table("steps", ["| patch_pf | 1 |"])
-    cost.write_table(page, "steps", table)
-    cost.write_table(page, "steps", table)
-    text = page.read_text()
-    assert text.startswith("a\n<!-- table: steps -->\n| method | 1 | 3 |")
-    assert text.endswith("| patch_pf | 1 |\n<!-- end -->\nb\n")
-    assert text.count("patch_pf") == 1
+def test_headings_are_the_columns_of_a_row(cost: ModuleType) -> None:
+    for key, values in cost.SWEEPS.items():
+        took = [[cost.Cost(0.1, 0.05)] * 5 for _ in values]
+        line = cost.describe("toy", key, values, took)
+        assert line.count(" | ") + 1 == len(cost.make_head(key))

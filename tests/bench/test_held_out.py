@@ -46,8 +46,8 @@ def _row(name: str, weights: str, part: str, area: float) -> dict[str, object]:
 
 def test_rows_of_other_weights_stay_in_the_page(held_out: ModuleType, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    marks = [held_out.MARK.format(title) for title in ("held-out", "parts")]
-    page.write_text("".join(f"text\n\n{mark}\n{held_out.END}\n\n" for mark in marks))
+    marks = [f"<!-- table: {title} -->" for title in ("held-out", "parts")]
+    page.write_text("".join(f"text\n\n{mark}\n<!-- end -->\n\n" for mark in marks))
     held_out.write_tables(
         [_row("mug", "old", "test", 10.0), _row("bowl", "old", "test", 20.0)], page
     )

@@ -133,3 +133,21 @@ def test_what_no_program_could_notice_is_left_alone(mutants: ModuleType, tmp_pat
     )
     changed = {mutant.before for mutant in mutants.list_mutants(file)}
     assert changed == {"a is None", "print(list(zip(b, b, strict=True)), 1e-09)"}
+
+
+def test_what_no_test_on_a_cpu_could_notice_is_not_drawn(
+    mutants: ModuleType, tmp_path: Path
+) -> None:
+    file = tmp_path / "code.py"
+    file.write_text(
+        "_CHUNK = 1 << 20\n\n\n"
+        "def f(x, chunk=1 << 4):\n"
+        "    rows = max(1, chunk // len(x))\n"
+        "    return zeros(max(1, 3), device=x.device, meaning='in words', unit='mm')\n"
+    )
+    changes = {(mutant.before, mutant.after) for mutant in mutants.list_mutants(file)}
+    assert {before.split("(")[0] for before, _ in changes} == {"max", "zeros"}
+    without = [after for before, after in changes if before.startswith("zeros")]
+    rest = ", device=x.device, meaning='in words'"
+    assert sorted(without) == [f"ones(max(1, 3){rest}, unit='mm')", f"zeros(max(1, 3){rest})"]
+    assert ("max(1, 3)", "max(2, 3)") in changes

@@ -4,6 +4,7 @@ under.
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +16,7 @@ from posefilter.cli.command import compose_job
 from posefilter.data.frames import Sample
 
 HOME = Path(__file__).parents[2]
+sys.path.insert(0, str(HOME / "bench"))  # scripts import their neighbors
 
 
 def load(name: str) -> ModuleType:
@@ -27,12 +29,13 @@ def load(name: str) -> ModuleType:
 
 
 photographs, color_shift = load("photographs"), load("color_shift")
+photograph_runs = load("photograph_runs")
 
 
 def kinds() -> list[Any]:
     """Return one run of each kind: those that differ in more than object, steps and start."""
     found = {}
-    for run in photographs.plan():
+    for run in photograph_runs.plan():
         words = [word for word in run.words.split() if not word.startswith("warm_start=")]
         found.setdefault((run.model, *words), run)
     return list(found.values())
@@ -49,12 +52,12 @@ def test_every_kind_of_training_composes(run: Any, tmp_path: Path) -> None:
 
 def test_a_warm_start_comes_after_the_run_that_it_starts_from() -> None:
     done = []
-    for run in photographs.plan():
-        if photographs._best("drill_patch_camera") in run.words:
+    for run in photograph_runs.plan():
+        if photograph_runs._best("drill_patch_camera") in run.words:
             assert "drill_patch_camera" in done
-        if photographs.CRACKER in run.words:
-            assert (HOME / photographs.CRACKER).is_file()
-        assert run.object in photographs.TARGETS
+        if photograph_runs.CRACKER in run.words:
+            assert (HOME / photograph_runs.CRACKER).is_file()
+        assert run.object in photograph_runs.TARGETS
         assert run.name not in done
         done.append(run.name)
 
@@ -75,12 +78,12 @@ def metrics(auc: float, instances: int) -> dict[str, Any]:
 def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     tmp_path: Path,
 ) -> None:
-    run, gone = photographs.plan()[:2]
+    run, gone = photograph_runs.plan()[:2]
     page = tmp_path / "page.md"
-    marks = [photographs.MARK.format(title) for title, _, _ in photographs.TABLES]
+    marks = [f"<!-- table: {title} -->" for title, _, _ in photographs.TABLES]
     kept = f"| `{gone.name}` | a run that is no longer there |"
-    old = f"old\n| `{run.name}` | old |\n{kept}\n"
-    page.write_text("Above.\n" + "".join(f"{m}\n{old}{photographs.END}\nBelow.\n" for m in marks))
+    old = f"| run |\n| --- |\n| `{run.name}` | old |\n{kept}\n"
+    page.write_text("Above.\n" + "".join(f"{m}\n{old}<!-- end -->\nBelow.\n" for m in marks))
     values = {
         f"runs/{run.name}": metrics(99.0, 2),
         f"evals/{run.name}/renders": metrics(88.0, 60),

@@ -1,5 +1,6 @@
 """Which of a run's validations is tested."""
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -83,3 +84,20 @@ def test_a_run_whose_best_checkpoint_would_not_be_found_is_refused_before_it(
         check_kept([last], tmp_path)
     with pytest.raises(UserError, match=r"callbacks\.last\.dirpath"):
         check_kept([Last(str(tmp_path)), Best(**right)], tmp_path)
+
+
+def test_saving_says_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trainer = Trainer(
+        max_steps=1,
+        callbacks=[Last(str(tmp_path), minutes=0)],
+        logger=False,
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    with caplog.at_level(logging.INFO):
+        trainer.fit(Scored([]), DataLoader([torch.zeros(1)]))
+        assert (tmp_path / "last.ckpt").is_file()
+        assert "weights_only" not in caplog.text
+        trainer.save_checkpoint(tmp_path / "other.ckpt")  # what Lightning says by itself
+    assert "weights_only" in caplog.text

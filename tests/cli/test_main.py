@@ -38,6 +38,7 @@ REFUSED = {
     "report run=nowhere": "run=nowhere: no such folder",
     "export checkpoint=999_nothing": "no weights of that name (002_master_chef_can, "
     "003_cracker_box",
+    "export checkpoint=weights/025_mug.ckpt": "did you mean checkpoint=025_mug?",
     "fly": "fly: there is no such command; choose train, evaluate",
 }
 OWN = {**os.environ, "PYTHONPATH": str(HOME / "src")}  # wherever it is started

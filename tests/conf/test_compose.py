@@ -16,8 +16,9 @@ from tests.conf.conftest import compose_once
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices, list_choices
 from posefilter.cli.checkpoints import build_method, recipe
-from posefilter.cli.command import compose_config, compose_job, explain
+from posefilter.cli.command import compose_config, compose_job
 from posefilter.cli.comparing import leaves
+from posefilter.cli.explain import explain
 from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job

@@ -140,13 +140,41 @@ def test_a_number_is_neither_a_mapping_nor_a_list(
         check_settings(cfg, command)
 
 
-def test_a_number_of_one_command_is_no_list_either(composed: dict[str, DictConfig]) -> None:
-    cfg = composed["export"].copy()
+@pytest.mark.parametrize(
+    ("command", "key"),
+    [
+        ("export", "max_mb"),
+        ("train", "optimizer.lr"),
+        ("train", "data.min_visibility"),
+        ("train", "filter.particles"),
+        ("train", "model.likelihood.width"),
+    ],
+)
+@pytest.mark.parametrize("value", [[], [1], [0.5, 0.5], [[1]], [-1], [{"a": 1}]])
+def test_one_number_is_no_list(
+    command: str, key: str, value: Any, composed: dict[str, DictConfig]
+) -> None:
+    cfg = composed[command].copy()
     OmegaConf.set_readonly(cfg, False)
-    for value in ([1], [[1]]):
-        OmegaConf.update(cfg, "max_mb", value, merge=False)
-        with pytest.raises(UserError, match=r"^max_mb=.*must be one number, and is a list"):
-            check_settings(cfg, "export")
+    OmegaConf.update(cfg, key, value, merge=False)
+    with pytest.raises(UserError) as caught:
+        check_settings(cfg, command)
+    assert str(caught.value) == f"{key}={value}: must be one number, and is a list"
+
+
+def test_lists_are_of_the_settings_that_are_said_to_have_them() -> None:
+    numbers = [key for key in find_numbers() if ".split." not in key and ".hydra." not in key]
+    listed = {key.rpartition("[")[0] for key in numbers if key.endswith("]")}
+    refused = [key for key in listed if not getattr(find_range(key), "many", False)]
+    assert len(listed) > 15
+    assert refused == []
+    many = {"data": {"generate": {"size": [640, 480]}}, "optimizer": {"betas": [0.9, 0.99]}}
+    check_ranges(many, "train")
+    check_ranges({"tracker": {"motion": {"shift_mm": [5.0, 5.0, 9.0], "turn_deg": 2.0}}}, "track")
+    with pytest.raises(UserError, match=r"^optimizer\.betas=1\.5: must be a number"):
+        check_ranges({"optimizer": {"betas": [0.9, 1.5]}}, "train")
+    with pytest.raises(UserError, match=r"^data\.generate\.size\[0\]=\[640\]: must be one number"):
+        check_ranges({"data": {"generate": {"size": [[640], 480]}}}, "train")
 
 
 @pytest.mark.parametrize("command", ["train", "onboard", "predict"])

@@ -9,17 +9,11 @@ import pytest
 
 from posefilter.figures.symmetries import draw_symmetries
 from posefilter.meshes.builtin import catalog
-from posefilter.meshes.find_symmetries import (
-    ANY,
-    Turn,
-    describe_symmetries,
-    find_symmetries,
-    make_group,
-    select,
-)
+from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.symmetries import read_symmetries, rotation_about
+from posefilter.meshes.turns import ANY, Turn, describe_symmetries, make_group, select
 
 
 def folds(turns: list[Turn], texture: bool) -> list[int]:

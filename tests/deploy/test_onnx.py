@@ -3,6 +3,7 @@
 import ast
 import io
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -121,14 +122,18 @@ def test_an_estimate_is_that_of_torch(
     assert weights.sum() == pytest.approx(1)
 
 
-def test_a_filter_over_pixels_takes_the_same_steps(pixels: ModuleType, tmp_path: Path) -> None:
+def test_a_filter_over_pixels_takes_the_same_steps(
+    pixels: ModuleType, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     pytest.importorskip("onnxscript", reason="needs the extra export")
     method = make_pixel_method(
         *("filter/propagate=learned", "filter/resample=none", "filter/estimate=argmax"),
         *("filter.particles=12", "filter.steps=3", "data.image_width=96"),
     )
     rgb, depth, K = read_scene()
-    write_filter(method, tmp_path, depth.shape[1], depth.shape[0], "onnx")
+    with caplog.at_level(logging.INFO):
+        write_filter(method, tmp_path, depth.shape[1], depth.shape[0], "onnx")
+    assert caplog.messages == []
     images, _ = check_images(rgb, depth, K)
     batch = make_batch(images, 96, None)
     with pytest.MonkeyPatch.context() as patch, torch.no_grad():

@@ -1,5 +1,8 @@
 """The agreed pose against a truth that most particles know, each a little wrong."""
 
+import math
+
+import pytest
 import torch
 
 from posefilter.filters.agreement import Agreement
@@ -93,3 +96,48 @@ def test_particles_that_cannot_tell_two_sides_apart_agree_on_the_one_that_fits_a
     assert share_near > 0.05, "votes find the truth now and then"
     assert mass_near > share_near, "and count for more there"
     torch.testing.assert_close(belief.log_weights.logsumexp(1), torch.zeros(B), atol=1e-5, rtol=0)
+
+
+def test_points_that_are_not_known_do_not_count() -> None:
+    """Two thirds stand on no measured point, and are certain of another pose."""
+    g = torch.Generator().manual_seed(2)
+    N = 90
+    truth = make_pose(random_rotation(1, generator=g), torch.tensor([[0.1, 0.0, 0.9]]))
+    other = make_pose(random_rotation(1, generator=g), torch.tensor([[0.1, 0.1, 0.9]]))
+    thing = torch.rand(1, N, 3, generator=g) * 0.2 - 0.1
+    known = torch.arange(N)[None] % 3 == 0
+    poses = torch.where(known[..., None, None], truth[:, None], other[:, None])
+    point = (poses[..., :3, :3] @ thing[..., None])[..., 0] + poses[..., :3, 3]
+
+    class Some(Points):
+        def surface_points(
+            self, scene: None, state: torch.Tensor
+        ) -> tuple[torch.Tensor, torch.Tensor]:
+            return self.point, known
+
+    log_p = torch.where(known, -0.7, -0.01)
+    empty = torch.zeros(1, N, 0)
+    particles = Particles(
+        torch.zeros(1, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(1, N)
+    )
+    output = ParticleOutput(log_p, torch.zeros(1, N, 2), poses, empty)
+    belief = Agreement()(particles, output, None, Some(point), g)  # type: ignore[arg-type]
+    assert float(angle_between(belief.best[:, :3, :3], truth[:, :3, :3])) < 1e-2
+    # all that is known agrees, and the highest likelihood is that of the others
+    assert float(belief.score) == pytest.approx(math.exp(-0.01), rel=1e-4)
+
+
+def test_as_many_fragments_are_considered_as_there_are() -> None:
+    log_share = torch.tensor([[[0.2, 0.5, 0.3]]]).log()
+    position = torch.arange(9.0).view(1, 1, 3, 3)
+    said = Fragments(log_share, position, torch.zeros(1, 3, 3), torch.tensor(0.1))
+    empty = torch.zeros(1, 1, 0)
+    output = ParticleOutput(
+        torch.zeros(1, 1), torch.zeros(1, 1, 2), torch.eye(4)[None, None], empty, said
+    )
+    for options, rows in ((1, [1]), (2, [1, 2]), (9, [1, 2, 0])):
+        share, found = Agreement(options=options).list_object_points(
+            output, torch.zeros(1, 1, 3), torch.zeros(3), 1.0
+        )
+        torch.testing.assert_close(share[0, 0], log_share[0, 0, rows].exp())
+        assert torch.equal(found[0, 0], position[0, 0, rows])

@@ -107,3 +107,27 @@ def test_after_the_last_level_particles_start_anew() -> None:
         poses, sigma = kept.recall(batch, sample_from_depth(batch, SPACE, 4, generator()), 0.1)
         torch.testing.assert_close(sigma, torch.tensor([expected]))
         kept.advance(batch, poses, torch.zeros(1, 4), sigma, used, SPACE, generator())
+
+
+def test_a_resumed_run_has_the_same_particles_and_levels() -> None:
+    batch = scenes(2)._replace(frame_id=torch.tensor([9, 4]))
+    kept, resumed = (PersistentParticles(particles=3, levels=4, sharpest=0.01) for _ in range(2))
+    assert kept.state() == {}
+    both = torch.tensor([True, True])
+    fresh = sample_from_depth(batch, SPACE, 3, generator())
+    for used in (both, torch.tensor([False, True])):
+        poses, sigma = kept.recall(batch, fresh, 0.08)
+        kept.advance(batch, poses, torch.zeros(2, 3), sigma, used, SPACE, generator(1))
+    state = kept.state()
+    assert state["frames"].tolist() == [4, 9]
+    assert state["levels"].tolist() == [2, 1]
+    resumed.restore(state)
+    for one, other in zip(
+        kept.recall(batch, fresh, 0.08), resumed.recall(batch, fresh, 0.08), strict=True
+    ):
+        assert torch.equal(one, other)
+    torch.testing.assert_close(
+        kept.recall(batch, fresh, 0.08)[1], torch.tensor([0.08 / 2, 0.08 / 4])
+    )
+    resumed.restore({})
+    assert resumed.state() == {}

@@ -102,3 +102,51 @@ def test_a_keypoint_that_is_not_there_has_an_empty_map() -> None:
     maps = draw_gaussians(torch.full((1, 2, 2), 50.0), there, 30, 40, STRIDE, 1.5)
     assert maps[0, 0].max() > 0.8
     assert maps[0, 1].max() == 0
+
+
+def test_a_pose_behind_the_camera_or_beyond_100_m_is_none() -> None:
+    """Pixels of a box before the camera, seen by one whose focal length is too long."""
+    _, pixels = planted(1)
+    assert solve_pnp(BOX.numpy(), pixels[0].numpy(), K.numpy()) is not None
+    long = K.numpy() * np.array([[200.0], [200.0], [1.0]])
+    long[:2, 2] = K.numpy()[:2, 2]
+    assert solve_pnp(BOX.numpy(), pixels[0].numpy(), long) is None  # 220 m away
+    half = K.numpy() * np.array([[60.0], [60.0], [1.0]])
+    half[:2, 2] = K.numpy()[:2, 2]
+    found = solve_pnp(BOX.numpy(), pixels[0].numpy(), half)
+    assert found is not None
+    assert 50 < found[2, 3] < 80
+
+
+def test_four_keypoints_make_a_pose_and_three_do_not() -> None:
+    pose, pixels = planted(1)
+    some = [0, 3, 5, 6]
+    found = solve_pnp(BOX[some].numpy(), pixels[0, some].numpy(), K.numpy())
+    assert found is not None
+    np.testing.assert_allclose(found, pose[0].numpy(), atol=5e-3)
+    assert solve_pnp(BOX[:3].numpy(), pixels[0, :3].numpy(), K.numpy()) is None
+
+
+def test_a_keypoint_at_the_cameras_plane_is_not_before_it() -> None:
+    poses = torch.eye(4)[None, None].repeat(1, 3, 1, 1)
+    poses[0, :, 2, 3] = torch.tensor([0.005, 0.011, 2.0])
+    where, ahead = project_keypoints(poses, torch.tensor([[0.1, 0.0, 0.0]]), K[None])
+    assert ahead[0, :, 0].tolist() == [False, True, True]
+    assert where[0, 2, 0].tolist() == pytest.approx([79.5 + 270 * 0.05, 59.5])
+
+
+def test_a_map_has_height_one_at_its_point_and_falls_as_a_gaussian() -> None:
+    """A sigma of 1.5 cells of 4 px is 6 px."""
+    middle = torch.tensor([[[5 * 4 + 1.5, 3 * 4 + 1.5]]])
+    maps = draw_gaussians(middle, torch.ones(1, 1, dtype=torch.bool), 8, 10, STRIDE, 1.5)[0, 0]
+    assert maps.shape == (8, 10)
+    assert maps[3, 5] == 1
+    assert float(maps[3, 8]) == pytest.approx(np.exp(-0.5 * (12 / 6) ** 2))
+    assert float(maps[7, 5]) == pytest.approx(np.exp(-0.5 * (16 / 6) ** 2))
+
+
+def test_the_corners_lie_along_the_objects_axes() -> None:
+    found = box_keypoints(torch.tensor([[-1.0, 0.0, 2.0], [1.0, 3.0, 4.0], [0.0, 1.0, 3.0]]))
+    corners = [[x, y, z] for x in (-1, 1) for y in (0, 3) for z in (2, 4)]
+    assert found[:8].tolist() == corners
+    assert found[8].tolist() == [0, 1.5, 3]

@@ -79,3 +79,28 @@ def test_an_image_without_any_weight_has_no_share_and_a_finite_pose() -> None:
     best, share = find_best(source, target, 0 * weights, count=4)
     assert bool(best.isfinite().all())
     assert share.tolist() == [0.0] * 5
+
+
+def test_three_inliers_are_enough_to_fit_again_and_two_are_not() -> None:
+    """Corners of a triangle 5 mm off: a fit to the three is exact, one to two is not tried."""
+    source = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.5, 0.5, 0.5]]])
+    target = source.clone()
+    target[0, 3] += 1.0
+    rough = torch.eye(4)[None, None].clone()
+    rough[..., 0, 3] = 0.005
+    weights = torch.ones(1, 4)
+    fitted = refit_to_inliers(rough, source, target, weights, TOLERANCE, 1)
+    torch.testing.assert_close(fitted[0, 0], torch.eye(4), atol=1e-5, rtol=0)
+    target[0, 2] += 1.0
+    assert torch.equal(refit_to_inliers(rough, source, target, weights, TOLERANCE, 1), rough)
+    assert torch.equal(refit_to_inliers(rough, source, source, weights, TOLERANCE, 0), rough)
+
+
+def test_what_agrees_is_nearer_than_the_tolerance_and_counts_by_its_weight() -> None:
+    source = torch.zeros(1, 3, 3)
+    target = torch.tensor([[[0.0, 0, 0], [0.006, 0.0, 0.007], [0.0, 0.008, 0.008]]])
+    inside = agreement(torch.eye(4)[None, None], source, target, TOLERANCE)
+    assert inside.tolist() == [[[True, True, False]]]
+    weights = torch.tensor([[1.0, 0.25, 0.25]])
+    assert weigh_inliers(inside, weights).item() == pytest.approx(1.25 / 2)
+    assert weigh_inliers(inside, weights, few=1.0).item() == pytest.approx(1.25 / 2.5)

@@ -213,6 +213,13 @@ def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
     assert state.grad.abs().sum() > 1e-3
 
 
+def test_the_ancestor_of_a_mixture_is_its_largest_part() -> None:
+    resampled = EnsembleTransform(0.02, 20)(cloud_of(2, 30), 30, SPACE, Generator())
+    assert resampled.shares is not None
+    assert torch.equal(resampled.shares.max(2).indices, resampled.ancestors)
+    assert float(resampled.shares.amax(2).mean()) > 0.3
+
+
 def test_transport_moves_particles_less_than_a_shuffle() -> None:
     particles = cloud_of(8, 100)
     moved = {}

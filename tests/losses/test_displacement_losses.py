@@ -114,3 +114,18 @@ def test_gradients(loss, batch, model, make_trace) -> None:
         return loss(make_trace(f64([[[12.1, 7.3], [6.2, 3.4]]]), displacement=m), batch, model)
 
     assert torch.autograd.gradcheck(value, (displacement.requires_grad_(),))
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 5])
+def test_chamfers_patch_has_as_many_pixels_as_it_says(size: int, batch, model, make_trace) -> None:
+    """Also of an even side, where one more pixel lies to the right and below than to the left."""
+    state = f64([[[12.3, 7.6], [6.2, 3.1]]])
+    got = Chamfer(size=size)(make_trace(state), batch, model).item()
+    mask = batch.mask[0, 0].nonzero().flip(-1).double()
+    side = range(-((size - 1) // 2), size // 2 + 1)
+    assert len(side) == size
+    want = 0.0
+    for place in state[0]:
+        squared = torch.cdist(place + f64([[i, j] for j in side for i in side]), mask) ** 2
+        want += squared.min(1).values.mean().item() + squared.min(0).values.mean().item()
+    assert got == pytest.approx(want / 2 / W**2)

@@ -74,3 +74,19 @@ def test_the_bins_of_the_reliability_diagram_hold_every_frame_once() -> None:
     assert found[0]["probability"] == pytest.approx(0.025)
     gap = sum(one["frames"] * abs(one["probability"] - one["right"]) for one in found) / 6
     assert gap == pytest.approx(float(calibration_error(probability, right)))
+
+
+def test_alarms_are_false_where_the_object_is_not() -> None:
+    """Of four frames with the object three are declared found; of three without, two."""
+    metric = Confidence()
+    there = torch.tensor([True] * 4 + [False] * 3)
+    verdict = torch.tensor([1.0, 1.0, 1.0, -1.0, 1.0, 1.0, 0.0])
+    right = there & (torch.arange(7) < 2)
+    probability = torch.tensor([0.9, 0.8, 0.7, 0.2, 0.6, 0.5, 0.1])
+    metric.update(probability, probability, there, right, verdict)
+    told = metric.compute()
+    assert (told["frames"], told["frames_without"], told["false_alarms"]) == (4, 3, 2)
+    assert (told["found"], told["absent"], told["wrong"]) == (0.75, 0.25, 0.5)
+    assert told["wrong_at_80"] == pytest.approx(1 / 3)  # three of four are kept
+    assert told["auroc_presence"] == pytest.approx(10 / 12)  # 0.2 is below 0.6 and 0.5
+    assert sum(one["frames"] for one in told["bins"]) == 7

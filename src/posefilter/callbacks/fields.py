@@ -27,7 +27,7 @@ from posefilter.geometry.pose import (
     transform,
 )
 from posefilter.geometry.rotation import exp_so3
-from posefilter.nets.coordinates import Cells, Coordinates, query, true_coordinates
+from posefilter.nets.coordinates import HasCoordinates, query, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, Points, sample_points
 from posefilter.protocols import ProposesPoses, Scene, ScoresPoses
@@ -49,20 +49,6 @@ class HasPointLikelihood(Protocol):
     """A method whose likelihood judges the points of images that it keeps as `scene.image`."""
 
     likelihood: ScoresPoints
-
-
-class ObjectCoordinates(Protocol):
-    """What a method keeps of an image whose object coordinates it predicts."""
-
-    @property
-    def coordinates(self) -> Coordinates:
-        """Return what is predicted, a cell."""
-        ...
-
-    @property
-    def cells(self) -> Cells:
-        """Return what was measured, a cell."""
-        ...
 
 
 def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
@@ -222,7 +208,7 @@ def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int
 
 def predict_proposals(
     method: ProposesPoses,
-    scene: ObjectCoordinates,
+    scene: HasCoordinates,
     batch: Batch,
     model: ObjectModel,
     drawn: int = 24,

@@ -133,7 +133,7 @@ class Last(Checkpoint):
 
     def _save(self, trainer: Trainer) -> None:
         new = self.path.with_name(f"new_{LAST}")
-        trainer.save_checkpoint(new)
+        trainer.save_checkpoint(new, weights_only=False)  # unset, Lightning logs that it is False
         if trainer.is_global_zero:
             if self._whole:
                 self.path.replace(self.path.with_name(BEFORE))

@@ -18,7 +18,7 @@ from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
-from posefilter.weights import find_weights
+from posefilter.weights import expand_weights, find_weights
 
 _SPARE_ELEMENTS, _SPARE_TENSORS = 1 << 24, 20_000  # that a method may make beside its weights
 
@@ -107,6 +107,14 @@ def read_checkpoint(path: str | Path | None) -> dict[str, Any]:
     if checkpoint.get("calibration") is not None:
         read_calibration(checkpoint["calibration"], said)
     return {**checkpoint, "recipe": check_recipe(checkpoint["recipe"], said)}
+
+
+def methods_of(weights: Any, wanted: dict[str, Any]) -> list[PoseEstimator]:
+    """Return the methods of all checkpoints that a setting stands for, see `expand_weights`, to
+    estimate with; `wanted` as in `method_of`.
+    """
+    found = expand_weights(weights)
+    return [method_of(read_checkpoint(one), wanted, lightning=False) for one in found]
 
 
 def method_of(

@@ -3,7 +3,6 @@
 import importlib
 import math
 import os
-import re
 import sys
 import traceback
 from collections.abc import Callable
@@ -15,10 +14,10 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.ablation_configs import register_ablations
 from posefilter.cli.arguments import (
@@ -31,13 +30,12 @@ from posefilter.cli.arguments import (
 )
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
+from posefilter.cli.explain import explain, first_line
 from posefilter.cli.fit import check_fit
 from posefilter.cli.folders import forget_failure, hold_folder, note_failure, remove_if_empty
-from posefilter.cli.instantiate import hint
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.preflight import check_files
-from posefilter.cli.renamed import rename_argument
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import with_resumed
 from posefilter.cli.trust import Scope, installed, trust
@@ -65,8 +63,6 @@ EXPECTED = (
     MemoryError,
 )
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
-# choices that packages of others bring
-_EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 _MULTIRUN = ("-m", "--multirun")
 _OWN_FOLDER = ("train", "evaluate", "predict", "check_data")  # others write to a folder of another
 
@@ -247,88 +243,3 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
         return compose_job(name, conf, loosen(bracketed(overrides), name), Path()).cfg
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error, name, conf, overrides)) from error
-
-
-def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:
-    """Return a mistake as one line that names the key and the nearest valid one."""
-    text = str(error)
-    if isinstance(error, OSError) and error.strerror:
-        place = "a file" if error.filename is None else str(error.filename)
-        return f"{place}: cannot be read or written ({error.strerror})"
-    if isinstance(error, MemoryError):
-        return "out of memory: fewer particles, smaller batches or images take less"
-    if (
-        isinstance(error, MissingConfigException)
-        and error.options is not None
-        and error.missing_cfg_file
-    ):
-        group, _, choice = error.missing_cfg_file.rpartition("/")
-        if choice in _EXTRA:
-            return f"{group}={choice}: its package is missing; pip install 'posefilter[sweep]'"
-        options = sorted(one for one in error.options if not one.startswith("_"))
-        return (
-            f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
-            f"are {', '.join(options)}"
-        )
-    if isinstance(error, ConfigCompositionException):
-        found = re.search(r"Could not override '([^']+)'", text)
-        if found:
-            key = found[1]
-            cfg = compose_without(key, name, conf, arguments)
-            section, _, last = key.rpartition(".")
-            target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
-            new = rename_argument(target, last)
-            if new is not None:
-                return f"{key}: is now {section}.{new}"
-            return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
-    if isinstance(error, MissingMandatoryValue):
-        return f"{error.full_key}: is missing; give {error.full_key}=..."
-    if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
-        return f"{error.full_key}: {first_line(error)}"
-    return first_line(error)
-
-
-def first_line(error: BaseException) -> str:
-    """Return an error's first line, or its kind where it says nothing."""
-    lines = str(error).splitlines()
-    return lines[0] if lines else type(error).__name__
-
-
-def near(wrong: str, known: list[str]) -> str:
-    """Return the nearest key of the same depth; else what the wrong key's section has."""
-    told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
-    section = wrong.rpartition(".")[0]
-    if told or section not in known:
-        return told or hint(wrong, known)
-    own = [key for key in known if key.rpartition(".")[0] == section]
-    return f"; {section} has {', '.join(own)}" if own else f"; {section} has no settings"
-
-
-def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> DictConfig:
-    """Compose a command's settings without the argument that sets a wrong key; without any where
-    others are wrong too.
-    """
-    good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
-    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
-        try:
-            return compose(name, good, return_hydra_config=True)
-        except HydraException:
-            return compose(name, return_hydra_config=True)
-
-
-def known_keys(cfg: DictConfig, wrong: str) -> list[str]:
-    """Return every key and group that would have been valid, nearest depth first."""
-    groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra/")]
-    keys: list[str] = []
-
-    def walk(node: Any, prefix: str) -> None:
-        for key, value in node.items():
-            keys.append(f"{prefix}{key}")
-            if isinstance(value, dict):
-                walk(value, f"{prefix}{key}.")
-
-    tree = OmegaConf.to_container(cfg, resolve=False)
-    assert isinstance(tree, dict)
-    walk({k: v for k, v in tree.items() if k != "hydra"}, "")
-    depth = wrong.count(".")
-    return sorted({*groups, *keys}, key=lambda k: (abs(k.count(".") - depth), k))

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, say
 from posefilter.cli.job import Job
@@ -16,7 +16,6 @@ from posefilter.result import Result
 from posefilter.ros.bags import BagFrame, BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections
 from posefilter.tracking.tracker import Tracker
-from posefilter.weights import expand_weights
 
 
 def convert_bag(job: Job) -> None:
@@ -32,14 +31,8 @@ def convert_bag(job: Job) -> None:
     topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
     with BagReader(Path(str(cfg.bag)), topics, float(cfg.tolerance)) as reader:
         settle(cfg.threads, cfg.seed)
-        wanted = changes(cfg)
-        estimator = Estimator(
-            [
-                method_of(read_checkpoint(one), wanted, lightning=False)
-                for one in expand_weights(cfg.checkpoint)
-            ],
-            costs=read_costs(cfg),
-        )
+        methods = methods_of(cfg.checkpoint, changes(cfg))
+        estimator = Estimator(methods, costs=read_costs(cfg))
         find = choose_finder(estimator, cfg.track, cfg.seed)
         images, found = 0, Counter(dict.fromkeys(estimator.objects, 0))
         with BagWriter(out, str(cfg.detections)) as writer:

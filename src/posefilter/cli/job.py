@@ -9,10 +9,8 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
-from posefilter.ranges import check_ranges, find_range
+from posefilter.ranges import check_ranges
 
-# settings of a command itself that are several numbers
-_LISTS = ("size", "camera", "distractors", "intrinsics")
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 # settings that a command cannot do without
 _NEEDED = {
@@ -106,16 +104,11 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     """
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
-    settings = {str(key): value for key, value in plain.items()}
-    check_ranges(settings, command)
+    check_ranges({str(key): value for key, value in plain.items()}, command)
     check_out(cfg)
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for name, value in settings.items():  # below, what is built checks the kind of its settings
-        number = find_range(f"{command}.{name}") is not None and name not in _LISTS
-        if number and isinstance(value, list):
-            raise UserError(f"{name}={value}: must be one number, and is a list")
     for key in ("seed", "threads"):
         check_ranges({key: cfg.get(key)}, command)  # where it is made of other settings
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, ListConfig
 
-from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.checkpoints import method_of, methods_of, read_checkpoint
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
@@ -107,12 +107,7 @@ def predict_several(job: Job) -> list[Result]:
     """
     cfg, folder = job.cfg, job.folder
     costs = read_costs(cfg)
-    checkpoints = expand_weights(cfg.checkpoint)
-    wanted = changes(cfg)
-    estimator = Estimator(
-        [method_of(read_checkpoint(one), wanted, lightning=False) for one in checkpoints],
-        costs=costs,
-    )
+    estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)), costs=costs)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
@@ -126,7 +121,7 @@ def predict_several(job: Job) -> list[Result]:
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
-    own = dict(zip(estimator.objects, checkpoints, strict=True))
+    own = dict(zip(estimator.objects, expand_weights(cfg.checkpoint), strict=True))
     answers = []
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, finite, say, show_table
 from posefilter.cli.job import Job
@@ -34,7 +34,6 @@ from posefilter.tracking.records import (
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
-from posefilter.weights import expand_weights
 
 POSES = "poses.csv"
 
@@ -46,13 +45,7 @@ def track(job: Job) -> None:
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
     settle(cfg.threads, cfg.seed)
     settings = make_settings(cfg.tracker)
-    wanted = changes(cfg)
-    estimator = Estimator(
-        [
-            method_of(read_checkpoint(one), wanted, lightning=False)
-            for one in expand_weights(cfg.checkpoint)
-        ]
-    )
+    estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     videos, native = open_videos(cfg, estimator.objects)
     store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
     shapes: dict[str, Shape] = {

@@ -169,7 +169,9 @@ def to_onnx(graph: Graph) -> bytes:
 @contextmanager
 def _quietly() -> Any:
     """Leave out what the exporters say of packages and interfaces that are not used here."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript")]
+    # onnx_ir, which onnxscript optimizes with, logs every constant that it merges
+    names = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
+    loggers = [logging.getLogger(name) for name in names]
     before = [one.level for one in loggers]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from posefilter.figures.canvas import AXES, PAPER, arrange_grid, draw_lines, draw_row
-from posefilter.meshes.find_symmetries import ANY, Turn
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.symmetries import rotation_about
+from posefilter.meshes.turns import ANY, Turn
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.surfaces import Instance, Lights
 

@@ -11,10 +11,9 @@ from posefilter.protocols import Method, Scene, Space
 from posefilter.types import Belief, ParticleOutput, Particles
 
 
-def select_particle(
-    particles: Particles, output: ParticleOutput, index: Tensor, score: Tensor
-) -> Belief:
-    """Return the belief whose estimate is one particle of each image.  index, score (B,)."""
+def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor) -> Belief:
+    """Return the belief of each image's particle of highest score.  scores (B, N)."""
+    score, index = scores.max(1)
     rows = torch.arange(len(index), device=index.device)
     return Belief(output.pose, particles.log_weights, output.pose[rows, index], score)
 
@@ -34,8 +33,7 @@ class Argmax:
         generator: Generator,
     ) -> Belief:
         """Return the belief."""
-        score, index = output.log_likelihood.max(1)
-        return select_particle(particles, output, index, score)
+        return select_particle(particles, output, output.log_likelihood)
 
 
 class Mean:
@@ -115,8 +113,7 @@ class DensestMode:
         mass = kernel_mass(
             particles.state.detach(), particles.log_weights.detach(), method.space, self.bandwidth
         )
-        score, index = mass.max(1)
-        return select_particle(particles, output, index, score)
+        return select_particle(particles, output, mass)
 
 
 class DensestPose:
@@ -145,5 +142,4 @@ class DensestPose:
         mass = kernel_mass(
             output.pose.detach(), particles.log_weights.detach(), self.space, self.bandwidth
         )
-        score, index = mass.max(1)
-        return select_particle(particles, output, index, score)
+        return select_particle(particles, output, mass)

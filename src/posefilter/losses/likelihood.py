@@ -50,10 +50,14 @@ class Bce:
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
+        log_p, y, entropy = self._compare(trace, batch, model)
+        return (self.weigh(log_p.detach(), y) * entropy).sum((0, 2))
+
+    def _compare(self, trace: Trace, batch: Batch, model: ObjectModel) -> tuple[Tensor, ...]:
+        """Return log-likelihoods, labels and their cross-entropy, each (S, B, N)."""
         log_p = stack_log_likelihoods(trace, self.steps)
         y = self.label(trace, batch, model)[-len(log_p) :]
-        entropy = -(y * log_p + (1 - y) * log1mexp(log_p))
-        return (self.weigh(log_p.detach(), y) * entropy).sum((0, 2))
+        return log_p, y, -(y * log_p + (1 - y) * log1mexp(log_p))
 
     def weigh(self, log_p: Tensor, y: Tensor) -> Tensor:
         """Return each particle's weight; weights of an image sum to 1.  (S, B, N) x 2 -> (S, B,
@@ -100,9 +104,7 @@ class Focal(Bce):
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        log_p = stack_log_likelihoods(trace, self.steps)
-        y = self.label(trace, batch, model)[-len(log_p) :]
-        entropy = -(y * log_p + (1 - y) * log1mexp(log_p))
+        log_p, y, entropy = self._compare(trace, batch, model)
         side = torch.where(y > 0, self.alpha, 1 - self.alpha)
         return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean(
             (0, 2)

@@ -24,9 +24,9 @@ from posefilter.meshes.mesh import (
     surface_colors,
     surface_points,
 )
-from posefilter.meshes.symmetries import rotation_about, symmetry_group
+from posefilter.meshes.symmetries import rotation_about
+from posefilter.meshes.turns import ANY, Turn, are_parallel
 
-ANY = 0  # the fold of a turn by any angle
 FOLDS = (2, 3, 4)
 # Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance,
 # and of the distance that a fiftieth of the samples exceed, which holes and handles raise.
@@ -36,33 +36,6 @@ MOST_COLOR = 0.18
 _SAMPLES, _DENSE = 3000, 20000
 _ANY_ANGLES = tuple(2 * np.pi * k * 0.381966 for k in (1, 2, 3))  # by the golden angle
 _COARSE = 0.03  # [diameters] a candidate that is farther off before its refinement is none
-_PARALLEL = np.cos(np.deg2rad(10.0))
-_MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
-
-
-class Turn(NamedTuple):
-    """A turn that was tried, and how well it fits.
-
-    Attributes:
-        axis: (3,) unit vector.
-        point: (3,) a point on the axis [m].
-        fold: 2, 3 or 4 for turns by that part of a circle, 0 for any.
-        distance: Mean distance of the turned surface to the surface, less that of two samplings
-            [m].
-        far: The same of the distance that a fiftieth of the samples exceed [m].
-        color: Color difference that a twentieth of the samples exceed, in [0, 1].
-        shape: Whether the shape is the same.
-        texture: Whether shape and texture are.
-    """
-
-    axis: np.ndarray
-    point: np.ndarray
-    fold: int
-    distance: float
-    far: float
-    color: float
-    shape: bool
-    texture: bool
 
 
 class _Surface(NamedTuple):
@@ -86,7 +59,7 @@ def find_symmetries(mesh: Mesh, seed: int = 0) -> list[Turn]:
         seed: Of the surface samples.
 
     Returns:
-        The turns, the best first; `select` takes a group's generators from them.
+        The turns, the best first; `turns.select` takes a group's generators from them.
     """
     surface = _sample(mesh, seed)
     center = surface.points.mean(0)  # every symmetry leaves the centroid as it is
@@ -99,82 +72,9 @@ def find_symmetries(mesh: Mesh, seed: int = 0) -> list[Turn]:
     found.sort(key=lambda turn: turn.distance)
     kept: list[Turn] = []
     for turn in found:
-        if not any(turn.fold == k.fold and _are_parallel(turn.axis, k.axis) for k in kept):
+        if not any(turn.fold == k.fold and are_parallel(turn.axis, k.axis) for k in kept):
             kept.append(turn)
     return [turn for turn in kept if not _is_implied(turn, kept)]
-
-
-def select(turns: Sequence[Turn], texture: bool = True) -> list[Turn]:
-    """Return the turns that generate a mesh's symmetries.
-
-    Args:
-        turns: What `find_symmetries` has found.
-        texture: Leave out those that change what one sees; False: all that keep the shape.
-
-    Returns:
-        Two continuous ones at most, since those of two axes make all turns; beside a continuous
-        one a half turn across it at most; else all discrete ones.
-    """
-    good = [turn for turn in turns if turn.texture or not texture]
-    continuous = [turn for turn in good if turn.fold == ANY][:2]
-    if not continuous:
-        return _drop_divisors(good)
-    across = [
-        turn
-        for turn in good
-        if turn.fold == 2 and all(abs(turn.axis @ c.axis) < 0.1 for c in continuous)
-    ]
-    return [*continuous, *(across[:1] if len(continuous) == 1 else [])]
-
-
-def make_group(turns: Sequence[Turn], size: float, steps: int = 36) -> np.ndarray:
-    """Return every product of turns.
-
-    Args:
-        turns: What `select` returns.
-        size: The object's diameter [m].
-        steps: Turns that a continuous symmetry is cut into.
-
-    Returns:
-        (S, 4, 4) object_from_object [m], the identity first.
-    """
-    continuous = [(turn.axis, turn.point) for turn in turns if turn.fold == ANY]
-    return symmetry_group(list_discrete(turns, size), continuous, steps)
-
-
-def list_discrete(turns: Sequence[Turn], size: float) -> list[np.ndarray]:
-    """Return every product of the discrete turns but the identity, (4, 4) each.
-
-    Where the products of turns about several axes do not close, as they do in a group, those of the
-    best turn's axis alone.
-    """
-    discrete = [turn for turn in turns if turn.fold != ANY]
-    generators = [rotation_about(t.axis, 2 * np.pi / t.fold, t.point) for t in discrete]
-    group = _close(generators, size)
-    if len(group) > _MOST_ELEMENTS:
-        group = _close(generators[:1], size)
-    return group[1:]
-
-
-def describe_symmetries(turns: Sequence[Turn], size: float, scale: float = 1.0) -> dict[str, Any]:
-    """Return symmetries in the BOP challenge's format.
-
-    Args:
-        turns: What `select` returns.
-        size: The object's diameter [m].
-        scale: Meters a unit of the file that the result is to stand beside.
-    """
-    discrete = [matrix.copy() for matrix in list_discrete(turns, size)]
-    for matrix in discrete:
-        matrix[:3, 3] /= scale
-    return {
-        "symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in discrete],
-        "symmetries_continuous": [
-            {"axis": turn.axis.tolist(), "offset": (turn.point / scale).tolist()}
-            for turn in turns
-            if turn.fold == ANY
-        ],
-    }
 
 
 def _sample(mesh: Mesh, seed: int) -> _Surface:
@@ -278,45 +178,9 @@ def _axis_of(transform: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np
     return (axis if axis @ towards >= 0 else -axis), point
 
 
-def _are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
-    return bool(abs(a @ b) > _PARALLEL)
-
-
 def _is_implied(turn: Turn, turns: Sequence[Turn]) -> bool:
     """Tell whether any turn about the same axis does, and as well, what a discrete one does."""
     return turn.fold != ANY and any(
-        one.fold == ANY and _are_parallel(one.axis, turn.axis) and (one.texture or not turn.texture)
+        one.fold == ANY and are_parallel(one.axis, turn.axis) and (one.texture or not turn.texture)
         for one in turns
     )
-
-
-def _drop_divisors(turns: Sequence[Turn]) -> list[Turn]:
-    """Leave out half turns about an axis that has quarter turns."""
-    return [
-        turn
-        for turn in turns
-        if not (
-            turn.fold == 2 and any(t.fold == 4 and _are_parallel(t.axis, turn.axis) for t in turns)
-        )
-    ]
-
-
-def _close(generators: Sequence[np.ndarray], size: float) -> list[np.ndarray]:
-    """Return the products of transforms, the identity first; more than `_MOST_ELEMENTS` of them
-    where they do not close.
-    """
-    group = [np.eye(4)]
-    for element in group:  # grows meanwhile
-        for generator in generators:
-            product = element @ generator
-            if all(_differ(product, one, size) for one in group):
-                group.append(product)
-        if len(group) > _MOST_ELEMENTS:
-            break
-    return group
-
-
-def _differ(a: np.ndarray, b: np.ndarray, size: float) -> bool:
-    """Tell whether two transforms differ by more than the errors of measured axes."""
-    turned = np.abs(a[:3, :3] - b[:3, :3]).max() > 0.2
-    return bool(turned or np.abs(a[:3, 3] - b[:3, 3]).max() > 0.1 * size)

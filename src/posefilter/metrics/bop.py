@@ -10,12 +10,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import rotation_of, transform, translation_of
 from posefilter.geometry.rotation import exp_so3, log_so3
+from posefilter.metrics.collect import Rows
 from posefilter.types import ObjectModel
 
 # shares of the diameter, and pixels in an image 640 wide, below which an error counts as correct
@@ -130,7 +130,7 @@ def average_recall(errors: Tensor, thresholds: Sequence[float], unit: Tensor) ->
     return float(100 * (errors[:, None] < limits).double().mean())
 
 
-class BopErrors(Metric):
+class BopErrors(Rows):
     """MSSD and MSPD of all instances; poses that are not finite have infinite error.
 
     Args:
@@ -138,16 +138,12 @@ class BopErrors(Metric):
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
-    full_state_update = False
-    rows: list[Tensor]
-
     def __init__(self, models: Sequence[ObjectModel], **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.models = list(models)
         self.symmetries = [densify(model.symmetries.double()) for model in models]
         # surface points alone would miss corners
         self.points = [torch.cat([model.hull, model.points]).double() for model in models]
-        self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(
         self,

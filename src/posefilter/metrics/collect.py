@@ -22,6 +22,17 @@ def concat_state(state: Any) -> Tensor:
     return dim_zero_cat(state) if len(state) else torch.zeros(0, dtype=torch.float64)
 
 
+class Rows(Metric):
+    """Base of metrics that keep a row of numbers an image."""
+
+    full_state_update = False
+    rows: list[Tensor]
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_state("rows", default=[], dist_reduce_fx="cat")
+
+
 class PoseErrors(Metric):
     """ADD and ADD-S of all instances; missed ones and poses that are not finite have infinite
     error.
@@ -124,7 +135,7 @@ class ParticlesOnObject(Average):
         self.collect(on_object(mask, pixels))
 
 
-class BeliefQuality(Metric):
+class BeliefQuality(Rows):
     """Uncertainty and calibration of beliefs.
 
     entropy: of the weights [nat]. effective_particles: 1 / sum w^2. spread_m, spread_rad: about the
@@ -138,8 +149,6 @@ class BeliefQuality(Metric):
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
-    full_state_update = False
-    rows: list[Tensor]
     names = (
         "entropy",
         "effective_particles",
@@ -154,7 +163,6 @@ class BeliefQuality(Metric):
         super().__init__(**kwargs)
         self.models = list(models)
         self.points = [subsample(model.points, points) for model in models]
-        self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(self, belief: Belief, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate beliefs.

@@ -4,9 +4,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
-from posefilter.metrics.collect import concat_state
+from posefilter.metrics.collect import Rows, concat_state
 from posefilter.metrics.diagnostics import auroc
 
 COVERAGE = 0.8  # share of the images that are kept where an error rate is given
@@ -69,7 +68,7 @@ def error_at_coverage(probability: Tensor, right: Tensor, coverage: float = COVE
     return (wrong[above].sum() + share * wrong[equal].sum()) / kept
 
 
-class Confidence(Metric):
+class Confidence(Rows):
     """The quality of calibrated probabilities, over frames with and without the object.
 
     auroc: of the probability, right against wrong poses, among frames with the object.
@@ -79,13 +78,6 @@ class Confidence(Metric):
     with the object that are declared so. false_alarms: number of frames without the object in which
     one is found. bins: the reliability diagram over all frames.
     """
-
-    full_state_update = False
-    rows: list[Tensor]
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(
         self, presence: Tensor, probability: Tensor, there: Tensor, right: Tensor, verdict: Tensor

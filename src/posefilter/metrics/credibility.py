@@ -5,10 +5,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
 from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
-from posefilter.metrics.collect import concat_state
+from posefilter.metrics.collect import Rows, concat_state
 from posefilter.types import Belief, ObjectModel
 
 LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
@@ -51,19 +50,12 @@ def score_truth(belief: Belief, truth: Tensor, model: ObjectModel) -> TruthScore
     return TruthScores(*(torch.stack(rows) if rows else torch.zeros(0, 3)).double().T)
 
 
-class Credibility(Metric):
+class Credibility(Rows):
     """The density of beliefs at the truth, and the coverage of credible sets, by visibility.
 
     log_density, log_density_p50: of the truth, mean and median [nat].  coverage_50, ...: percentage
     of the images whose credible set of that level holds the truth.  levels, all, quarters: curves.
     """
-
-    full_state_update = False
-    rows: list[Tensor]
-
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_state("rows", default=[], dist_reduce_fx="cat")
 
     def update(self, scores: TruthScores, visibility: Tensor) -> None:
         """Accumulate scores (B,) with the objects' visible shares (B,), NaN where unknown."""

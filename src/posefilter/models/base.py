@@ -61,7 +61,7 @@ class PoseEstimator(Module):
     _trainer: Any = None  # of the LightningModule
     # what makes probabilities of its evidence, and why there is none
     calibration: Calibration | None = None
-    calibration_note: str = "the checkpoint is not calibrated (calibrate.py does it)"
+    calibration_note: str = "the checkpoint is not calibrated (run calibrate)"
     costs = Costs()  # of errors, by which verdicts are chosen
     test_only_settings: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 

@@ -27,6 +27,8 @@ from posefilter.nets.fused import Tables, applies, missing_context, score
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
 
+SPREAD = 0.6  # of the pixels that a pose is scored by, in projected radii of the object
+
 
 class Pixels(NamedTuple):
     """Images, flattened for gathering."""
@@ -83,7 +85,7 @@ def sample_points(
     center: Tensor,
     radius: float,
     noise: Tensor,
-    spread: float = 0.6,
+    spread: float = SPREAD,
     anchor: Tensor | None = None,
 ) -> Points:
     """Gather the pixels of each pose, and map them into its object frame.

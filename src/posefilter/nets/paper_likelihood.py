@@ -10,7 +10,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.nets.layers import ResnetFC
-from posefilter.nets.likelihood import Pixels, Points, sample_points
+from posefilter.nets.likelihood import SPREAD, Pixels, Points, sample_points
 from posefilter.nets.linear import Linear
 
 
@@ -32,7 +32,7 @@ class PaperLikelihood(nn.Module):
     provides: ClassVar[Capabilities] = ("score_points", "score_samples")
 
     def __init__(
-        self, width: int = 128, blocks: int = 5, spread: float = 0.6, anchor: str = "center"
+        self, width: int = 128, blocks: int = 5, spread: float = SPREAD, anchor: str = "center"
     ) -> None:
         super().__init__()
         if anchor not in ("origin", "center"):

@@ -1,0 +1,101 @@
+"""From a mistake in a command line to one readable line."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from posefilter.cli.instantiate import hint
+from posefilter.cli.renamed import rename_argument
+
+# choices that packages of others bring
+_EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
+
+
+def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:
+    """Return a mistake as one line that names the key and the nearest valid one."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror:
+        place = "a file" if error.filename is None else str(error.filename)
+        return f"{place}: cannot be read or written ({error.strerror})"
+    if isinstance(error, MemoryError):
+        return "out of memory: fewer particles, smaller batches or images take less"
+    if (
+        isinstance(error, MissingConfigException)
+        and error.options is not None
+        and error.missing_cfg_file
+    ):
+        group, _, choice = error.missing_cfg_file.rpartition("/")
+        if choice in _EXTRA:
+            return f"{group}={choice}: its package is missing; pip install 'posefilter[sweep]'"
+        options = sorted(one for one in error.options if not one.startswith("_"))
+        return (
+            f"{group}={choice}: there is no such choice{hint(choice, options).rstrip('?')}; there "
+            f"are {', '.join(options)}"
+        )
+    if isinstance(error, ConfigCompositionException):
+        found = re.search(r"Could not override '([^']+)'", text)
+        if found:
+            key = found[1]
+            cfg = compose_without(key, name, conf, arguments)
+            section, _, last = key.rpartition(".")
+            target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
+            new = rename_argument(target, last)
+            if new is not None:
+                return f"{key}: is now {section}.{new}"
+            return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key}: is missing; give {error.full_key}=..."
+    if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
+        return f"{error.full_key}: {first_line(error)}"
+    return first_line(error)
+
+
+def first_line(error: BaseException) -> str:
+    """Return an error's first line, or its kind where it says nothing."""
+    lines = str(error).splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def near(wrong: str, known: list[str]) -> str:
+    """Return the nearest key of the same depth; else what the wrong key's section has."""
+    told = hint(wrong, [key for key in known if key.count(".") == wrong.count(".")])
+    section = wrong.rpartition(".")[0]
+    if told or section not in known:
+        return told or hint(wrong, known)
+    own = [key for key in known if key.rpartition(".")[0] == section]
+    return f"; {section} has {', '.join(own)}" if own else f"; {section} has no settings"
+
+
+def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> DictConfig:
+    """Compose a command's settings without the argument that sets a wrong key; without any where
+    others are wrong too.
+    """
+    good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        try:
+            return compose(name, good, return_hydra_config=True)
+        except HydraException:
+            return compose(name, return_hydra_config=True)
+
+
+def known_keys(cfg: DictConfig, wrong: str) -> list[str]:
+    """Return every key and group that would have been valid, nearest depth first."""
+    groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra/")]
+    keys: list[str] = []
+
+    def walk(node: Any, prefix: str) -> None:
+        for key, value in node.items():
+            keys.append(f"{prefix}{key}")
+            if isinstance(value, dict):
+                walk(value, f"{prefix}{key}.")
+
+    tree = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(tree, dict)
+    walk({k: v for k, v in tree.items() if k != "hydra"}, "")
+    depth = wrong.count(".")
+    return sorted({*groups, *keys}, key=lambda k: (abs(k.count(".") - depth), k))

@@ -1,0 +1,213 @@
+"""What filters make of what lies at an edge: nearest leaders, empty islands, single moves."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.filters.loop import make_particles
+from posefilter.filters.modes import find_modes, find_pose_modes
+from posefilter.filters.refine import Gradient, MeanShift, Rescore
+from posefilter.filters.resample import BelowESS, Islands, Soft, Systematic
+from posefilter.filters.resample_move import ResampleMove, draw_differences
+from posefilter.geometry.pose import make_pose
+from posefilter.geometry.spaces import PixelSpace, PoseSpace
+from posefilter.types import Belief
+
+PIXELS = PixelSpace()
+POSES = PoseSpace((0.0, 0.0, 0.0), 0.1)
+
+
+def shifted(shifts: list[float], dtype: torch.dtype = torch.float64) -> Tensor:
+    t = torch.tensor([[x, 0.0, 0.0] for x in shifts], dtype=dtype)
+    return make_pose(torch.eye(3, dtype=dtype).expand(len(shifts), 3, 3), t)
+
+
+@pytest.mark.parametrize(("gap", "modes"), [(0.0199, 1), (0.0201, 2), (0.03, 2), (0.06, 2)])
+def test_poses_nearer_than_a_tenth_of_the_diameter_are_one_mode(gap: float, modes: int) -> None:
+    found = find_pose_modes(shifted([0.0, gap]), torch.tensor([0.6, 0.4]).log(), POSES, 0.2)
+    assert len(found.weights) == modes
+
+
+def test_the_density_that_decides_who_follows_whom_is_over_a_thirtieth_of_the_diameter() -> None:
+    """Kernels of 0.2 / 30 = 6.7 mm: two light poses 1 mm apart are denser than a heavier one
+    18 mm away, and the mode is one of them; under wide kernels it would be the heavier one.
+    """
+    poses = shifted([0.0, 0.001, 0.0185])
+    found = find_pose_modes(poses, torch.tensor([0.3, 0.31, 0.39]).log(), POSES, 0.2)
+    assert len(found.weights) == 1
+    assert float(found.states[0, 0, 3]) == pytest.approx(0.001)
+
+
+def test_a_particle_follows_the_nearest_that_is_denser_at_the_reach_too() -> None:
+    """0 is densest, 10 next; 7 lies nearer to 10, and 3 at its reach from 0."""
+    state = torch.tensor([[0.0, 0.0], [10.0, 0.0], [7.0, 0.0], [-3.0, 0.0]])
+    found = find_modes(state, torch.tensor([0.5, 0.3, 0.1, 0.1]).log(), PIXELS, 1.0, reach=3.0)
+    assert found.member.tolist() == [0, 1, 1, 0]
+    assert found.weights.tolist() == pytest.approx([0.6, 0.4])
+
+
+def test_an_island_without_weight_has_children_without_weight_and_no_others_suffer() -> None:
+    log_w = torch.tensor([[0.5, 0.5, 0.0, 0.0, 0.0, 0.0]]).log()
+    particles = make_particles(torch.arange(12.0).view(1, 6, 2), 0)._replace(log_weights=log_w)
+    new = Islands(Systematic(), 2)(particles, 6, PIXELS, Generator().manual_seed(0))
+    assert new.log_weights.exp().tolist() == [[0.5, 0.5, 0, 0, 0, 0]]
+    assert sorted(new.ancestors[0].tolist()) == [0, 1, 2, 3, 4, 5]
+    assert not new.log_weights.isnan().any()
+    # those of an empty island are drawn evenly among it, of any number
+    more = Islands(Systematic(), 2)(particles, 12, PIXELS, Generator().manual_seed(0))
+    assert sorted(more.ancestors[0].tolist()) == sorted(2 * list(range(6)))
+
+
+@pytest.mark.parametrize(
+    ("count", "children", "size", "islands"),
+    [(12, 12, 3, 4), (12, 12, 5, 2), (12, 8, 2, 4), (12, 12, 13, 1), (12, 12, 12, 1), (4, 4, 1, 4)],
+)
+def test_islands_have_their_size_at_least_and_divide_all(
+    count: int, children: int, size: int, islands: int
+) -> None:
+    """All weight is with the first particle: its island's children are its copies."""
+    log_w = torch.full((1, count), -torch.inf)
+    log_w[0, 0] = 0.0
+    particles = make_particles(torch.zeros(1, count, 2), 0)._replace(log_weights=log_w)
+    new = Islands(Systematic(), size)(particles, children, PIXELS, Generator().manual_seed(0))
+    assert int((new.ancestors == 0).sum()) == children // islands
+    assert float(new.log_weights.exp().sum()) == pytest.approx(1)
+
+
+def test_resampling_begins_below_the_threshold() -> None:
+    """Two of four equal weights: an effective size of 2, which is not below 0.5 x 4."""
+    log_w = torch.tensor([[0.5, 0.5, 0.0, 0.0]]).log()
+    particles = make_particles(torch.zeros(1, 4, 2), 0)._replace(log_weights=log_w)
+    for threshold, resampled in ((0.49, False), (0.51, True)):
+        new = BelowESS(Systematic(), threshold)(particles, 4, PIXELS, Generator().manual_seed(0))
+        assert (new.ancestors.tolist() != [[0, 1, 2, 3]]) == resampled
+
+
+def test_soft_weights_are_by_hand() -> None:
+    """Half of q is the weights and half even: a particle of weight 0.7 of two has q = 0.6."""
+    log_w = torch.tensor([[0.7, 0.3]]).log()
+    particles = make_particles(torch.zeros(1, 2, 2), 0)._replace(log_weights=log_w)
+    new = Soft(0.5)(particles, 10, PIXELS, Generator().manual_seed(0))
+    assert int((new.ancestors == 0).sum()) == 6
+    ratio = float((new.log_weights[0, 0] - new.log_weights[0, -1]).exp())
+    assert ratio == pytest.approx((0.7 / 0.6) / (0.3 / 0.4))
+    for alpha in (0.0, 1.0):
+        assert Soft(alpha).alpha == alpha
+
+
+class Hill:
+    """Scores a pose by how far along x it is; what it was asked is kept."""
+
+    space = POSES
+
+    def __init__(self, slope: float = 1.0) -> None:
+        self.slope = slope
+        self.counts: list[int] = []
+        self.seeds: list[int] = []
+
+    def score_poses(
+        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+    ) -> Tensor:
+        self.counts.append(poses.shape[1])
+        self.seeds.append(generator.initial_seed())
+        return self.slope * 100 * poses[..., 0, 3]
+
+
+def belief(count: int) -> Belief:
+    poses = shifted([0.001 * k for k in range(count)])[None]
+    even = torch.full((1, count), -math.log(count)).double()
+    return Belief(poses, even, poses[:, 0], torch.zeros(1).double())
+
+
+def move(method: Hill, seed: int, **settings: float) -> Belief:
+    moves = ResampleMove(sweeps=3, **settings)  # type: ignore[arg-type]
+    return moves(belief(10), None, method, Generator().manual_seed(seed))  # type: ignore[arg-type]
+
+
+def test_a_sweep_moves_one_half_after_the_other_and_looks_at_the_same_points() -> None:
+    one, other, third = Hill(), Hill(), Hill()
+    for method, seed in ((one, 1), (other, 1), (third, 2)):
+        move(method, seed)
+    assert one.counts == [10] + 3 * [5, 5]
+    assert len(set(one.seeds)) == 1
+    assert one.seeds == other.seeds
+    assert one.seeds != third.seeds
+
+
+def test_a_temperature_divides_the_log_likelihood() -> None:
+    """Twice the slope at twice the temperature is the same target: bit by bit the same moves."""
+    plain, hot = move(Hill(), 1), move(Hill(4.0), 1, temperature=4.0)
+    assert torch.equal(plain.poses, hot.poses)
+    assert not torch.equal(plain.poses, move(Hill(4.0), 1).poses)
+
+
+def test_with_few_partners_there_is_no_difference() -> None:
+    none = draw_differences(shifted([0.1])[None], 4, POSES, Generator())
+    assert torch.equal(none, torch.zeros(1, 4, 6).double())
+    pair = draw_differences(shifted([0.0, 0.1])[None], 50, POSES, Generator().manual_seed(0))
+    assert sorted({round(x, 6) for x in pair[0, :, 0].tolist()}) == [-0.1, 0.1]
+
+
+def test_one_shift_of_one_pair_goes_up() -> None:
+    """The mean of a pair by their weights is never on the lower side."""
+    method = Hill()
+    shift = MeanShift(iterations=1, antithetic_pairs=1, start=0.01, end=0.01)
+    found = shift(belief(4), None, method, Generator().manual_seed(0))  # type: ignore[arg-type]
+    assert method.counts == [2, 1]
+    assert float(found.best[0, 0, 3]) > 0
+    assert float(found.score) == pytest.approx(100 * float(found.best[0, 0, 3]))
+
+
+def test_shifts_narrow_from_the_start_to_the_end_by_equal_ratios() -> None:
+    """On even ground the spread of what is scored is that of the iteration."""
+
+    class Flat(Hill):
+        spreads: list[float]
+
+        def score_poses(
+            self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        ) -> Tensor:
+            if poses.shape[1] > 1:
+                self.spreads.append(float(poses[..., :3, 3].std()))
+            return torch.zeros(poses.shape[:2])
+
+    method = Flat()
+    method.spreads = []
+    shift = MeanShift(iterations=3, antithetic_pairs=4000, start=0.016, end=0.004)
+    shift(belief(2), None, method, Generator().manual_seed(0))  # type: ignore[arg-type]
+    assert method.spreads == pytest.approx([0.016, 0.008, 0.004], rel=0.05)
+
+
+def test_the_first_steps_of_a_climb_have_its_length_and_the_last_are_shorter() -> None:
+    """Adam's steps on a slope have the length of the rate, which falls linearly: n steps of rate r
+    go (n + 1) / 2 r.
+    """
+
+    class Score(Hill):
+        def score_poses(
+            self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        ) -> Tensor:
+            return 1000 * super().score_poses(scene, poses, sigma, generator, pixels)
+
+    climb = Gradient(steps=9, lr=1e-3)
+    one = belief(4)
+    start = one._replace(poses=one.poses.float(), best=one.best.float())
+    found = climb(start, None, Score(), Generator())  # type: ignore[arg-type]
+    assert float(found.best[0, 0, 3]) == pytest.approx(5e-3, rel=1e-3)
+
+
+def test_the_estimate_and_the_heaviest_are_scored_again_all_there_are_at_most() -> None:
+    method = Hill()
+    few = Rescore(top_k=2)(belief(4), None, method, Generator())  # type: ignore[arg-type]
+    all_of_them = Rescore(top_k=9)(belief(4), None, method, Generator())  # type: ignore[arg-type]
+    assert method.counts == [3, 5]
+    assert float(few.best[0, 0, 3]) <= float(all_of_them.best[0, 0, 3]) == pytest.approx(0.003)
+
+
+def test_modes_reach_three_bandwidths() -> None:
+    state = torch.tensor([[0.0, 0.0], [2.9, 0.0], [10.0, 0.0], [13.1, 0.0]])
+    found = find_modes(state, torch.tensor([0.4, 0.1, 0.3, 0.2]).log(), PIXELS, 1.0)
+    assert found.member.tolist() == [0, 0, 1, 2]
