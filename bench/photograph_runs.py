@@ -165,6 +165,10 @@ def plan() -> list[Run]:
         shipped("chef_f", chef, 1000),
         shipped("soup_h", soup, 1000),
         shipped("drill_g", drill, 1000),
+        shipped("mug_f", mug, 1500),
+        more("mug_g", mug, 1000, "mug_f"),
+        shipped("hammer_e", "048_hammer", 1000),
+        shipped("banana_e", "011_banana", 1000),
     ]
 
 

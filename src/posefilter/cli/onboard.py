@@ -47,7 +47,10 @@ _FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 40, 200, 2000
 _FEWEST_STEPS, _MOST_STEPS = 100, 8000
 _VALIDATED = 8  # images, once at the end
 _CALIBRATED = 40  # images with the object, and as many without
-_REST = 45.0  # [s] reserved for figures, weights and report
+_REST = 25.0  # [s] reserved for figures, weights and report
+# Of the time of a step that is measured at the start, which is rather long. If steps take longer
+# than so, the learning rate keeps pace with the clock.
+_HOPED = 0.75
 
 
 class Stage(NamedTuple):
@@ -220,17 +223,18 @@ def train(work: Onboarding) -> None:
     values, console = work.stages.values, work.cfg.console
     if "steps" not in values:
         speed = measure_speed(work.job(work.out / ".trial"))
-        steps = work.cfg.steps
+        steps, seconds = work.cfg.steps, speed.step
         if steps is None:
             spent = sum(work.stages.seconds.values())
             room = 60 * work.cfg.budget_minutes - spent - work.rest(speed)
-            steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / speed.step)))
-        work.stages.keep(
-            steps=int(steps), seconds_per_step=speed.step, seconds_per_image=speed.image
-        )
-        duration = format_duration(steps * speed.step)
-        sentence = f"{steps} steps of {speed.step:.2f} s each: {duration}"
-        say(console, "steps", sentence, steps=steps, seconds_per_step=speed.step)
+            steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / (_HOPED * speed.step))))
+            seconds = speed.step if steps == _FEWEST_STEPS else min(speed.step, room / steps)
+        work.stages.keep(steps=int(steps), seconds_per_step=seconds, seconds_per_image=speed.image)
+        duration = format_duration(steps * seconds)
+        sentence = f"{steps} steps of {seconds:.2f} s each: {duration}"
+        if work.cfg.steps is None:
+            sentence = f"at most {steps} steps in {duration}"
+        say(console, "steps", sentence, steps=steps, seconds_per_step=seconds)
     if work.cfg.steps is None:  # the machine may turn out slower than it was measured
         seconds = values["steps"] * values["seconds_per_step"]
         work.run.trainer.callbacks.append(TimeBudget(seconds))
