@@ -1,13 +1,14 @@
 """Kill trainings at random times, go on with them, and compare them with trainings that were not.
 
     python bench/kills.py [COUNT] [--seed SEED] [--models A,B] [--workers 0,2] [--minutes MINUTES]
+        [--after SHARE]
 
 Each training is a process of its own, forked from this one, and is killed by SIGKILL at a random
-time of its length; it writes a checkpoint after every batch, so that many kills fall into the
-writing of one. It is then gone on with by `resume=`, or started anew where it had no checkpoint
-yet. Weights, optimizer, particles of the training's own and the test's numbers must be the same
-bits as those of a training that was never killed. Prints the counts; the exit status is 1 where one
-was not.
+time of its length, in its later part with --after; it writes a checkpoint after every batch, so
+that many kills fall into the writing of one. It is then gone on with by `resume=`, or started anew
+where it had no checkpoint yet. Weights, optimizer, particles of the training's own and the test's
+numbers must be the same bits as those of a training that was never killed. Prints the counts; the
+exit status is 1 where one was not.
 """
 
 import argparse
@@ -54,13 +55,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--models", default=",".join(MODELS))
     parser.add_argument("--workers", default="0,2")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which it stops")
+    parser.add_argument(
+        "--after", type=float, default=0.0, help="share of a training before which none is killed"
+    )
     given = parser.parse_args(arguments)
     print(f"at most {given.count} kills, seed {given.seed}", flush=True)
     prepare()
     kinds = [(m, w) for w in given.workers.split(",") for m in given.models.split(",")]
     with tempfile.TemporaryDirectory() as folder:
         counts = kill_many(
-            Path(folder), kinds[: given.count], given.count, given.seed, given.minutes
+            Path(folder), kinds[: given.count], given.count, given.seed, given.minutes, given.after
         )
     print(f"{counts.total()} kills")
     for what, count in sorted(counts.items()):
@@ -74,6 +78,7 @@ def kill_many(
     count: int,
     seed: int,
     minutes: float = math.inf,
+    after: float = 0.0,
 ) -> Counter[str]:
     """Kill trainings of each kind in turn.
 
@@ -83,6 +88,7 @@ def kill_many(
         count: How many kills.
         seed: Decides when.
         minutes: After which no further training is begun.
+        after: Share of a training's time before which it is not killed.
 
     Returns:
         How many ended how.
@@ -101,7 +107,7 @@ def kill_many(
         settings.append(f"data.workers={kind[1]}")
         if kind not in wholes:
             wholes[kind] = train_whole(folder / f"whole_{kind[0]}_{kind[1]}", settings)
-        part = random.Random(f"{seed} {number}").random()
+        part = after + (1 - after) * random.Random(f"{seed} {number}").random()
         found = kill_one(folder / f"{number:04d}", settings, wholes[kind], part)
         counts[found] += 1
         if found.startswith("NOT"):

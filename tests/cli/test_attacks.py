@@ -24,6 +24,16 @@ LINES = {
     "a number as a choice": ("train", ["loss/aux/likelihood=5"], "likelihood=5: cannot be read"),
     "a reference of another command": ("generate", ["out=${nope}"], "key 'nope' not found"),
     "a mapping as a checkpoint": ("export", ["checkpoint={}", "out=a.ckpt"], "a file, a run's"),
+    "a number as a file": (
+        "export",
+        ["checkpoint=003_cracker_box", "out=0.5"],
+        "out=0.5: must end in .ckpt",
+    ),
+    "a number as a copy": (
+        "calibrate",
+        ["checkpoint=003_cracker_box", "out=0.5"],
+        "out=0.5: ",
+    ),
     "no model": ("train", ["model=null"], "model=null: cannot be read"),
     "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
     "an umlaut": (

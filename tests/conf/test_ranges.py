@@ -12,6 +12,7 @@ from posefilter.cli.command import compose_job
 from posefilter.cli.job import check_settings
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.options import open_groups
+from posefilter.cli.recipe import LIMITS, MOST_WHOLE, NOT_KEPT
 from posefilter.errors import UserError
 from posefilter.ranges import RANGES, check_ranges, find_range, list_values
 
@@ -51,6 +52,19 @@ def test_every_number_has_a_range_and_lies_in_it() -> None:
     assert [k for k, known in ranges.items() if known and not known.holds(numbers[k])] == []
 
 
+def test_what_a_training_may_have_its_checkpoint_may_hold() -> None:
+    """Else a run would train, and its best checkpoint be refused before the test."""
+    no_part = tuple(f"{name}." for name in (*NOT_KEPT, "onboard", "check_data"))
+    wide = {
+        key: known.most
+        for key, known in RANGES.items()
+        if known.whole and not key.startswith(no_part)
+    }
+    assert len(wide) > 30
+    for key, most in wide.items():
+        assert most <= LIMITS.get(key.rpartition(".")[2], MOST_WHOLE), key
+
+
 def test_no_range_holds_what_is_no_number() -> None:
     for key, allowed in RANGES.items():
         for value in (math.nan, math.inf, -math.inf, True, "text", -1e30):
@@ -72,8 +86,8 @@ REFUSED = {
         "data.batch_size": (0, -3, 1.5),
         "data.batch_size_test": (0,),
         "data.workers": (-1, 1_000_000),
-        "data.limit_train": (-1, 0),
-        "data.limit_val": (0,),
+        "data.limit_train": (-1, 0, 10**21),
+        "data.limit_val": (0, 10**21),
         "data.generate.frames": (0,),
         "filter.particles": (0, 10**9),
         "filter.first_particles": (0,),
@@ -86,7 +100,7 @@ REFUSED = {
     },
     "predict": {"depth_scale": (0, -1, 1e-9, math.nan), "seed": (-1,), "threads": (0,)},
     "generate": {"frames": (0, -1), "workers": (0,), "occlusion": (1, math.nan), "size": (8,)},
-    "check_data": {"limit": (0, -1)},
+    "check_data": {"limit": (0, -1, 10**21)},
     "export": {"points": (0,), "max_mb": (0, None)},
     "onboard": {"budget_minutes": (0, None, math.nan), "steps": (0,), "workers": (0,)},
     "evaluate": {"threads": (0,)},

@@ -141,3 +141,23 @@ def test_as_many_fragments_are_considered_as_there_are() -> None:
         )
         torch.testing.assert_close(share[0, 0], log_share[0, 0, rows].exp())
         assert torch.equal(found[0, 0], position[0, 0, rows])
+
+
+def test_a_particle_agrees_within_two_scales() -> None:
+    """Of sixty, three are off by 1.9 scales and three by 2.1: these alone do not agree."""
+    g = torch.Generator().manual_seed(4)
+    N, scale = 60, 0.01
+    truth = make_pose(random_rotation(1, generator=g), torch.tensor([[0.1, 0.0, 0.9]]))
+    thing = torch.rand(1, N, 3, generator=g) * 0.2 - 0.1
+    own = truth[:, None].repeat(1, N, 1, 1)
+    point = (own[..., :3, :3] @ thing[..., None])[..., 0] + own[..., :3, 3]
+    # in turn to either side, so that the fit of all is not drawn to one
+    side = torch.tensor([1.9, 2.1, -1.9, -2.1, 1.9, -2.1])
+    own[0, :6, 0, 3] += scale * side
+    log_p, empty = torch.full((1, N), -0.5), torch.zeros(1, N, 0)
+    particles = Particles(
+        torch.zeros(1, N, 2), empty, log_p.log_softmax(1), torch.arange(N).expand(1, N)
+    )
+    output = ParticleOutput(log_p, torch.zeros(1, N, 2), own, empty)
+    belief = Agreement(scale)(particles, output, None, Points(point), g)  # type: ignore[arg-type]
+    assert float(belief.score) == pytest.approx(57 / 60 * math.exp(-0.5), rel=1e-4)

@@ -7,14 +7,18 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from posefilter.errors import UserError
+from posefilter.filters.estimate import Mean
+from posefilter.filters.guided import Guided
 from posefilter.filters.loop import make_particles
 from posefilter.filters.modes import find_modes, find_pose_modes
 from posefilter.filters.refine import Gradient, MeanShift, Rescore
 from posefilter.filters.resample import BelowESS, Islands, Soft, Systematic
 from posefilter.filters.resample_move import ResampleMove, draw_differences
+from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief
+from posefilter.types import Belief, ParticleOutput
 
 PIXELS = PixelSpace()
 POSES = PoseSpace((0.0, 0.0, 0.0), 0.1)
@@ -211,3 +215,71 @@ def test_modes_reach_three_bandwidths() -> None:
     state = torch.tensor([[0.0, 0.0], [2.9, 0.0], [10.0, 0.0], [13.1, 0.0]])
     found = find_modes(state, torch.tensor([0.4, 0.1, 0.3, 0.2]).log(), PIXELS, 1.0)
     assert found.member.tolist() == [0, 0, 1, 2]
+
+
+def test_near_pairs_are_preferred_as_the_logarithm_says() -> None:
+    """A share s, log-uniform from 1 / 200 to 1, then an even draw of the share s of the nearest.
+
+    The nearest hundredth q is drawn with probability P(s < q) + q E[1 / s; s > q], which is
+    (ln 2 + 1 - q) / ln 200 = 0.32.
+    """
+    g = Generator().manual_seed(5)
+    places = torch.rand(60, generator=g).double()
+    steps = draw_differences(shifted(places.tolist())[None], 20_000, POSES, g)[0, :, 0].abs()
+    apart = (places[:, None] - places).abs()[tuple(torch.triu_indices(60, 60, 1))].sort().values
+    share = len(apart) // 100 / len(apart)
+    want = (math.log(200 * share) + 1 - share) / math.log(200)
+    found = (steps < (apart[len(apart) // 100 - 1] + apart[len(apart) // 100]) / 2).double().mean()
+    assert float(found) == pytest.approx(want, abs=0.02)
+    assert float(steps.max()) > 0.8 * float(apart.max())
+
+
+def test_only_some_hundreds_of_partners_are_compared() -> None:
+    """Those that come first: of 301 poses the last, far from all, has no pair."""
+    poses = shifted([*(0.001 * k for k in range(300)), 50.0])[None]
+    steps = draw_differences(poses, 2000, POSES, Generator().manual_seed(0))
+    assert 0.2 < float(steps[..., 0].abs().max()) < 1
+
+
+def test_a_guided_draw_by_hand() -> None:
+    """Relevances of 1 and 0.01, of which the floor makes 0.25: with even weights four of five
+    children are of the first, each with a quarter of the weight that one of the second has.
+    """
+    particles = make_particles(torch.tensor([[[0.0, 0.0], [1.0, 0.0]]]), 0)
+    scene = Relevance(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
+    draw = Guided(Systematic(), floor=0.25).bind(scene, 1, 2)
+    new = draw(particles, 10, PIXELS, Generator().manual_seed(0))
+    assert int((new.ancestors == 0).sum()) == 8
+    first, last = new.log_weights[0, [0, -1]].exp().tolist()
+    assert last / first == pytest.approx(4)
+    assert float(new.log_weights.exp().sum()) == pytest.approx(1)
+    assert Guided(Systematic(), floor=1.0).floor == 1
+    for floor in (0.0, 1.1, math.nan):
+        with pytest.raises(UserError, match="floor="):
+            Guided(Systematic(), floor=floor)
+
+
+class Relevance:
+    def __init__(self, relevance: Tensor) -> None:
+        self.relevance = relevance
+
+
+def test_a_mean_has_a_score_though_some_likelihood_is_zero() -> None:
+    poses = shifted([0.0, 0.1, 5.0])[None]
+    particles = make_particles(poses, 0)._replace(
+        log_weights=torch.tensor([[0.5, 0.5, 0.0]]).double().log()
+    )
+    log_p = torch.tensor([[-1.0, -3.0, -math.inf]]).double()
+    output = ParticleOutput(log_p, torch.zeros(1, 3, 6), poses, particles.latent)
+    found = Mean()(particles, output, None, Hill(), Generator())  # type: ignore[arg-type]
+    assert float(found.score) == pytest.approx(-2)
+    assert float(found.best[0, 0, 3]) == pytest.approx(0.05)
+
+
+def test_weights_of_three_kinds_by_hand() -> None:
+    before, now, then = (torch.tensor([x]) for x in ([-1.0, -2.0], [0.5, 0.25], [0.125, 1.0]))
+    assert Sequential()(before, now, then).tolist() == [[-0.5, -1.75]]
+    assert TemperedSMC()(before, now, then).tolist() == [[-0.625, -2.75]]
+    assert Annealed()(before, now, then)[0].tolist() == pytest.approx(
+        [0.5 - math.log(2), 0.25 - math.log(2)]
+    )

@@ -180,3 +180,19 @@ def test_the_same_generator_draws_the_same(piece: Initialize) -> None:
     scene = Map(torch.rand(2, 1, 5, 10, generator=Generator().manual_seed(0)))
     assert torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=4))
     assert not torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=5))
+
+
+def test_centers_lie_a_tenth_to_nine_tenths_of_a_radius_behind_the_surface() -> None:
+    """At one measured pixel, on the axis: all of the offset is depth."""
+    depth = torch.zeros(1, 1, 3, 3)
+    depth[0, 0, 1, 1] = 0.5
+    K = intrinsics(100.0, 100.0, 1.0, 1.0)[None]
+    for poses in (
+        draw_from_depth(depth, K, SPACE, 2000, Generator().manual_seed(0)),
+        draw_from_depth(
+            depth, K, SPACE, 2000, Generator().manual_seed(0), depth_offset=FromDepth().depth_offset
+        ),
+    ):
+        behind = origin_of(poses, CENTER)[0, :, 2] - 0.5
+        assert float(behind.min()) == pytest.approx(0.01, abs=2e-4)
+        assert float(behind.max()) == pytest.approx(0.09, abs=2e-4)

@@ -80,3 +80,8 @@ def test_distances() -> None:
             math.hypot(float(shift[i]), float(turn[i])), rel=1e-5
         )
     assert PIXELS.distance(torch.tensor([3.0, 0.0]), torch.tensor([0.0, 4.0])) == 5.0
+
+
+def test_noise_on_pixels_is_the_same_along_both_axes() -> None:
+    assert PIXELS.noise_scale(torch.tensor([2.0, 3.0])).tolist() == [[2, 2], [3, 3]]
+    assert PIXELS.dimensions == 2

@@ -91,6 +91,11 @@ def test_own_point_measures_where_the_particles_surface_point_lands(
     ).item() == pytest.approx(far / 0.15, abs=1e-5)
     blind = batch._replace(depth=torch.zeros_like(batch.depth))
     assert SurfacePointLoss()(trace, blind, model).item() == 0
+    # a wall behind the object that the mask's pixel shows: 1 m is farther than 1.2 radii
+    wall = batch._replace(depth=torch.full_like(batch.depth, 2.0))
+    assert SurfacePointLoss()(trace, wall, model).item() == 0
+    near = batch._replace(depth=torch.full_like(batch.depth, 1.17))  # of a radius of 0.15
+    assert SurfacePointLoss()(trace, near, model).item() > 0.1
 
 
 def test_fragments_are_scored_by_the_true_fragment_and_the_position_in_it(

@@ -363,3 +363,9 @@ def test_every_visible_pixel_of_a_part_counts_where_there_are_few() -> None:
     metric.reset()
     metric.update(at, batch._replace(mask=torch.zeros_like(mask)))
     assert math.isnan(metric.compute()["mask_iou"])
+
+
+def test_the_last_bin_is_a_bin_of_its_own() -> None:
+    """One that is right at 0.2 and one that is wrong at 0.9: both are off, and do not cancel."""
+    probability, right = torch.tensor([0.2, 0.9]), torch.tensor([True, False])
+    assert calibration_error(probability, right, 2) == pytest.approx((0.8 + 0.9) / 2)

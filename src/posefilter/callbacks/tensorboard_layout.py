@@ -66,7 +66,7 @@ LAYOUT: dict[str, dict[str, Chart]] = {
         ),
         "spread [px], by iteration": ("Multiline", [r"filter/spread_px/step_\d+$"]),
         "noise level [m] or [px], by iteration": ("Multiline", [r"filter/sigma_(m|px)/step_\d+$"]),
-        "where they end": ("Multiline", [r"diagnostics/.*/last$"]),
+        "diagnostics at the last iteration": ("Multiline", [r"diagnostics/.*/last$"]),
     },
     "4  Is the belief calibrated?": {
         "truths within the region that holds 50 % and 90 % of the belief [%]": (
@@ -74,7 +74,7 @@ LAYOUT: dict[str, dict[str, Chart]] = {
             [r"val/belief/coverage_\d+$"],
         ),
         "weight near the truth": ("Multiline", [r"val/belief/mass_.*"]),
-        "the truth outscored: share of the images": (
+        "share of the images in which a particle outscores the truth": (
             "Multiline",
             [r"val/belief/truth_outscored.*"],
         ),

@@ -47,7 +47,7 @@ def calibrate(job: Job) -> None:
             "checkpoint with another"
         )
     checkpoint, file = read_checkpoint(cfg.checkpoint), find_checkpoint(cfg.checkpoint)
-    out = file if cfg.out is None else Path(cfg.out)
+    out = file if cfg.out is None else Path(str(cfg.out))
     check_out(checkpoint, file, out, cfg.replace)
     method = method_of(checkpoint, lightning=False)
     name = method.model.name

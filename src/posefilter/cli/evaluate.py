@@ -136,7 +136,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             "estimates need to know of which data: give data=fat|ycb_video|bop|scenes "
             "and data.root=DIR"
         )
-    rows = read_poses_csv(Path(job.cfg.estimates))
+    rows = read_poses_csv(Path(str(job.cfg.estimates)))
     data = build_data(data_settings(job, {}, None), job.cfg.console)
     data.setup("test")
     best = {}

@@ -24,7 +24,7 @@ def export(job: Job) -> None:
     """
     if job.cfg.out is None:
         raise UserError("out: is missing; name the file to write, such as out=weights/carton.ckpt")
-    out = Path(job.cfg.out)
+    out = Path(str(job.cfg.out))
     if job.cfg.format != "weights":
         export_networks(job, out)
         return

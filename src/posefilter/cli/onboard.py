@@ -178,7 +178,7 @@ def onboard(job: Job) -> None:
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
     mesh = read_onboarded(cfg)
-    out = Path(cfg.out) if cfg.out else Path("outputs") / "onboard" / mesh.name
+    out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
     hold_folder(out)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD))
     for number, stage in enumerate(STAGES, 1):

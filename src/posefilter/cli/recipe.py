@@ -36,11 +36,13 @@ NOT_KEPT = (
 # settings that name files to start a training from: the checkpoint has what came of them
 PRETRAINED = ("weights",)
 _DEEPEST, _MOST_NODES, _LONGEST = 16, 20_000, 1000
-_MOST = 1_000_000  # a setting that is a whole number
-_LIMITS = {
+MOST_WHOLE = 1_000_000  # a setting that is a whole number; none may be less than its range allows
+LIMITS = {
     "seed": 1 << 63,
     "split_seed": 1 << 63,
-    "workers": 64,
+    "workers": 256,
+    "frames": 10_000_000,
+    "warm_up": 10**12,
     "particles": 100_000,
     "first_particles": 100_000,
 }
@@ -199,7 +201,7 @@ def _check_value(path: str, value: Any, said: str) -> None:
                 f"such as ${{filter}}"
             )
     elif isinstance(value, int) and not isinstance(value, bool):
-        if abs(value) > _LIMITS.get(where.rpartition(".")[2], _MOST):
+        if abs(value) > LIMITS.get(where.rpartition(".")[2], MOST_WHOLE):
             raise UserError(f"{said}: its recipe's {where}={str(value)[:30]} is too large")
     elif isinstance(value, float):
         if not math.isfinite(value):

@@ -57,7 +57,7 @@ def report(job: Job) -> None:
         best = read_run(winner) if (winner / "metrics.json").is_file() else None
         page = make_sweep_page(found, best, compared(best) if best else None, command)
     out = (
-        Path(job.cfg.out)
+        Path(str(job.cfg.out))
         if job.cfg.out
         else folder / ("comparison" if kind == "runs" else "report")
     )

@@ -100,7 +100,7 @@ def _describe_credible() -> tuple[MetricInfo, ...]:
             ".0f",
             limits=PERCENT,
             short=f"{level} % set",
-            meaning=f"{level} where calibrated; fewer: too sure; a set of highest density",
+            meaning=f"{level} where calibrated; fewer: overconfident; a set of highest density",
         )
         for level in (50, 80, 90, 95)
     )
@@ -158,7 +158,7 @@ _METRICS = (
         "entropy",
         "nat",
         ".2f",
-        meaning="of the weights: 0 where one particle has all",
+        meaning="of the weights: 0 where one particle has all the weight",
     ),
     MetricInfo(
         "belief/spread_m",
@@ -185,7 +185,7 @@ _METRICS = (
         100.0,
         PERCENT,
         "within 0.1 diameter",
-        "100 where the belief is sure and right",
+        "100 where the belief is narrow and right",
     ),
     MetricInfo(
         "belief/mass_2cm",
@@ -210,7 +210,7 @@ _METRICS = (
         ".0f",
         limits=PERCENT,
         short="50 % region",
-        meaning="50 where calibrated; fewer: too sure",
+        meaning="50 where calibrated; fewer: overconfident",
     ),
     MetricInfo(
         "belief/coverage_90",
@@ -220,7 +220,7 @@ _METRICS = (
         HIGHER,
         limits=PERCENT,
         short="90 % region",
-        meaning="90 where calibrated; fewer: too sure",
+        meaning="90 where calibrated; fewer: overconfident",
     ),
     MetricInfo(
         "credibility/log_density",
@@ -233,11 +233,11 @@ _METRICS = (
     ),
     MetricInfo(
         "credibility/log_density_p50",
-        "log density of the truth, middle image",
+        "log density of the truth, median",
         "nat",
         ".2f",
         HIGHER,
-        meaning="the same, at half of the images or more",
+        meaning="over the images; the same unit",
     ),
     *_describe_credible(),
     MetricInfo(
@@ -259,7 +259,7 @@ _METRICS = (
         100.0,
         PERCENT,
         "by a wrong pose",
-        "what no search can mend",
+        "more particles cannot correct these",
     ),
     # calibrated probabilities, on frames with the object and without
     MetricInfo("confidence/frames", "frames with the object", form=".0f"),
@@ -271,7 +271,7 @@ _METRICS = (
         direction=HIGHER,
         limits=(-0.03, 1.03),
         short="AUROC right",
-        meaning="among frames with the object; 0.5: it tells nothing",
+        meaning="among frames with the object; 0.5: no better than chance",
     ),
     MetricInfo(
         "confidence/auroc_presence",
@@ -382,7 +382,7 @@ _METRICS = (
         factor=100.0,
         limits=PERCENT,
         short="along a line",
-        meaning="share of the particles' variance along its first principal axis; 50: no line",
+        meaning="share of the particles' variance along its first principal axis; 50: no preferred one",
     ),
     MetricInfo(
         "diagnostics/line_share/first",

@@ -18,7 +18,7 @@ def show_calibration(metrics: Mapping[str, Any]) -> list[Block]:
     panels = [*chart_coverage(metrics), *chart_reliability(metrics)]
     if not panels:
         return []
-    text = "On the diagonal, the belief means what it says; below it, it is too sure."
+    text = "On the diagonal, the belief is calibrated; below it, overconfident."
     words: list[Block] = [Heading("Calibration"), Paragraph([text])]
     return [*words, *draw_charts(panels), *list_coverage(metrics), *list_reliability(metrics)]
 

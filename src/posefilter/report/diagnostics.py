@@ -41,7 +41,7 @@ DIAGNOSTICS = (
         0.02,
         "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
-    Diagnostic("belief/coverage_90", 75.0, "The belief is too sure of itself."),
+    Diagnostic("belief/coverage_90", 75.0, "The belief is overconfident."),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
     Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),

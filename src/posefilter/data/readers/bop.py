@@ -22,7 +22,7 @@ from posefilter.data.readers.decode import (
     read_json,
     read_label,
 )
-from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.naming import choose_objects, need_text
 from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
@@ -104,6 +104,7 @@ class BopReader(BaseReader):
         super().__init__(root, meshes, on_error)
         if not isinstance(inverted, bool):
             raise UserError(f"data.options.inverted={inverted}: choose true or false")
+        need_text("part", part)
         self._inverted = inverted
         base = self.root / part if part else self.root
         folders = sorted(_scene_folders(base))

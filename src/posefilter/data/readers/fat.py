@@ -35,7 +35,7 @@ from posefilter.data.readers.fat_settings import (
     object_settings,
     scene_folders,
 )
-from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.naming import choose_objects, choose_several
 from posefilter.data.readers.plausible import check_camera, check_sample, narrow
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
@@ -90,7 +90,8 @@ class FatReader(BaseReader):
             UserError: There are no frames, or no such class.
         """
         super().__init__(root, meshes, on_error)
-        self.cameras = tuple(cameras)
+        self.cameras = choose_several("cameras", cameras, ("left", "right"))
+        parts = choose_several("parts", parts, ("single", "mixed"))
         self._native: dict[str, np.ndarray] = {}
         # a folder whose frame of the class is not the first folder's
         self._ambiguous: dict[str, Path] = {}

@@ -28,3 +28,21 @@ def choose_objects(
     if not names:
         raise UserError(f"{root}: data.object is an empty list: name a class")
     return names
+
+
+def choose_several(name: str, asked: object, known: Sequence[str]) -> tuple[str, ...]:
+    """Return the choices that an option of a reader names, one or several.
+
+    Raises UserError, naming the option, for anything else.
+    """
+    several = (asked,) if isinstance(asked, str) else asked
+    right = isinstance(several, Sequence) and several and all(one in known for one in several)
+    if not right:
+        raise UserError(f"data.options.{name}={asked}: choose one or more of {', '.join(known)}")
+    return tuple(several)  # type: ignore[arg-type]
+
+
+def need_text(name: str, asked: object) -> None:
+    """Raise UserError where an option of a reader that names a folder or file is something else."""
+    if asked is not None and not isinstance(asked, str | Path):
+        raise UserError(f"data.options.{name}={asked}: must be a name, or null")

@@ -18,7 +18,7 @@ from posefilter.data.readers.decode import (
     read_depth,
     read_label,
 )
-from posefilter.data.readers.naming import choose_objects
+from posefilter.data.readers.naming import choose_objects, choose_several, need_text
 from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
 from posefilter.data.readers.ycb_video_files import (
     FRAME,
@@ -82,6 +82,8 @@ class YCBVideoReader(BaseReader):
         super().__init__(root, meshes, on_error)
         if mesh_frame not in ("original", "ycb_video"):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose original or ycb_video")
+        parts = choose_several("parts", parts, ("data", "data_syn"))
+        need_text("frames", frames)
         self._mesh_frame = mesh_frame
         self._classes = read_class_names(self.root)
         usable = [
