@@ -382,7 +382,7 @@ _METRICS = (
         factor=100.0,
         limits=PERCENT,
         short="along a line",
-        meaning="share of the particles' variance along its first principal axis; 50: no preferred one",
+        meaning="share of the particles' variance along its first principal axis; 50: round",
     ),
     MetricInfo(
         "diagnostics/line_share/first",
