@@ -67,7 +67,16 @@ def test_an_island_without_weight_has_children_without_weight_and_no_others_suff
 
 @pytest.mark.parametrize(
     ("count", "children", "size", "islands"),
-    [(12, 12, 3, 4), (12, 12, 5, 2), (12, 8, 2, 4), (12, 12, 13, 1), (12, 12, 12, 1), (4, 4, 1, 4)],
+    [
+        (12, 12, 3, 4),
+        (12, 12, 5, 2),
+        (12, 8, 2, 4),
+        (12, 12, 13, 1),
+        (12, 12, 12, 1),
+        (4, 4, 1, 4),
+        (12, 24, 6, 2),
+        (12, 4, 2, 2),
+    ],
 )
 def test_islands_have_their_size_at_least_and_divide_all(
     count: int, children: int, size: int, islands: int

@@ -196,3 +196,9 @@ def test_centers_lie_a_tenth_to_nine_tenths_of_a_radius_behind_the_surface() -> 
         behind = origin_of(poses, CENTER)[0, :, 2] - 0.5
         assert float(behind.min()) == pytest.approx(0.01, abs=2e-4)
         assert float(behind.max()) == pytest.approx(0.09, abs=2e-4)
+
+
+def test_the_seed_decides_where_and_how_poses_are_turned() -> None:
+    one, same, other = (run(FromDepth(), Poses(), particles=20, seed=s) for s in (3, 3, 4))
+    assert torch.equal(one, same)
+    assert not torch.equal(rotation_of(one), rotation_of(other))
