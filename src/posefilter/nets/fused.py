@@ -8,17 +8,17 @@ matrix products. The network goes over points in parts that fit into a processor
 """
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import argmin
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import STRIDE, Context
+from posefilter.nets.kept import Kept
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.linear import has_onednn
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from posefilter.nets.likelihood import Pixels, PoseLikelihood
 
 PART = 4096  # points that the network takes at once
-_LEVELS = 32  # noise levels whose weights are kept, of each network
 _LEAST = 1e-12  # added to the shares of fragments, so that their sum can be divided by
 
 
@@ -97,7 +96,13 @@ def score(
         tables = make_tables(image.context)
     octaves = likelihood.octaves
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
-    weights = _recall_weights(likelihood, sigma, dtype)
+    # a video asks at the same few noise levels in every frame
+    weights = KEPT.get(
+        likelihood,
+        likelihood.parameters(),
+        (float(sigma), dtype),
+        lambda: _Weights(likelihood, sigma, dtype),
+    )
     context = None if tables is None else tables.smooth
     scores = weights.score(inputs.flatten(1), context, cells).view(inside.shape)
     return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
@@ -290,29 +295,6 @@ class _Weights:
         return out.add_(self.last)
 
 
-_kept: WeakKeyDictionary[nn.Module, dict[object, Any]] = WeakKeyDictionary()
-
-
-def _recall_weights(likelihood: "PoseLikelihood", sigma: Tensor, dtype: torch.dtype) -> _Weights:
-    """Return `_Weights`, made anew only where the network has changed since.
-
-    A video asks at the same few noise levels in every frame.
-    """
-    parameters = [*likelihood.parameters()]
-    if any(one.is_inference() for one in parameters):  # these do not tell when they change
-        return _Weights(likelihood, sigma, dtype)
-    state = tuple((one.data_ptr(), one._version) for one in parameters)
-    kept = _kept.get(likelihood)
-    if kept is None or kept.get("state") != state or len(kept) > _LEVELS:
-        kept = {"state": state}
-    key = (float(sigma), dtype)
-    found = kept.get(key)
-    if found is None:
-        found = _Weights(likelihood, sigma, dtype)
-        _kept[likelihood] = {**kept, key: found}  # never changed, so that threads may share it
-    return found
-
-
 def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """relu(x W^T + b), in one operation where oneDNN has it.  (m, k), (n, k), (n,) -> (m, n)."""
     if _FUSES:
@@ -322,3 +304,4 @@ def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 _FUSES = has_onednn()
+KEPT: Kept[_Weights] = Kept()

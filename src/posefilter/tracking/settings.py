@@ -63,6 +63,7 @@ class TrackerSettings:
         walk: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
+        fit_points: Image points that a pose is scored from in these fits.
         jump: Log odds against a jump to what the network proposes, while the object is tracked
             [nat]; so that it does not flip between faces that look alike.
         epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -89,13 +90,14 @@ class TrackerSettings:
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
     rounds: int = 1
+    fit_points: int = 128
     jump: float = 5.0
     epsilon: float = 0.15
     quantile: float = 0.95
     cell: float = 0.03
-    look_around: int = 1
-    side: int = 128
-    reach: float = 1.6
+    look_around: int = 4
+    side: int = 320
+    reach: float = 1.25
     noise: float = 0.0015
     lost_below: float = 0.3
     found_above: float = 0.5
@@ -104,7 +106,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, look_around=0, side=64, patience=1, full_every=0)
+        check_whole(self, rounds=0, fit_points=1, look_around=0, side=64, patience=1, full_every=0)
         if not (min(self.walk, self.noise, self.jump) >= 0 and self.reach >= 1):
             raise UserError("tracker: walk, noise and jump must be 0 or more, reach 1 or more")
         if not 0 <= self.lost_below <= self.found_above <= 1:

@@ -167,7 +167,8 @@ class Track:
         scene = self.method.encode(batch)
         against = 0.0 if self.watch.lost else settings.jump
         glance = Glance(self.method, scene, effort.points, effort.proposals, against)
-        refine = QuadraticFit(settings.rounds) if settings.rounds else NoRefine()
+        fit = QuadraticFit(settings.rounds, pixels=settings.fit_points)
+        refine = fit if settings.rounds else NoRefine()
         filter = ParticleFilter(
             particles=predicted.belief.state.shape[1],
             steps=effort.steps,
