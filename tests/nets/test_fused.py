@@ -162,3 +162,17 @@ def test_weights_are_computed_once_for_a_noise_level(monkeypatch: pytest.MonkeyP
         for sigma in (0.008, 0.004, 0.008, 0.004):
             likelihood(image, poses, torch.tensor(sigma), CENTER, RADIUS, 8, g)
     assert len(made) == 2
+
+
+def test_every_parameter_that_weights_depend_on_is_watched() -> None:
+    g = torch.Generator().manual_seed(0)
+    image, poses, likelihood = make_images(g), make_poses(g), make_likelihood(FEATURES)
+    noise = torch.randn(B, 1, 20, 2, generator=g)
+    arguments = (likelihood, image, poses, torch.tensor(0.02), CENTER, RADIUS, noise)
+    with torch.no_grad():
+        for parameter in likelihood.parameters():
+            fused.score(*arguments)
+            parameter.mul_(1.1)
+            kept = fused.score(*arguments)
+            fused.KEPT.clear()
+            assert torch.equal(kept, fused.score(*arguments))

@@ -11,7 +11,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project
@@ -99,7 +99,7 @@ def score(
     # a video asks at the same few noise levels in every frame
     weights = KEPT.get(
         likelihood,
-        likelihood.parameters(),
+        _list_parameters(likelihood),
         (float(sigma), dtype),
         lambda: _Weights(likelihood, sigma, dtype),
     )
@@ -242,6 +242,16 @@ def _columns(octaves: int) -> list[int]:
     """
     waves = [3 + axis * octaves + k for k in range(octaves) for axis in range(3)]
     return [0, 1, 2, *waves, *(3 * octaves + i for i in waves)]
+
+
+def _list_parameters(likelihood: "PoseLikelihood") -> list[Tensor]:
+    """Return what `_Weights` depends on; `parameters()` searches all modules, a ms a frame."""
+    layers = [likelihood.enter, *likelihood.modulate, likelihood.leave]
+    for block in likelihood.blocks:
+        assert isinstance(block, ResnetFC)
+        layers += [block.inner, block.outer]
+    own = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    return [one for layer in own for one in (layer.weight, layer.bias)]
 
 
 class _Weights:

@@ -38,10 +38,10 @@ class Kept(Generic[T]):
             key: Tells the module's values from each other.
             make: Computes it.
         """
-        tensors = [*of]
-        if any(one.is_inference() for one in tensors):  # these do not tell when they change
+        try:
+            state = tuple([(one.data_ptr(), one._version) for one in of])
+        except RuntimeError:  # a tensor of inference mode does not tell when it changes
             return make()
-        state = tuple((one.data_ptr(), one._version) for one in tensors)
         entry = self._entries.get(module)
         known = {} if entry is None or entry.state != state else entry.values
         if key in known:

@@ -21,7 +21,8 @@ class Effort:
     Attributes:
         least: Particles of the belief at least.
         most: Particles at most; KLD sampling chooses between.
-        proposals: Particles that the network proposes, beside them.
+        proposals: Particles that the network proposes, beside them, in frames of which it sees the
+            whole image.
         steps: Likelihood steps.
         start: Noise level of the first step [m].
         stop: Noise level of the last [m].
@@ -86,7 +87,7 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(48, 300, 8, 1, 0.008, 0.008, 64)
+    follow: Effort = Effort(40, 300, 8, 1, 0.008, 0.008, 48)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
     rounds: int = 1
