@@ -87,7 +87,7 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(40, 300, 8, 1, 0.008, 0.008, 48)
+    follow: Effort = Effort(32, 300, 8, 1, 0.008, 0.008, 64)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
     rounds: int = 1
