@@ -153,6 +153,7 @@ RANGES: dict[str, Range] = {
     },
     "tracker.walk": Range(0, 100),
     "tracker.rounds": _whole(0, 10_000),
+    "tracker.fit_points": COUNT,
     "tracker.jump": Range(0, 1000),
     "tracker.epsilon": POSITIVE,
     "tracker.quantile": Range(0, 0.999_999_999, above=True),

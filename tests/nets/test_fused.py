@@ -118,3 +118,61 @@ def test_a_likelihood_with_context_refuses_images_without() -> None:
     image, poses, likelihood = make_images(g, False), make_poses(g), make_likelihood(FEATURES)
     with torch.no_grad(), pytest.raises(UserError, match="model/proposals=dense"):
         likelihood(image, poses, torch.tensor(0.02), CENTER, RADIUS, 8, g)
+
+
+def test_what_is_kept_of_a_network_goes_when_the_network_changes() -> None:
+    g = torch.Generator().manual_seed(0)
+    image, poses, likelihood = make_images(g), make_poses(g), make_likelihood(FEATURES)
+    noise = torch.randn(B, 1, 20, 2, generator=g)
+
+    def score(sigma: float) -> torch.Tensor:
+        return fused.score(likelihood, image, poses, torch.tensor(sigma), CENTER, RADIUS, noise)
+
+    def anew(sigma: float) -> torch.Tensor:
+        fused.KEPT.clear()
+        return score(sigma)
+
+    with torch.no_grad():
+        first = score(0.02)
+        assert torch.equal(score(0.02), first)
+        assert not torch.allclose(score(0.1), first)  # of another noise level
+        likelihood.modulate[2].bias.add_(0.3)
+        changed = score(0.02)
+        assert not torch.allclose(changed, first)
+        assert torch.equal(changed, anew(0.02))
+        state = {k: 0.5 * v for k, v in likelihood.state_dict().items()}
+        likelihood.load_state_dict(state, assign=True)  # other tensors of the same versions
+        halved = score(0.02)
+        assert not torch.allclose(halved, changed)
+        assert torch.equal(halved, anew(0.02))
+        for level in range(70):
+            score(0.01 + 0.001 * level)
+        assert 1 <= fused.KEPT.count(likelihood) <= 32
+
+
+def test_weights_are_computed_once_for_a_noise_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    g = torch.Generator().manual_seed(0)
+    image, poses, likelihood = make_images(g), make_poses(g), make_likelihood(FEATURES)
+    made = []
+    init = fused._Weights.__init__
+    monkeypatch.setattr(
+        fused._Weights, "__init__", lambda self, *given: (made.append(given), init(self, *given))[1]
+    )
+    with torch.no_grad():
+        for sigma in (0.008, 0.004, 0.008, 0.004):
+            likelihood(image, poses, torch.tensor(sigma), CENTER, RADIUS, 8, g)
+    assert len(made) == 2
+
+
+def test_every_parameter_that_weights_depend_on_is_watched() -> None:
+    g = torch.Generator().manual_seed(0)
+    image, poses, likelihood = make_images(g), make_poses(g), make_likelihood(FEATURES)
+    noise = torch.randn(B, 1, 20, 2, generator=g)
+    arguments = (likelihood, image, poses, torch.tensor(0.02), CENTER, RADIUS, noise)
+    with torch.no_grad():
+        for parameter in likelihood.parameters():
+            fused.score(*arguments)
+            parameter.mul_(1.1)
+            kept = fused.score(*arguments)
+            fused.KEPT.clear()
+            assert torch.equal(kept, fused.score(*arguments))

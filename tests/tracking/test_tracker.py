@@ -51,6 +51,27 @@ def test_the_network_sees_a_window_and_now_and_then_the_whole_image() -> None:
         assert whole or max(toy.encoded[0]) <= 64
 
 
+def test_the_network_proposes_poses_where_it_sees_the_whole_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, TrackerSettings(look_around=3, side=64))
+    toy.truth = walk_pose(1)[0]
+    tracker.update(RGB, DEPTH, K)
+    asked, propose = [], toy.propose_poses
+    monkeypatch.setattr(
+        toy, "propose_poses", lambda *given: (asked.append(given[1]), propose(*given))[1]
+    )
+    for frame in range(1, 10):
+        asked.clear()
+        toy.encoded.clear()
+        result = tracker.update(RGB, DEPTH, K)
+        whole = frame % 3 == 0
+        assert ((120, 160) in toy.encoded) == whole
+        assert asked == ([tracker.settings.follow.proposals] if whole else [])
+        assert off(result, toy.truth) < 0.01
+
+
 def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
     toy, estimator = make_toy()
     tracker = posefilter.Tracker(estimator)

@@ -4,6 +4,7 @@ A method predicts by itself. Lightning and torchmetrics, which train and test it
 import, so that a method becomes a LightningModule only where that is needed: see `with_lightning`.
 """
 
+import itertools
 import logging
 import time
 from collections.abc import Callable, Iterable
@@ -78,6 +79,7 @@ class PoseEstimator(Module):
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
         self._object_model: ObjectModel | None = None
+        self._first: tuple[nn.Module, ...] = ()  # the first module that has weights
         self._scores: Any = None  # made when they are first asked for
         self.seconds_per_image: list[float] = []
         self.skipped_steps = self.skipped_in_a_row = 0  # whose gradient was not finite
@@ -138,7 +140,13 @@ class PoseEstimator(Module):
     @property
     def device(self) -> torch.device:
         """Where the weights are."""
-        return next((weight.device for weight in self.parameters()), torch.device("cpu"))
+        # asked for many times a frame, and a search of all modules takes long
+        for module in itertools.chain(self._first, self.modules()):
+            for weight in module._parameters.values():
+                if weight is not None:
+                    self._first = self._first or (module,)
+                    return weight.device
+        return torch.device("cpu")
 
     @property
     def scores(self) -> Any:

@@ -43,6 +43,10 @@ class PoseScene(NamedTuple):
             )
         return torch.sigmoid(self.coordinates.logit)[:, None]
 
+    def draw_evenly(self) -> "PoseScene":
+        """Return the same images, whose poses are scored by points that are drawn evenly."""
+        return self._replace(image=self.image._replace(even=True))
+
     def first(self, count: int) -> "PoseScene":
         """Return the first `count` images."""
         return PoseScene(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]

@@ -5,7 +5,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.geometry.camera import back_project, pixel_grid, rays
-from posefilter.nets.layers import ResBlock, conv_norm, fast_bfloat16
+from posefilter.nets.folded import ConvNorm
+from posefilter.nets.layers import ResBlock, fast_bfloat16
 
 
 def masked_mean_pool(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -95,12 +96,12 @@ class UNet(nn.Module):
             widths: Channels at strides 4, 8, 16 and 32, multiples of 8.
         """
         a, b, c, d = widths
-        self.color = conv_norm(3, 24, stride=2)
-        self.enter = conv_norm(24 + 7, a, stride=2)
+        self.color = ConvNorm(3, 24, stride=2)
+        self.enter = ConvNorm(24 + 7, a, stride=2)
         self.down4 = ResBlock(a)
-        self.down8 = nn.Sequential(conv_norm(a, b, 2), ResBlock(b))
-        self.down16 = nn.Sequential(conv_norm(b, c, 2), ResBlock(c), ResBlock(c))
-        self.down32 = nn.Sequential(conv_norm(c, d, 2), ResBlock(d), ResBlock(d))
+        self.down8 = nn.Sequential(ConvNorm(a, b, 2), ResBlock(b))
+        self.down16 = nn.Sequential(ConvNorm(b, c, 2), ResBlock(c), ResBlock(c))
+        self.down32 = nn.Sequential(ConvNorm(c, d, 2), ResBlock(d), ResBlock(d))
         self.to16, self.up16 = nn.Conv2d(d, c, 1), ResBlock(c)
         self.to8 = nn.Conv2d(c, b, 1)
 
@@ -115,7 +116,7 @@ class UNet(nn.Module):
             Maps of stride 4 (from the downward path) and 8 (from the upward path).
         """
         x = self.color((rgb * 2 - 1).contiguous(memory_format=torch.channels_last))
-        x4 = self.down4(self.enter(torch.cat([x, shape], dim=1)))
+        x4 = self.down4(self.enter(torch.cat([x, shape.to(x.dtype)], dim=1)))
         x8 = self.down8(x4)
         x16 = self.down16(x8)
         x32 = self.down32(x16)

@@ -11,13 +11,14 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import argmin
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import STRIDE, Context
+from posefilter.nets.kept import Kept
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.linear import has_onednn
 
@@ -95,7 +96,13 @@ def score(
         tables = make_tables(image.context)
     octaves = likelihood.octaves
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
-    weights = _Weights(likelihood, sigma, dtype)
+    # a video asks at the same few noise levels in every frame
+    weights = KEPT.get(
+        likelihood,
+        _list_parameters(likelihood),
+        (float(sigma), dtype),
+        lambda: _Weights(likelihood, sigma, dtype),
+    )
     context = None if tables is None else tables.smooth
     scores = weights.score(inputs.flatten(1), context, cells).view(inside.shape)
     return likelihood.pool(scores, inside, likelihood.level(sigma.reshape(1)), poses, center)
@@ -237,6 +244,16 @@ def _columns(octaves: int) -> list[int]:
     return [0, 1, 2, *waves, *(3 * octaves + i for i in waves)]
 
 
+def _list_parameters(likelihood: "PoseLikelihood") -> list[Tensor]:
+    """Return what `_Weights` depends on; `parameters()` searches all modules, a ms a frame."""
+    layers = [likelihood.enter, *likelihood.modulate, likelihood.leave]
+    for block in likelihood.blocks:
+        assert isinstance(block, ResnetFC)
+        layers += [block.inner, block.outer]
+    own = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    return [one for layer in own for one in (layer.weight, layer.bias)]
+
+
 class _Weights:
     """The likelihood's network at one noise level."""
 
@@ -297,3 +314,4 @@ def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 _FUSES = has_onednn()
+KEPT: Kept[_Weights] = Kept()

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from posefilter.nets.folded import ConvNorm
 from posefilter.nets.linear import Linear
 
 
@@ -42,29 +43,14 @@ class ResnetFC(nn.Module):
         return x + self.outer(torch.relu(self.inner(torch.relu(x))))
 
 
-def conv_norm(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """Return a 3 x 3 convolution, batch norm and ReLU.
-
-    Batch norm's statistics do not depend on the image's size: training uses crops, evaluation whole
-    images.
-    """
-    return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, padding=1, bias=False),
-        nn.BatchNorm2d(outputs),
-        nn.ReLU(inplace=True),
-    )
-
-
 class ResBlock(nn.Module):
     """Two 3 x 3 convolutions with batch norm and a skip."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.first = conv_norm(width, width)
-        self.second = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1, bias=False), nn.BatchNorm2d(width)
-        )
+        self.first = ConvNorm(width, width)
+        self.second = ConvNorm(width, width, relu=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, width, H, W) -> (B, width, H, W)."""
-        return torch.relu(x + self.second(self.first(x)))
+        return self.second.add_relu(self.first(x), x)

@@ -23,6 +23,7 @@ from posefilter.geometry.camera import project, rays
 from posefilter.geometry.lookup import gather_rows
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
+from posefilter.nets.even_points import draw_evenly
 from posefilter.nets.fused import Tables, applies, missing_context, score
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
@@ -38,11 +39,13 @@ class Pixels(NamedTuple):
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: Context | None = None  # output of the coordinate network
     tables: Tables | None = None  # of the context, where poses are scored without gradient
+    even: bool = False  # whether a pose's image points are drawn evenly instead of independently
 
     def first(self, count: int) -> "Pixels":
         """Return the first `count` images."""
         context = None if self.context is None else self.context.first(count)
-        return Pixels(self.values[:count], self.size, self.intrinsics[:count], context)
+        values, K = self.values[:count], self.intrinsics[:count]
+        return Pixels(values, self.size, K, context, even=self.even)
 
 
 class Points(NamedTuple):
@@ -238,7 +241,10 @@ class PoseLikelihood(nn.Module):
         Returns:
             Log-likelihoods (B, N).
         """
-        noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
+        if image.even:
+            noise = draw_evenly(len(poses), pixels, generator, poses.device)
+        else:
+            noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
         if applies(poses.device) and sigma.numel() == 1:
             half = torch.is_autocast_enabled("cpu")
             dtype = torch.get_autocast_dtype("cpu") if half else poses.dtype

@@ -39,7 +39,7 @@ class QuadraticFit:
     def __init__(
         self,
         rounds: int = 1,
-        pairs: int = 24,
+        pairs: int = 16,
         spread: float = 0.006,
         sigma: float = 0.004,
         pixels: int = 256,
@@ -56,8 +56,7 @@ class QuadraticFit:
         scorer, best, space = require_scorer(method), belief.best, method.space
         for _ in range(self.rounds):
             scale = space.noise_scale(best.new_tensor(self.spread))
-            shape = (len(best), self.pairs, space.dimensions)
-            noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)
+            noise = draw_orthogonal(best, self.pairs, space.dimensions, generator)
             moves = torch.cat([noise, -noise], dim=1) * scale
             poses = space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
             scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
@@ -65,6 +64,36 @@ class QuadraticFit:
             best = space.move(best, find_maximum(noise, up, down, self.reach) * scale)
         score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
         return belief._replace(best=best, score=score)
+
+
+def draw_orthogonal(like: Tensor, pairs: int, dimensions: int, generator: Generator) -> Tensor:
+    """Draw perturbations that are at right angles to each other, in groups of as many as there are
+    dimensions.
+
+    Each is distributed as a standard normal vector. In a group the error of one axis' slope does
+    not enter another's, so that fewer pairs are needed than of independent vectors.
+
+    Args:
+        like: (B, ...) gives number of images, type and device.
+        pairs: Number of perturbations, P.
+        dimensions: Of a perturbation, D.
+        generator: Source of randomness.
+
+    Returns:
+        Perturbations (B, P, D).
+
+    References:
+        Mezzadri: How to generate random matrices from the classical compact groups. Notices of the
+            AMS 54 (2007).
+    """
+    groups = -(-pairs // dimensions)
+    shape = (len(like), groups, dimensions, dimensions)
+    draw = torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
+    turn, triangle = torch.linalg.qr(draw)
+    # with these signs it is uniform over all turns
+    turn = turn * triangle.diagonal(dim1=-2, dim2=-1).sign()[..., None, :]
+    length = draw.norm(dim=-2, keepdim=True)  # of columns, independent of where they point
+    return (turn * length).mT.flatten(1, 2)[:, :pairs]
 
 
 def find_maximum(noise: Tensor, up: Tensor, down: Tensor, reach: float) -> Tensor:

@@ -1,5 +1,7 @@
 """A method as tracking uses it: its own network and likelihood, with fewer image points a pose."""
 
+from typing import Protocol, runtime_checkable
+
 import torch
 from torch import Generator, Tensor
 
@@ -23,6 +25,15 @@ def check_method(method: PoseEstimator) -> None:
         )
 
 
+@runtime_checkable
+class DrawsEvenly(Protocol):
+    """An encoded frame that can have its poses scored by points that are drawn evenly."""
+
+    def draw_evenly(self) -> Scene:
+        """Return the frame, so set."""
+        ...
+
+
 class Glance:
     """An encoded frame whose poses are scored by few image points: a `Method` for the filter.
 
@@ -44,7 +55,9 @@ class Glance:
         jumps: int = 0,
         against: float = 0.0,
     ) -> None:
-        self.method, self.scene, self.points = method, scene, points
+        self.method, self.points = method, points
+        # few points tell more of a pose where they are spread evenly
+        self.scene = scene.draw_evenly() if isinstance(scene, DrawsEvenly) else scene
         self.jumps, self.against = jumps, against
 
     @property

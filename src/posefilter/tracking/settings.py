@@ -21,7 +21,8 @@ class Effort:
     Attributes:
         least: Particles of the belief at least.
         most: Particles at most; KLD sampling chooses between.
-        proposals: Particles that the network proposes, beside them.
+        proposals: Particles that the network proposes, beside them, in frames of which it sees the
+            whole image.
         steps: Likelihood steps.
         start: Noise level of the first step [m].
         stop: Noise level of the last [m].
@@ -63,6 +64,7 @@ class TrackerSettings:
         walk: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
+        fit_points: Image points that a pose is scored from in these fits.
         jump: Log odds against a jump to what the network proposes, while the object is tracked
             [nat]; so that it does not flip between faces that look alike.
         epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -85,17 +87,18 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(48, 300, 8, 1, 0.008, 0.008, 64)
+    follow: Effort = Effort(32, 300, 8, 1, 0.008, 0.008, 64)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
     walk: float = 0.4
     rounds: int = 1
+    fit_points: int = 128
     jump: float = 5.0
     epsilon: float = 0.15
     quantile: float = 0.95
     cell: float = 0.03
-    look_around: int = 1
-    side: int = 128
-    reach: float = 1.6
+    look_around: int = 4
+    side: int = 320
+    reach: float = 1.25
     noise: float = 0.0015
     lost_below: float = 0.3
     found_above: float = 0.5
@@ -104,7 +107,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, look_around=0, side=64, patience=1, full_every=0)
+        check_whole(self, rounds=0, fit_points=1, look_around=0, side=64, patience=1, full_every=0)
         if not (min(self.walk, self.noise, self.jump) >= 0 and self.reach >= 1):
             raise UserError("tracker: walk, noise and jump must be 0 or more, reach 1 or more")
         if not 0 <= self.lost_below <= self.found_above <= 1:

@@ -27,7 +27,7 @@ from posefilter.tracking.relevance import measure_presence, measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.watch import LOST, TRACKED, Watch
-from posefilter.tracking.window import clean_depth, cut_window, place_window
+from posefilter.tracking.window import Window, clean_depth, cut_window, place_window
 from posefilter.types import Batch, Belief, Particles, Trace
 
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
@@ -160,18 +160,22 @@ class Track:
 
     def _follow(self, images: Images, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
-        batch = self._take(self._look(images, predicted.best[0]))
+        window = self._choose_window(images, predicted.best[0])
+        batch = self._take(self._look(images, window))
         if not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         effort, settings = self._effort, self.settings
+        # what a window shows is the predicted belief's already
+        proposals = effort.proposals if window is None else 0
         scene = self.method.encode(batch)
         against = 0.0 if self.watch.lost else settings.jump
-        glance = Glance(self.method, scene, effort.points, effort.proposals, against)
-        refine = QuadraticFit(settings.rounds) if settings.rounds else NoRefine()
+        glance = Glance(self.method, scene, effort.points, proposals, against)
+        fit = QuadraticFit(settings.rounds, pixels=settings.fit_points)
+        refine = fit if settings.rounds else NoRefine()
         filter = ParticleFilter(
             particles=predicted.belief.state.shape[1],
             steps=effort.steps,
-            initialize=FromBelief(predicted.belief.state, effort.proposals),
+            initialize=FromBelief(predicted.belief.state, proposals),
             schedule=Geometric(effort.start, effort.stop),
             reweight=Annealed(),
             resample=Systematic(),
@@ -200,14 +204,14 @@ class Track:
     def _effort(self) -> Effort:
         return self.settings.search if self.watch.lost else self.settings.follow
 
-    def _look(self, images: Images, pose: Tensor) -> Batch:
-        """Return the window about the object, or the whole image where it is time for that."""
+    def _choose_window(self, images: Images, pose: Tensor) -> Window | None:
+        """Return the window about the object; None where it is time for the whole image."""
         settings, every = self.settings, self.settings.look_around
         height, width = images.depth.shape[1:]
         # what a window leaves in doubt the whole image may tell
         if not self.watch.sure or (every and self.frames % every == 0):
-            return make_batch(clean_depth(images), *self.size)
-        window = place_window(
+            return None
+        return place_window(
             pose.double().cpu().numpy(),
             self.method.model,
             images.intrinsics[0],
@@ -216,11 +220,13 @@ class Track:
             settings.side,
             settings.reach,
         )
+
+    def _look(self, images: Images, window: Window | None) -> Batch:
+        """Return a window of a photograph, or the whole of it, as the network is to see it."""
         if window is None:
             return make_batch(clean_depth(images), *self.size)
-        return make_batch(
-            clean_depth(cut_window(images, window)), window.seen_width, window.seen_height
-        )
+        part = clean_depth(cut_window(images, window))
+        return make_batch(part, window.seen_width, window.seen_height)
 
     def _take(self, batch: Batch) -> Batch:
         return Batch(*(x.to(self.method.device) for x in batch))
