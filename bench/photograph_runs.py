@@ -168,7 +168,6 @@ def plan() -> list[Run]:
         shipped("mug_f", mug, 1500),
         more("mug_g", mug, 1000, "mug_f"),
         shipped("hammer_e", "048_hammer", 1000),
-        shipped("banana_e", "011_banana", 1000),
     ]
 
 

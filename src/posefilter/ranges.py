@@ -184,6 +184,7 @@ RANGES: dict[str, Range] = {
     "trainer.overfit_batches": BATCHES,
     "trainer.num_nodes": COUNT,
     "trainer.devices": _whole(1, 1024, words=("auto", -1), many=True),
+    "trainer.devices[]": _whole(0, 1023),  # a list names them, from 0
     "every_n_validations": COUNT,
     "save_top_k": _whole(-1, 1000),
     "last.minutes": Range(0, 1e6),
@@ -345,11 +346,13 @@ def find_range(place: str) -> Range | None:
     """Return the range of a setting, None where the table has none.
 
     Args:
-        place: Dotted, the command's name first; without indices of lists.
+        place: Dotted, the command's name first.
     """
     parts = [part.partition("[")[0] for part in place.split(".")]
     ends = [".".join(parts[i:]) for i in range(len(parts))]
-    return next((RANGES[end] for end in ends if end in RANGES), None)
+    entry = "[]" if place.endswith("]") else ""  # one of a list may have a range of its own
+    keys = [key for end in ends for key in (f"{end}{entry}", end)]
+    return next((RANGES[key] for key in keys if key in RANGES), None)
 
 
 def list_values(settings: Any) -> Iterator[tuple[str, Any, bool]]:

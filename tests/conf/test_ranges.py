@@ -191,6 +191,14 @@ def test_lists_are_of_the_settings_that_are_said_to_have_them() -> None:
         check_ranges({"data": {"generate": {"size": [[640], 480]}}}, "train")
 
 
+def test_devices_are_a_count_or_a_list_that_names_them_from_0() -> None:
+    for devices in (2, [0], [0, 1], "auto", -1):
+        check_ranges({"trainer": {"devices": devices}}, "train")
+    for devices in (0, [-1], [0.5], [[0]]):
+        with pytest.raises(UserError, match=r"^trainer\.devices"):
+            check_ranges({"trainer": {"devices": devices}}, "train")
+
+
 @pytest.mark.parametrize("command", ["train", "onboard", "predict"])
 def test_a_number_that_is_made_of_other_settings_is_checked(
     command: str, composed: dict[str, DictConfig]

@@ -1,6 +1,7 @@
 """Train a method, test its best checkpoint, and write down what came of it."""
 
 import logging
+import shlex
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,7 +137,9 @@ def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[
     write_json(file, metrics)
     report = typed("report", run=job.folder)
     evaluate = typed("evaluate", checkpoint=run.best, **places(job), **plugins(job))
-    board = "tensorboard --logdir outputs" if is_installed() else "make board"
+    inside = Path("outputs").resolve() in job.folder.resolve().parents
+    everything = "tensorboard --logdir outputs" if is_installed() else "make board"
+    board = everything if inside else f"tensorboard --logdir {shlex.quote(str(job.folder))}"
     show(
         metrics,
         f"{job.choices['model']}, loss {job.choices['loss']}",
