@@ -51,7 +51,8 @@ def test_the_next_commands_of_few_frames_run(
 ) -> None:
     out = tmp_path / "ten"
     size = ["size=[96,72]", "workers=1", "console=json", "seed=4"]
-    generate(compose_job("generate", CONF, [f"out={out}", "frames=10", *size], tmp_path))
+    one = ["frames=10", "frames_per_scene=10"]
+    generate(compose_job("generate", CONF, [f"out={out}", *one, *size], tmp_path))
     (following,) = json.loads(capsys.readouterr().out)["next"]
     words = shlex.split(following)
     assert words[:2] == ["python", "check_data.py"]

@@ -157,7 +157,7 @@ def test_the_library_gives_what_the_command_gives(
     assert result.decide(Costs(miss=1e6)) != "absent"
     plain = load(weights, device="cpu").predict(rgb, depth, K)
     assert plain.probability is plain.presence is plain.verdict is None
-    assert "calibrate.py" in plain.calibration_note
+    assert "run calibrate" in plain.calibration_note
     other = load(calibrated, overrides=["filter.particles=8"], device="cpu").predict(rgb, depth, K)
     assert other.probability is None
     assert "another filter" in other.calibration_note
