@@ -61,6 +61,7 @@ def toy(mutants: ModuleType, tmp_path: Path) -> tuple:
     return mutants.Place(tmp_path, "toy")
 
 
+@pytest.mark.slow
 def test_a_planted_mutant_is_killed_and_an_equal_one_survives(
     mutants: ModuleType, toy: tuple, tmp_path: Path
 ) -> None:

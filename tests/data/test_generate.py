@@ -232,6 +232,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_processes_do_not_change_what_is_written(alone: Path, tmp_path: Path) -> None:
     generate(tmp_path / "two", 7, **{**SETTINGS, "workers": 2})
     assert contents(tmp_path / "two") == contents(alone)

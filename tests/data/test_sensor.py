@@ -123,6 +123,7 @@ def test_an_unknown_sensor_is_named() -> None:
         sensor_model("lidar")
 
 
+@pytest.mark.slow
 def test_real_depth_could_have_come_from_it(real_data: Path) -> None:
     shares, holes = [], []
     for path in sorted((real_data / "ycbv" / "data").glob("*/*-depth.png")):

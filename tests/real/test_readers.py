@@ -129,6 +129,7 @@ def test_a_real_fat_pose_puts_the_mesh_into_its_cuboid(real_data, meshes, banana
     assert not reader.notes  # the mesh is the one that FAT measured
 
 
+@pytest.mark.slow
 def test_the_wood_block_of_fat_has_no_geometry(real_data, meshes, banana):
     settings = json.loads((real_data / "fat" / "nvdu_ycb_original.json").read_text())
     (banana / "_object_settings.json").write_text(json.dumps(settings))

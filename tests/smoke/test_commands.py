@@ -253,6 +253,7 @@ def test_a_view_that_cannot_be_written_is_refused_before_the_work(
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["pixel_pf", "patch_pf", "cnn_patch", "downsized"])
 def test_every_image_space_method_goes_the_whole_way(model: str, tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     train(tiny_job(tmp_path, f"model={model}", "trainer.max_steps=4"))
@@ -278,6 +279,7 @@ def test_a_training_shorter_than_its_interval_is_validated_at_its_end(
     assert (tmp_path / "checkpoints" / "best.ckpt").is_file()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result_and_another_another(tiny_job, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     found = []
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):

@@ -19,6 +19,7 @@ FEW = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", FEW)
 def test_a_training_repeats_and_its_checkpoint_predicts(
     model: str, tiny_job: Callable[..., Job], tmp_path: Path

@@ -38,6 +38,7 @@ def train(root: Path, out: Path, *typed: str) -> int:
     return run_command("train", None, [*folder, *TINY, f"data.root={root}", f"out={out}", *typed])
 
 
+@pytest.mark.slow
 def test_method_reader_and_loss_of_ones_own(
     npz_scenes: Path,
     tmp_path: Path,
@@ -103,6 +104,7 @@ def forget_trust(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     installed.cache_clear()
 
 
+@pytest.mark.slow
 def test_likelihood_of_ones_own(
     tiny_scenes: Path,
     tmp_path: Path,

@@ -11,6 +11,7 @@ from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 from posefilter.cli import run_command
 
 
+@pytest.mark.slow
 def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -59,6 +59,7 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert run_command("track", HOME, typed) == 2  # nothing is overwritten
 
 
+@pytest.mark.slow
 def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None:
     """Its frames are of one scene each: a video of one frame is a single estimate."""
     root = SCENE.parents[1]

@@ -41,6 +41,7 @@ def test_two_images_are_memorized(tiny_scenes: Path, tmp_path: Path) -> None:
     assert "two words" in told
 
 
+@pytest.mark.slow
 def test_a_profile_is_written(tiny_scenes: Path, tmp_path: Path) -> None:
     typed = ["debug=profiler", *TOY, "filter.particles=4", "filter.steps=2", "trainer.max_steps=2"]
     typed += ["model=cnn_patch", "callbacks=checkpoints"]
