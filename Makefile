@@ -9,7 +9,7 @@ MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized dense_coordinates keypoi
 .PHONY: help setup train test test-all check format smoke bench methods board report tour pictures weights docs tables clean
 
 help: ## print this list
-	@awk 'BEGIN {FS = ":.*## "} /^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: $(STAMP) ## make the virtual environment and install the project (once)
 

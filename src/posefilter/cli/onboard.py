@@ -231,9 +231,8 @@ def train(work: Onboarding) -> None:
             seconds = speed.step if steps == _FEWEST_STEPS else min(speed.step, room / steps)
         work.stages.keep(steps=int(steps), seconds_per_step=seconds, seconds_per_image=speed.image)
         duration = format_duration(steps * seconds)
-        sentence = f"{steps} steps of {seconds:.2f} s each: {duration}"
-        if work.cfg.steps is None:
-            sentence = f"at most {steps} steps in {duration}"
+        fixed = f"{steps} steps of {seconds:.2f} s each: {duration}"
+        sentence = fixed if work.cfg.steps else f"at most {steps} steps in {duration}"
         say(console, "steps", sentence, steps=steps, seconds_per_step=seconds)
     if work.cfg.steps is None:  # the machine may turn out slower than it was measured
         seconds = values["steps"] * values["seconds_per_step"]
