@@ -9,6 +9,7 @@ Needs numpy, onnxruntime, and opencv-python-headless to read the images.
 import json
 import sys
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import onnxruntime
@@ -59,7 +60,7 @@ class PoseFilter:
 
     def score(self, scene, poses, sigma, points, rng):
         """Log-likelihoods (N,) at a noise level [m], from so many image points."""
-        noise = rng.standard_normal((points, 2), dtype=np.float32)
+        noise = draw_points(points, self.settings["even_points"], rng)
         given = {"poses": poses, "sigma": np.array(sigma, np.float32), "noise": noise, **scene}
         names = [one.name for one in self.measure.get_inputs()]
         return self.measure.run(None, {name: given[name] for name in names})[0]
@@ -97,6 +98,15 @@ class PoseFilter:
             weight = softmax(self.score(scene, near, sigma, pixels, rng))
             best = move(best[None], (weight[:, None] * moves).sum(0)[None], self.center)[0]
         return best, self.score(scene, best[None], sigma, pixels, rng)[0]
+
+
+def draw_points(count, even, rng):
+    """Standard normal points (count, 2), independent or from an even sequence, shifted."""
+    if not even:
+        return rng.standard_normal((count, 2), dtype=np.float32)
+    step = [0.7548776662466927, 0.5698402909980532]
+    square = (np.arange(count)[:, None] * step + rng.random(2)) % 1
+    return np.float32(np.vectorize(NormalDist().inv_cdf)(square.clip(1e-7, 1 - 1e-7)))
 
 
 def softmax(x):

@@ -262,6 +262,7 @@ RANGES: dict[str, Range] = {
     "glimpse.size": _whole(1, 1024),
     "glimpse.spacing": Range(0, 1024, above=True),
     "likelihood.spread": POSITIVE,
+    "likelihood.surface.points": _whole(1, 4096),
     "displacement.reach": Range(0, 10, above=True),
     "candidate_sampler.rays": COUNT,
     "candidate_sampler.samples": COUNT,

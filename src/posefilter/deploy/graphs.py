@@ -125,8 +125,10 @@ class ScorePoses(nn.Module):
         image = Pixels(values[None], self.size, network_intrinsics[None], context)
         center = self.get_buffer("center")
         points = sample_points(image, poses[None], center, self.radius, noise[None, None])
-        assert isinstance(self.likelihood, PoseLikelihood)
-        return self.likelihood.score_sampled(points, poses[None], sigma, center, self.radius)[0]
+        judge, hypotheses = self.likelihood, poses[None]
+        assert isinstance(judge, PoseLikelihood)
+        score = judge.score_sampled(points, hypotheses, sigma, center, self.radius)
+        return (score + judge.judge_surface(image, hypotheses, sigma, center, self.radius))[0]
 
 
 class EncodePixelScene(nn.Module):

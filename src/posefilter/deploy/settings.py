@@ -35,6 +35,7 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         "particles": own.particles,
         "levels": [float(level) for level in own.schedule(own.steps)],
         "points": method.pixels if isinstance(method, PosePF) else None,
+        "even_points": isinstance(method, PosePF) and method.even_points,
         "latent_width": method.latent_width,
         "initialize": _describe_start(own.initialize),
         "resample": _choose(own.resample, "resample", systematic=resample.Systematic,
@@ -62,7 +63,8 @@ def check_method(method: PoseEstimator) -> None:
     contextual = isinstance(likelihood, PoseLikelihood) and likelihood.context is not None
     if method.proposals is None or not contextual:
         raise UserError(
-            "format: of pose_pf only model/proposals=dense with model/likelihood=contextual is "
+            "format: of pose_pf only model/proposals=dense with model/likelihood=surface or "
+            "contextual is "
             "exported"
         )
 

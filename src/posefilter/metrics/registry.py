@@ -261,6 +261,17 @@ _METRICS = (
         "by a wrong pose",
         "more particles cannot correct these",
     ),
+    MetricInfo(
+        "belief/truth_outscored_by_misplaced",
+        "images in which a pose of wrong ADD-S outscores the truth",
+        "%",
+        ".1f",
+        LOWER,
+        100.0,
+        PERCENT,
+        "by a misplaced pose",
+        "no look-alike of the truth",
+    ),
     # calibrated probabilities, on frames with the object and without
     MetricInfo("confidence/frames", "frames with the object", form=".0f"),
     MetricInfo("confidence/frames_without", "frames without the object", form=".0f"),

@@ -21,6 +21,10 @@ from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 log = logging.getLogger(__name__)
 
+# images in which the estimate scores higher than the truth: all, those whose ADD is wrong, and
+# those whose ADD-S is
+_OUTSCORED = ("truth_outscored", "truth_outscored_by_wrong", "truth_outscored_by_misplaced")
+
 
 class PoseScene(NamedTuple):
     """Encoded images: their pixels, and the output of the proposal network (None without one)."""
@@ -60,6 +64,8 @@ class PosePF(PoseParticles):
         candidate_sampler: Draws the candidates that the likelihood is trained on.
         proposals: Network of dense object coordinates that initial poses are drawn from, or None.
         pixels: Image points that each pose is scored from, at each step of the filter.
+        even_points: Whether these are drawn evenly (nets/even_points.py), with less noise in the
+            score, instead of independently. Training draws them independently.
         train_pixels: The same in training.
         likelihood_batch_size: Images of a batch that the likelihood is trained on; None: all. The
             proposal network, which needs more of them, is always trained on all.
@@ -68,7 +74,8 @@ class PosePF(PoseParticles):
     """
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
-    test_only_settings = ("filter", "train_filter", "pixels")  # training rolls out no filter
+    # training rolls out no filter
+    test_only_settings = ("filter", "train_filter", "pixels", "even_points")
     # for comparing the scores of estimate and truth: image points, noise level [m]
     comparison_pixels, comparison_sigma = 4096, 0.004
 
@@ -78,6 +85,7 @@ class PosePF(PoseParticles):
         candidate_sampler: CandidateSampler,
         proposals: ObjectCoordinateNet | None = None,
         pixels: int = 64,
+        even_points: bool = False,
         train_pixels: int = 48,
         likelihood_batch_size: int | None = None,
         proposal_weight: float = 1.0,
@@ -89,20 +97,20 @@ class PosePF(PoseParticles):
             proposals,
             candidate_sampler,
         )
-        self.pixels, self.train_pixels, self.likelihood_batch_size = (
-            pixels,
-            train_pixels,
-            likelihood_batch_size,
-        )
+        self.pixels, self.even_points, self.train_pixels = pixels, even_points, train_pixels
+        self.likelihood_batch_size = likelihood_batch_size
         self.proposal_weight = proposal_weight
 
     def encode(self, batch: Batch) -> PoseScene:
         """Flatten the images, and run the proposal network once."""
+        even = self.even_points and not self.training
         if self.proposals is None:
-            return PoseScene(flatten_images(batch.rgb, batch.depth, batch.intrinsics), None, None)
+            image = flatten_images(batch.rgb, batch.depth, batch.intrinsics)
+            return PoseScene(image._replace(even=even), None, None)
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         context = coordinates if coordinates.features.shape[-1] else None
         image = flatten_images(batch.rgb, batch.depth, batch.intrinsics, context)
+        image = image._replace(even=even)
         if context is not None and applies(batch.rgb.device):
             assert image.context is not None
             image = image._replace(tables=make_tables(image.context))
@@ -191,8 +199,11 @@ class PosePF(PoseParticles):
         return evidence | measure_coordinates(best, scene.coordinates, scene.cells, self.model)
 
     def set_object(self, model: ObjectModel) -> None:
-        """Set the object of the proposal network too."""
+        """Set the object of the networks too."""
         super().set_object(model)
+        surface = getattr(self.likelihood, "surface", None)
+        if surface is not None:
+            surface.set_object(model.points)
         if self.proposals is not None:
             self.proposals.set_object(model.points, model.center, model.radius)
 
@@ -200,16 +211,17 @@ class PosePF(PoseParticles):
         """Create the metrics, with a count of how often the truth is outscored."""
         from torchmetrics import MeanMetric  # prediction needs none
 
-        counts = {name: MeanMetric() for name in ("truth_outscored", "truth_outscored_by_wrong")}
+        counts = {name: MeanMetric() for name in _OUTSCORED}
         return super().make_metrics() | counts
 
     def update_metrics(self, trace: Trace, batch: Batch) -> None:
         """Add a batch's errors, and whether the estimate scores higher than the truth does.
 
         A refined estimate outscores the truth by a little even where it is right. The likelihood is
-        at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more).
+        at fault where an estimate does so and is wrong (ADD of 0.1 diameters or more), and beyond
+        doubt where its ADD-S is as large: then no look-alike of the truth excuses it.
         """
-        from posefilter.metrics.errors import add  # trees of scipy: prediction needs none
+        from posefilter.metrics.errors import add, add_s  # trees of scipy: prediction needs none
 
         super().update_metrics(trace, batch)
         scene = self.encode(batch)
@@ -218,17 +230,18 @@ class PosePF(PoseParticles):
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(scene, pair, sigma, generator, self.comparison_pixels)
         outscored = scores[:, 0] > scores[:, 1]
-        wrong = (
-            add(trace.belief.best, batch.camera_from_object, self.model.points)
-            > 0.1 * self.model.diameter
+        errors = (
+            error(trace.belief.best, batch.camera_from_object, self.model.points)
+            for error in (add, add_s)
         )
-        self.scores["truth_outscored"].update(outscored.float())
-        self.scores["truth_outscored_by_wrong"].update((outscored & wrong).float())
+        wrong = [outscored & (error > 0.1 * self.model.diameter) for error in errors]
+        for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
+            self.scores[name].update(value.float())
 
     def compute_metrics(self) -> dict[str, Any]:
         """Return the metrics, with the fractions of images in which the truth was outscored."""
         out = super().compute_metrics()
-        for name in ("truth_outscored", "truth_outscored_by_wrong"):
+        for name in _OUTSCORED:
             out["belief"][name] = float(self.scores[name].compute())
         return out
 

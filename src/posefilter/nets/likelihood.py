@@ -27,6 +27,7 @@ from posefilter.nets.even_points import draw_evenly
 from posefilter.nets.fused import Tables, applies, missing_context, score
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
+from posefilter.nets.surface_term import SurfaceTerm
 
 SPREAD = 0.6  # of the pixels that a pose is scored by, in projected radii of the object
 
@@ -151,6 +152,7 @@ class PoseLikelihood(nn.Module):
         scale: Factor on the mean score.
         sigma: Lowest and highest noise level [m].
         context: Features of the coordinate network for each point; None for points without context.
+        surface: A term from the hypothesis's surface, added to the mean score; None for none.
     """
 
     provides: ClassVar[Capabilities] = ("score_points",)
@@ -163,9 +165,10 @@ class PoseLikelihood(nn.Module):
         scale: float = 20.0,
         sigma: tuple[float, float] = (0.003, 0.25),
         context: int | None = None,
+        surface: SurfaceTerm | None = None,
     ) -> None:
         super().__init__()
-        self.context = context
+        self.context, self.surface = context, surface
         self.octaves, self.scale, self.sigma = octaves, scale, (float(sigma[0]), float(sigma[1]))
         surroundings = 0 if context is None else 9 + context
         self.enter = Linear(3 * (2 * octaves + 1) + 7 + surroundings, width)
@@ -249,11 +252,28 @@ class PoseLikelihood(nn.Module):
             half = torch.is_autocast_enabled("cpu")
             dtype = torch.get_autocast_dtype("cpu") if half else poses.dtype
             with torch.autocast("cpu", enabled=False):
-                return score(self, image, poses, sigma, center, radius, noise, dtype)
+                found = score(self, image, poses, sigma, center, radius, noise, dtype)
+                return found + self.judge_surface(image, poses, sigma, center, radius)
         # half precision would round poses to half a millimeter
         with torch.autocast(poses.device.type, enabled=False):
             points = sample_points(image, poses, center, radius, noise)
-        return self.score_sampled(points, poses, sigma, center, radius)
+            surface = self.judge_surface(image, poses, sigma, center, radius)
+        return self.score_sampled(points, poses, sigma, center, radius) + surface
+
+    def judge_surface(
+        self, image: Pixels, poses: Tensor, sigma: Tensor, center: Tensor, radius: float
+    ) -> Tensor | float:
+        """Return the term of the hypotheses' surfaces, 0 without one; arguments as of `forward`.
+
+        -> (B, N).
+        """
+        if self.surface is None:
+            return 0.0
+        member = None if image.context is None else image.context.smooth[..., 0].detach().sigmoid()
+        at = self.level(sigma.expand(len(poses)))
+        what = (image.values, image.size, image.intrinsics, member)
+        term: Tensor = self.surface(*what, poses, sigma, at, center, radius)
+        return term
 
     def score_sampled(
         self, points: Points, poses: Tensor, sigma: Tensor, center: Tensor, radius: float
