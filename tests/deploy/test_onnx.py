@@ -27,7 +27,9 @@ from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
 
 HOME = Path(__file__).parents[2]
-SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"  # one mode: random numbers do not choose
+SCENE = (
+    HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
+)  # one mode: random numbers do not choose
 
 
 def read_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,6 +81,23 @@ def make_pixel_method(*overrides: str) -> PoseEstimator:
 def test_networks_are_those_of_torch(
     exported: Path, estimator: posefilter.Estimator, poses: ModuleType, monkeypatch
 ) -> None:
+    compare_networks(exported, estimator, poses, monkeypatch)
+
+
+@pytest.mark.slow
+def test_the_surface_term_is_exported(poses: ModuleType, tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("onnxscript", reason="needs the extra export")
+    drill = posefilter.load("035_power_drill", device="cpu")
+    assert drill.methods[0].likelihood.surface is not None
+    height, width = read_scene()[1].shape
+    write_filter(drill.methods[0], tmp_path, width, height, "onnx")
+    compare_networks(tmp_path, drill, poses, monkeypatch)
+
+
+def compare_networks(
+    exported: Path, estimator: posefilter.Estimator, poses: ModuleType, monkeypatch
+) -> None:
+    """Assert that what was exported gives what torch gives."""
     monkeypatch.setattr("posefilter.nets.encoding.fast_bfloat16", lambda device: False)
     rgb, depth, K = read_scene()
     graphs = make_graphs(estimator.methods[0], depth.shape[1], depth.shape[0])
@@ -98,7 +117,7 @@ def test_networks_are_those_of_torch(
             own.center, own.radius, count, draw,
         )  # fmt: skip
         scores = own.score(scene, states, sigma, points, np.random.default_rng(1))
-        noise = np.random.default_rng(1).standard_normal((points, 2), dtype=np.float32)
+        noise = poses.draw_points(points, own.settings["even_points"], np.random.default_rng(1))
         tensors = [torch.from_numpy(one) for one in (states, noise)]
         with torch.no_grad():
             same = graphs.measure.network(tensors[0], torch.tensor(sigma), tensors[1], *truth[:5])
