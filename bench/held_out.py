@@ -11,8 +11,8 @@ images (95 %, percentile bootstrap). With --out, rows are added to those of the 
 
 Objects that the frame cuts off, and those whose pixels are few, have figures of their own.
 
-Errors are of the surface points that a checkpoint carries, 200 in those that ship. ADD-S of few
-points is lower than of many: compare files that carry as many.
+ADD-S of few surface points is lower than of many. Files carry 200 or 2,000 of them: all files of an
+object are judged by those of the one that carries the most.
 """
 
 import argparse
@@ -99,15 +99,27 @@ def measure_kinds(
     return out
 
 
-def test(checkpoint: str, frames: Sequence[tuple[str, Sample]]) -> dict[str, Any]:
-    """Return the row of one checkpoint."""
+def choose_points(checkpoints: Sequence[str]) -> dict[str, torch.Tensor]:
+    """Return each object's surface points, of the file that carries the most, (P, 3) [m]."""
+    out: dict[str, torch.Tensor] = {}
+    for checkpoint in checkpoints:
+        model = posefilter.load(checkpoint, device="cpu").models[0]
+        if len(model.points) > len(out.get(model.name, ())):
+            out[model.name] = model.points.double()
+    return out
+
+
+def test(
+    checkpoint: str, frames: Sequence[tuple[str, Sample]], points: torch.Tensor
+) -> dict[str, Any]:
+    """Return the row of one checkpoint.  points (P, 3) [m]."""
     estimator = posefilter.load(checkpoint, device="cpu")
     model = estimator.models[0]
     results = [estimator.predict(s.rgb, s.depth, s.intrinsics) for _, s in frames]
     poses = torch.from_numpy(np.stack([result.pose for result in results]))
     truth = torch.from_numpy(np.stack([s.camera_from_object for _, s in frames])).double()
     scenes = [scene for scene, _ in frames]
-    plain, symmetric = (f(poses, truth, model.points.double()) for f in (add, add_s))
+    plain, symmetric = (f(poses, truth, points) for f in (add, add_s))
     recall = [float((e < 0.1 * model.diameter).double().mean()) for e in (plain, symmetric)]
     path = Path(checkpoint)
     name = path.stem if path.parent.name != "checkpoints" else path.parents[1].name
@@ -184,13 +196,14 @@ def main() -> int:
         parser.error("--root, --meshes and a checkpoint are needed")
     torch.set_num_threads(1)
     keep_freed_memory()
+    points = choose_points(options.checkpoints)
     frames: dict[str, list[tuple[str, Sample]]] = {}
     for checkpoint in options.checkpoints:
         name = posefilter.load(checkpoint, device="cpu").objects[0]
         if name not in frames:
             where = (options.root, options.meshes)
             frames[name] = read_frames(*where, name, options.images, options.part)
-        row = test(checkpoint, frames[name]) | {"part": options.part}
+        row = test(checkpoint, frames[name], points[name]) | {"part": options.part}
         print(make_line(row), make_part_line(row), sep="\n", flush=True)
         if options.out:
             rows = json.loads(options.out.read_text()) if options.out.is_file() else []
