@@ -5,6 +5,7 @@ import torch
 
 from posefilter.geometry.camera import intrinsics, pixel_grid, rays
 from posefilter.geometry.pose import make_pose
+from posefilter.nets.coordinates import Context
 from posefilter.nets.likelihood import Pixels, PoseLikelihood, flatten_images
 from posefilter.nets.surface_term import SurfaceTerm
 from posefilter.synthetic.solids import fibonacci_sphere
@@ -36,9 +37,7 @@ def at(*middles: tuple[float, float, float]) -> torch.Tensor:
 def shares(poses: torch.Tensor, sigma: float = 0.004) -> torch.Tensor:
     term, image = SurfaceTerm(), make_image()
     term.set_object(POINTS)
-    found = term.measure(
-        image.values, image.size, K, None, poses, torch.tensor(sigma), CENTER, RADIUS
-    )
+    found = term.measure(image, poses, torch.tensor(sigma), CENTER, RADIUS)
     return (found[0] + 1) / 2
 
 
@@ -81,9 +80,10 @@ def test_membership_counts_where_the_surface_is_seen() -> None:
     member = torch.zeros(1, H // 2, W // 2)
     member[:, 17:43, 27:53] = 1  # the ball
     poses = at((0, 0, BALL), (0.22, 0, BALL))
-    found = term.measure(
-        image.values, image.size, K, member.flatten(1), poses, torch.tensor(0.004), CENTER, RADIUS
-    )
+    none = torch.zeros(1, 0)
+    logit = torch.logit(member, eps=1e-9).flatten(1)[..., None]
+    image = image._replace(context=Context(logit, none, none, none, (H // 8, W // 8), W // 2))
+    found = term.measure(image, poses, torch.tensor(0.004), CENTER, RADIUS)
     there, beside = (found[0] + 1) / 2
     assert there[-1] > 0.9
     assert there[-2] > 0.85
@@ -116,7 +116,8 @@ def test_the_term_has_a_gradient_in_the_pose() -> None:
     term, image = SurfaceTerm(), make_image()
     term.set_object(POINTS)
     poses = at((0.0, 0.0, BALL - 0.01)).requires_grad_()
-    what = (image.values, image.size, K, None, poses, torch.tensor(0.02), CENTER, RADIUS)
-    (through,) = term.measure(*what)[0, :, 1:2]  # tight tolerance
+    (through,) = term.measure(image, poses, torch.tensor(0.02), CENTER, RADIUS)[
+        0, :, 1:2
+    ]  # tight tolerance
     (gradient,) = torch.autograd.grad(through.sum(), poses)
     assert gradient[0, 0, 2, 3] < 0  # farther from the camera less is seen through

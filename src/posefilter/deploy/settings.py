@@ -64,8 +64,7 @@ def check_method(method: PoseEstimator) -> None:
     if method.proposals is None or not contextual:
         raise UserError(
             "format: of pose_pf only model/proposals=dense with model/likelihood=surface or "
-            "contextual is "
-            "exported"
+            "contextual is exported"
         )
 
 

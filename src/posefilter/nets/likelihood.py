@@ -269,10 +269,8 @@ class PoseLikelihood(nn.Module):
         """
         if self.surface is None:
             return 0.0
-        member = None if image.context is None else image.context.smooth[..., 0].detach().sigmoid()
         at = self.level(sigma.expand(len(poses)))
-        what = (image.values, image.size, image.intrinsics, member)
-        term: Tensor = self.surface(*what, poses, sigma, at, center, radius)
+        term: Tensor = self.surface(image, poses, sigma, at, center, radius)
         return term
 
     def score_sampled(

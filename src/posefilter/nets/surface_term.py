@@ -6,12 +6,17 @@ how much of what should be seen is seen, hidden by something nearer, or seen thr
 is seen through cannot be there.
 """
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
 from posefilter.geometry.fragments import sample_farthest_points
 from posefilter.geometry.pose import origin_of, rotation_of, translation_of
 from posefilter.nets.linear import Linear
+
+if TYPE_CHECKING:
+    from posefilter.nets.likelihood import Pixels
 
 _NEAREST = 0.05  # [m] points nearer to the camera's plane are projected as if they were there
 _TINY = 1e-6
@@ -53,10 +58,7 @@ class SurfaceTerm(nn.Module):
 
     def forward(
         self,
-        values: Tensor,
-        size: tuple[int, int],
-        intrinsics: Tensor,
-        membership: Tensor | None,
+        image: "Pixels",
         poses: Tensor,
         sigma: Tensor,
         level: Tensor,
@@ -66,11 +68,7 @@ class SurfaceTerm(nn.Module):
         """Return the term.
 
         Args:
-            values: (B, H * W, 4) red, green, blue, z-depth [m] (0 unknown).
-            size: H, W.
-            intrinsics: (B, 3, 3) [px].
-            membership: (B, H / 2 * W / 2) probability that a cell of 2 x 2 pixels shows the object,
-                None where no network says so.
+            image: The images; without context the object's membership counts as 0.
             poses: (B, N, 4, 4) camera_from_object [m].
             sigma: (B,) or () noise level [m].
             level: (B, 9) or (1, 9) the same, encoded.
@@ -80,34 +78,26 @@ class SurfaceTerm(nn.Module):
         Returns:
             (B, N).
         """
-        shares = self.measure(values, size, intrinsics, membership, poses, sigma, center, radius)
+        shares = self.measure(image, poses, sigma, center, radius)
         at = level[:, None].expand(*shares.shape[:2], -1)
         x = torch.relu(self.enter(torch.cat([shares, at], dim=-1)))
         out: Tensor = self.leave(torch.relu(self.hidden(x)))[..., 0]
         return self.scale * out
 
     def measure(
-        self,
-        values: Tensor,
-        size: tuple[int, int],
-        intrinsics: Tensor,
-        membership: Tensor | None,
-        poses: Tensor,
-        sigma: Tensor,
-        center: Tensor,
-        radius: float,
+        self, image: "Pixels", poses: Tensor, sigma: Tensor, center: Tensor, radius: float
     ) -> Tensor:
         """Return the network's inputs but the noise level; arguments as of `forward`.
 
         -> (B, N, 17).
         """
-        (H, W), (B, N), own = size, poses.shape[:2], self.get_buffer("points")
+        (H, W), (B, N), own = image.size, poses.shape[:2], self.get_buffer("points")
         R, t = rotation_of(poses), translation_of(poses)
         # one product for all poses: (B, N, 3, P)
         at = (R.flatten(0, 2) @ own.T).view(B, N, 3, -1) + t[..., None]
         x, y, z = at.unbind(-2)
         fx, fy, cx, cy = (
-            intrinsics[:, row, column, None, None]
+            image.intrinsics[:, row, column, None, None]
             for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
         )
         with torch.no_grad():
@@ -115,7 +105,7 @@ class SurfaceTerm(nn.Module):
             u, v = (fx * x * over + cx).round(), (fy * y * over + cy).round()
             inside = (u >= 0) & (u < W) & (v >= 0) & (v < H) & (z > _NEAREST)
             column, row = u.clamp_(0, W - 1).long(), v.clamp_(0, H - 1).long()
-            depth = values[..., 3].gather(1, (row * W + column).flatten(1)).view(B, N, -1)
+            depth = image.values[..., 3].gather(1, (row * W + column).flatten(1)).view(B, N, -1)
             known = (inside & (depth > 0)).to(z.dtype)
         # the cosine of the angle between the way outward and the way to the camera
         toward = ((origin_of(poses, center)[..., None] - at) * at).sum(-2)
@@ -137,10 +127,12 @@ class SurfaceTerm(nn.Module):
         total = seen.sum(-1)
         out += [(weights[0] * inside).sum(-1), known_weights[0].sum(-1)]
         out.append((seen * offset.clamp(-2, 2)).sum(-1) / (total + _FEW))
-        if membership is None:
+        if image.context is None:
             out += [torch.zeros_like(total)] * 2
         else:
-            cells = (row // 2) * (-(-W // 2)) + column // 2
-            member = membership.gather(1, cells.flatten(1)).view(B, N, -1) * inside
+            # only of the cells that are asked for: there are more of them in an image
+            logit = image.context.smooth[..., 0].detach()
+            cells = (row // 2) * image.context.columns + column // 2
+            member = logit.gather(1, cells.flatten(1)).sigmoid().view(B, N, -1) * inside
             out += [(seen * member).sum(-1) / (total + _FEW), (weights[0] * member).sum(-1)]
         return 2 * torch.stack(out, dim=-1) - 1
