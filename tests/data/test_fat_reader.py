@@ -2,6 +2,7 @@
 confused.
 """
 
+import dataclasses
 import json
 
 import cv2
@@ -126,6 +127,31 @@ def test_visibility_is_the_share_of_pixels_not_what_the_json_says(tmp_path, mesh
     assert 0.2 < expected < 0.95
     assert reader.visible_share(sample) == pytest.approx(expected, abs=0.005)
     np.testing.assert_array_equal(reader.others(0), index == 1)
+
+
+@pytest.mark.parametrize("shift", [(0.19, 0.0), (-0.19, 0.0), (0.0, 0.15), (0.0, -0.15)])
+def test_what_the_frame_cuts_off_is_not_visible(tmp_path, meshes, shift):
+    folder = fat_folder(tmp_path / "mixed" / "temple_1", {"toy": 24})
+    at = pose(position=(*shift, 0.45))
+    fat_frame(folder, 0, [("toy", 24, at)])
+    reader = FatReader(tmp_path, "toy", meshes)
+    sample = reader.read(0)
+    wider = K.copy()
+    wider[:2, 2] += (WIDTH, HEIGHT)
+    whole = (truth(at, wider, 3 * HEIGHT, 3 * WIDTH) > 0).sum()
+    expected = sample.mask.sum() / whole
+    assert 0.1 < expected < 0.9
+    assert reader.visible_share(sample) == pytest.approx(expected, abs=0.005)
+
+
+def test_an_object_about_the_camera_fills_at_most_three_frames_by_three(tmp_path, meshes):
+    folder = fat_folder(tmp_path / "mixed" / "temple_1", {"toy": 24})
+    fat_frame(folder, 0, [("toy", 24, pose())])
+    reader = FatReader(tmp_path, "toy", meshes)
+    sample = reader.read(0)
+    near = pose(position=(0.0, 0.0, 0.02))
+    filled = dataclasses.replace(sample, camera_from_object=near, mask=np.ones_like(sample.mask))
+    assert 1 / 9 - 0.01 <= reader.visible_share(filled) <= 1
 
 
 def test_two_instances_are_distinguished_by_their_geometry(tmp_path, meshes):

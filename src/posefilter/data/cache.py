@@ -25,7 +25,7 @@ _HEADER = 4096  # bytes, at most, ahead of an array
 _UNITS = 10_000.0  # a meter
 # of the files of a `DiskCache`: one more whenever they change, so that none of another layout is
 # read
-_LAYOUT = 2
+_LAYOUT = 3
 _STALE = 3600.0  # [s] after which a file that is not whole has no writer any more
 
 

@@ -26,7 +26,8 @@ class Sample:
     camera_from_object: np.ndarray  # (4, 4) float32 [m]
     object_id: int  # index into the reader's objects
     frame_id: int  # index into the reader's (or the split's) records
-    # visible share of the pixels that the object would have alone in the frame; NaN where unknown
+    # share of the pixels that the object would have alone in an image without edges (BOP's visible
+    # fraction); NaN where unknown
     visibility: float
 
 

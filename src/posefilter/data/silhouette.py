@@ -44,16 +44,21 @@ class Geometry:
         return render_depth(meshes, poses, K, *shape, renderer=self._local.renderer)
 
     def visible_share(self, name: str, sample: Sample) -> float:
-        """Return mask pixels over those that the object would have alone in the frame; NaN without
-        a mesh.
+        """Return mask pixels over those that the object would have alone in an image without
+        edges; NaN without a mesh.
+
+        This is BOP's visible fraction: what the frame cuts off is not visible. As there, such an
+        image is at most three times as wide and high as the frame.
         """
         mesh = self.mesh(name)
         if mesh is None:
             return float("nan")
-        height, width = sample.mask.shape
-        _, index = self.render(
-            [mesh], [sample.camera_from_object], sample.intrinsics, (height, width)
-        )
+        pose = sample.camera_from_object
+        before, after = _margins(mesh.vertices, pose, sample.intrinsics, sample.mask.shape)
+        K = sample.intrinsics.copy()
+        K[:2, 2] += before[::-1]
+        height, width = (int(side) for side in np.add(sample.mask.shape, before) + after)
+        _, index = self.render([mesh], [pose], K, (height, width))
         alone = int((index == 0).sum())
         return min(float(sample.mask.sum()) / alone, 1.0) if alone else float("nan")
 
@@ -85,3 +90,23 @@ class Geometry:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Start with no renderer."""
         self.__dict__.update(state, _local=threading.local())
+
+
+def _margins(
+    vertices: np.ndarray, pose: np.ndarray, K: np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how many rows and columns a frame must grow to hold a whole object: before the
+    first and after the last, (2,) int each, none more than the frame has.
+
+    Where the object reaches behind the camera, its image has no end, and the frame grows as far as
+    it may.
+    """
+    size = np.array(shape)
+    points = vertices @ pose[:3, :3].T + pose[:3, 3]
+    if (points[:, 2] <= 0).any():
+        return size, size
+    pixels = (points[:, :2] / points[:, 2:]) @ K[:2, :2].T + K[:2, 2]
+    rows = pixels[:, ::-1]
+    before = np.ceil(-rows.min(0)).clip(0, size).astype(int)
+    after = np.ceil(rows.max(0) - (size - 1)).clip(0, size).astype(int)
+    return before, after
