@@ -2,11 +2,13 @@
 what calibrated checkpoints declare.
 
     python bench/confidence.py --source ycb_video --root DIR --meshes DIR [--weights FILE ...]
-        [--every 10] [--input depth_x2] [--out FILE.json]
+        [--every 10] [--input depth_x2 ...] [--out FILE.json]
 
 Photographs serve as a test alone: no calibration sees them.  `--input` spoils what a user types or
-connects, so that every estimate is of a scene that there is not: a wrong depth scale, another focal
-length, red and blue exchanged.  With it, no answer is right to be sure.
+connects: a wrong depth scale, intrinsics of another resolution or with two numbers exchanged, the
+depth of another photograph, colors exchanged or upside down.  `--input all` does so in every way,
+with the objects that a photograph shows, and counts the answers that are declared found and wrong
+(ADD of 0.1 diameters or more, up to symmetry).
 """
 
 import argparse
@@ -18,33 +20,58 @@ from typing import Any
 
 import numpy as np
 import torch
+from marked import format_row
 
 import posefilter
 from posefilter.data.frames import FrameRecord, Reader, Sample
 from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.errors import UserError
 from posefilter.metrics.errors import add_up_to_symmetry
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
+Spoil = Callable[[Sample, Sample], Inputs]  # of a photograph, and of one of another scene
 HEAD = ("object", "with it", "right", "found", "found and right", "absent")
 HEAD += ("without it", "found", "unsure", "highest probability")
+HEAD_SPOILED = ("input", "asked for", "refused", "right", "found", "found and wrong")
+HEAD_SPOILED += ("highest probability of a wrong one",)
 
 
-def _stretch(factor: float) -> Callable[[Sample], Inputs]:
-    return lambda one: (one.rgb, factor * one.depth, one.intrinsics)
+def _stretch(factor: float) -> Spoil:
+    return lambda one, _: (one.rgb, factor * one.depth, one.intrinsics)
 
 
-def _zoom(factor: float) -> Callable[[Sample], Inputs]:
-    return lambda one: (one.rgb, one.depth, one.intrinsics @ np.diag([factor, factor, 1.0]))
+def _zoom(factor: float) -> Spoil:
+    return lambda one, _: (one.rgb, one.depth, one.intrinsics @ np.diag([factor, factor, 1.0]))
 
 
-SPOILED: dict[str, Callable[[Sample], Inputs]] = {
-    "as_it_is": lambda one: (one.rgb, one.depth, one.intrinsics),
+def _resolve(factor: float) -> Spoil:
+    """Take the intrinsics of the same camera at another resolution."""
+    return lambda one, _: (one.rgb, one.depth, np.diag([factor, factor, 1.0]) @ one.intrinsics)
+
+
+def _exchange(one: Sample, _: Sample) -> Inputs:
+    """Exchange fx and cx, fy and cy."""
+    K = one.intrinsics.copy()
+    K[0, 0], K[0, 2], K[1, 1], K[1, 2] = K[0, 2], K[0, 0], K[1, 2], K[1, 1]
+    return one.rgb, one.depth, K
+
+
+SPOILED: dict[str, Spoil] = {
+    "as_it_is": lambda one, _: (one.rgb, one.depth, one.intrinsics),
+    "depth_x10": _stretch(10.0),
     "depth_x2": _stretch(2.0),
-    "depth_x0.5": _stretch(0.5),
+    "depth_x1.5": _stretch(1.5),
     "depth_x1.25": _stretch(1.25),
+    "depth_x0.5": _stretch(0.5),
+    "depth_x0.1": _stretch(0.1),
     "focal_x1.5": _zoom(1.5),
     "focal_x0.67": _zoom(0.67),
-    "swapped": lambda one: (one.rgb[..., ::-1].copy(), one.depth, one.intrinsics),
+    "resolution_x2": _resolve(2.0),
+    "resolution_x0.5": _resolve(0.5),
+    "fx_cx_exchanged": _exchange,
+    "another_depth": lambda one, other: (one.rgb, other.depth, one.intrinsics),
+    "red_blue_exchanged": lambda one, _: (one.rgb[..., ::-1].copy(), one.depth, one.intrinsics),
+    "color_upside_down": lambda one, _: (one.rgb[::-1].copy(), one.depth, one.intrinsics),
 }
 
 
@@ -67,9 +94,19 @@ def look(
     records, rows = list(reader.records()), []
     for own in images:
         there = {records[i].object: reader.read(i) for i in own}
-        (results,) = estimator.predict_batch(*SPOILED[spoil](reader.read(own[0])))
+        scene = records[own[0]].group
+        other = next((k for k, *_ in images if records[k].group != scene), own[0])
+        inputs = SPOILED[spoil](reader.read(own[0]), reader.read(other))
+        try:
+            (results,) = estimator.predict_batch(*inputs)
+        except UserError as error:
+            print(error, flush=True)
+            refused = {"image": records[own[0]].name, "input": spoil, "verdict": "refused"}
+            refused |= {"there": True, "right": False, "probability": 0.0}
+            rows += [{"object": name} | refused for name in there]
+            continue
         for result in results:
-            row = {"object": result.object, "image": records[own[0]].name}
+            row = {"object": result.object, "image": records[own[0]].name, "input": spoil}
             row |= {"there": result.object in there, "verdict": result.verdict}
             row |= {"probability": result.probability, "presence": result.presence}
             if result.object in there:
@@ -99,6 +136,22 @@ def tabulate(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def tabulate_spoiled(rows: list[dict[str, Any]]) -> str:
+    """Return the counts of each way to spoil as a Markdown table, of objects that are there."""
+    lines = [format_row(HEAD_SPOILED), format_row("---" for _ in HEAD_SPOILED)]
+    for name in SPOILED:
+        own = [row for row in rows if row["input"] == name and row["there"]]
+        found = [row for row in own if row["verdict"] == "found"]
+        right = sum(row["right"] for row in own)
+        wrong = [row for row in own if not row["right"]]
+        refused = sum(row["verdict"] == "refused" for row in own)
+        wrong_found = sum(not row["right"] for row in found)
+        cells = [name, len(own), refused, right, len(found), wrong_found]
+        cells.append(f"{max((row['probability'] for row in wrong), default=0):.2f}")
+        lines.append(format_row(map(str, cells)))
+    return "\n".join(lines)
+
+
 def main() -> int:
     """Print a row a line, then the table."""
     parser = argparse.ArgumentParser(
@@ -109,14 +162,19 @@ def main() -> int:
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--meshes", required=True)
     parser.add_argument("--every", type=int, default=10, help="images of a scene")
-    parser.add_argument("--input", choices=SPOILED, default="as_it_is")
+    parser.add_argument("--input", choices=[*SPOILED, "all"], default="as_it_is")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     meshes = open_meshes(options.meshes, None, options.source, None)
     reader = open_reader(options.source, options.root, None, meshes, "skip")
-    estimator = posefilter.load(options.weights)
-    rows = look(estimator, reader, list_images(reader, options.every), options.input)
-    print(tabulate(rows))
+    weights = options.weights
+    if options.input == "all" and weights == ["all"]:
+        weights = list(reader.objects)
+    estimator = posefilter.load(weights)
+    inputs = list(SPOILED) if options.input == "all" else [options.input]
+    images = list_images(reader, options.every)
+    rows = [row for spoil in inputs for row in look(estimator, reader, images, spoil)]
+    print(tabulate_spoiled(rows) if options.input == "all" else tabulate(rows))
     if options.out is not None:
         options.out.write_text(json.dumps(rows, indent=1) + "\n")
     return 0
