@@ -1,6 +1,6 @@
 """Write down every run of outputs/methods as a row of docs/results/runs.csv, and its tables anew.
 
-    python bench/collect_runs.py [FOLDER] [--into docs/results/runs.csv]
+    python bench/collect_runs.py [FOLDER] [--out docs/results/runs.csv]
 
 FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table,
 searched for metrics.json. The rows of a table that has runs there are replaced; those of other
@@ -134,7 +134,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("outputs/methods"))
-    parser.add_argument("--into", type=Path, default=HOME / "docs" / "results" / "runs.csv")
+    parser.add_argument("--out", type=Path, default=HOME / "docs" / "results" / "runs.csv")
     options = parser.parse_args()
     tables = {path.name: read_runs(path) for path in sorted(options.folder.glob("*/"))}
     tables = {name: runs for name, runs in tables.items() if runs}
@@ -142,14 +142,14 @@ def main() -> int:
         print(f"{options.folder}: holds no run", file=sys.stderr)
         return 1
     kept = []
-    if options.into.is_file():
-        with options.into.open() as file:
+    if options.out.is_file():
+        with options.out.open() as file:
             kept = [row for row in csv.DictReader(file) if row["table"] not in tables]
     for name, runs in tables.items():
         print(f"{name}: {len(runs)} runs")
         kept += make_rows(name, runs)
     kept.sort(key=lambda row: row["table"])  # stable: rows of a table keep their order
-    with options.into.open("w", newline="") as file:
+    with options.out.open("w", newline="") as file:
         header = ["table", "method", "variant", "changed", *COLUMNS, "device", "torch"]
         writer = csv.DictWriter(file, header, lineterminator="\n")
         writer.writeheader()

@@ -1,6 +1,7 @@
 """What an estimate costs against image width, particles, iterations and image points.
 
-    python bench/cost.py [--only width --only particles ...] [--methods patch_pf ...] [--most 10000]
+    python bench/cost.py [--only width --only particles ...] [--methods patch_pf ...]
+        [--max-particles 10000]
 
 The five methods in their working preset, with new weights, on one drawn image: what is computed
 does not depend on what was learned. Each value of a setting is measured in turn, and all of them
@@ -165,7 +166,7 @@ def main() -> None:
     )
     parser.add_argument("--only", action="append", choices=[*SWEEPS])
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
-    parser.add_argument("--most", type=int, default=100_000, help="particles")
+    parser.add_argument("--max-particles", type=int, default=100_000, help="particles")
     typed = parser.parse_args()
     torch.set_num_threads(1)
     keep_freed_memory()
@@ -175,7 +176,7 @@ def main() -> None:
         for name, method in methods.items():
             if key == "points" and name != "pose_pf":
                 continue  # the others read a patch
-            values = choose_values(name, key, typed.most)
+            values = choose_values(name, key, typed.max_particles)
             rows.append(describe(name, key, values, sweep(method, key, values)))
             print(key, rows[-1], flush=True)
         PAGE.write_text(put_table(PAGE.read_text(), key, make_head(key), rows))

@@ -4,7 +4,7 @@
 
 A table stands between two comments of a page:
 
-    <!-- runs table=ablation method=patch_pf changed=*ablation=c* show=on object %|heading -->
+    <!-- runs table=ablation method=patch_pf changed=*ablation=c* show=on object %|offset cosine -->
     <!-- end -->
 
 `table`, `method`, `variant` and `changed` choose rows; `changed` takes shell patterns, separated by

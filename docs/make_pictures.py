@@ -70,10 +70,10 @@ TOUR = {  # what docs/tour.md shows -> what its commands leave
 }
 # the ablations that its picture shows, and what to say of each
 ABLATIONS = {
-    "paper": "The paper's",
-    "c5_displacement_loss": "Told the way, and few arrive",
-    "c6_position": "No gradient through the place",
-    "c9_context": "And global context",
+    "paper": "Paper",
+    "c5_displacement_loss": "Loss on the displacement",
+    "c6_position": "Position detached, too",
+    "c9_context": "Features of the whole image, too",
 }
 # those with a pose first: each has one color in all charts
 METHODS = ("patch_pf", "pixel_pf", "cnn_patch", "downsized")
@@ -82,7 +82,7 @@ SIZES = {"filter.particles": "particles", "filter.steps": "iterations"}
 FIGURES = {  # of these sweeps: title, unit, and by what to multiply; None: of one over the least
     "particles_on_object": ("Particles on the object", "%", 100),
     "add/auc": ("ADD AUC", "", 1),
-    "seconds_per_image": ("Time of an image", "the least is 1", None),
+    "seconds_per_image": ("Time per image", "relative to the shortest", None),
 }
 BROWSER = next(
     (
@@ -225,7 +225,7 @@ def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.n
         [
             draw_row(
                 figure.shape[1],
-                f"{method.model.name}: {len(found)} scenes that no training saw",
+                f"{method.model.name}: {len(found)} held-out scenes",
                 legend,
             ),
             figure,

@@ -59,7 +59,7 @@ def test_only_tables_with_runs_are_replaced(
     monkeypatch.setattr(
         collect.subprocess, "run", lambda *_, **__: type("Done", (), {"returncode": 0})
     )
-    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path / "runs"), "--into", str(into)])
+    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path / "runs"), "--out", str(into)])
     assert collect.main() == 0
     (tmp_path / "runs" / "memorize" / "a" / "metrics.json").unlink()
     (tmp_path / "runs" / "other" / "deep" / "b" / "metrics.json").unlink()
@@ -78,7 +78,7 @@ def test_a_folder_without_runs_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     into = tmp_path / "runs.csv"
-    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path), "--into", str(into)])
+    monkeypatch.setattr(sys, "argv", ["collect_runs", str(tmp_path), "--out", str(into)])
     assert collect.main() == 1
     assert "holds no run" in capsys.readouterr().err
     assert not into.exists()

@@ -66,6 +66,7 @@ RENAMED = {
     "callbacks.figures.without=[animation]": "callbacks.figures.exclude=[animation]",
     "callbacks.figures.every=5": "callbacks.figures.every_n_validations=5",
     "most_mb=8": "max_mb=8",
+    "compact=false": "quantize=false",
     "budget=patch_pf/working": "the preset, with its size apart: preset/size=patch_pf",
 }
 

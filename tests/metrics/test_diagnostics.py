@@ -9,10 +9,10 @@ from posefilter.metrics.diagnostics import (
     FilterDiagnostics,
     auroc,
     distinct,
-    heading,
     line_share,
     near_edge,
     off_frame,
+    offset_cosine,
     pairwise_cosine,
     r2_score,
 )
@@ -40,9 +40,9 @@ def test_explained_is_one_for_the_truth_nought_for_the_mean_and_negative_for_dri
     assert r2_score(true + 3, true) < -1
 
 
-def test_heading_ignores_particles_that_are_there() -> None:
+def test_offset_cosine_ignores_particles_that_are_there() -> None:
     true = torch.tensor([[10.0, 0.0], [0.0, 10.0], [0.0, 0.0]])
-    assert heading(
+    assert offset_cosine(
         torch.tensor([[1.0, 0.0], [1.0, 0.0], [-9.0, 1.0]]), true
     ).item() == pytest.approx(0.5)
 

@@ -25,10 +25,10 @@ from posefilter.metrics.confidence import calibration_error, error_at_coverage, 
 from posefilter.metrics.diagnostics import (
     auroc,
     distinct,
-    heading,
     is_off_frame,
     line_share,
     near_edge,
+    offset_cosine,
     pairwise_cosine,
     r2_score,
 )
@@ -76,10 +76,10 @@ def test_a_particle_that_hardly_moves_has_no_direction() -> None:
     assert pairwise_cosine(three).item() == pytest.approx(1 / 3)
 
 
-def test_a_heading_counts_beyond_one_pixel() -> None:
+def test_the_offset_cosine_counts_beyond_one_pixel() -> None:
     true = torch.tensor([[1.0, 0.0], [0.0, 1.5]])
-    assert heading(torch.tensor([[-1.0, 0.0], [0.0, 0.2]]), true).item() == pytest.approx(1.0)
-    assert math.isnan(heading(true[:1], true[:1]).item())
+    assert offset_cosine(torch.tensor([[-1.0, 0.0], [0.0, 0.2]]), true).item() == pytest.approx(1.0)
+    assert math.isnan(offset_cosine(true[:1], true[:1]).item())
 
 
 def test_areas_and_shares_of_too_little_are_undefined() -> None:

@@ -29,7 +29,7 @@ def test_a_number_is_written_in_its_unit() -> None:
     assert find_metric("belief/spread_m").describe(0.0123) == "12.3 mm"
     assert find_metric("add/median_mm").title == "median ADD [mm]"
     assert find_metric("iou").describe(0.8766) == "0.877"
-    assert find_metric("diagnostics/on_object/first").column == "began on it %"
+    assert find_metric("diagnostics/on_object/first").column == "on object at start %"
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def worst(o: Occasion) -> Drawn:
 
 
 def particles(o: Occasion) -> Drawn:
-    """Draw the clouds on the image, colored by weight."""
+    """Draw the particles on the image, colored by weight."""
     title = o.title("Particles by iteration")
     return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
 

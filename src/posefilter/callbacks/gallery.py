@@ -43,7 +43,7 @@ class KeptImage(NamedTuple):
     intrinsics: np.ndarray  # (3, 3) [px]
     estimate: np.ndarray  # (4, 4)
     truth: np.ndarray  # (4, 4)
-    pixels: np.ndarray  # (N, 2) the last cloud on the image [px]
+    pixels: np.ndarray  # (N, 2) the last particles on the image [px]
     weights: np.ndarray  # (N,)
 
 

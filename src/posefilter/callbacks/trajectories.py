@@ -12,7 +12,7 @@ from posefilter.types import Particles, Trace
 
 
 def trace_lineage(history: Sequence[Particles]) -> Tensor:
-    """Return where each particle of the last cloud, and its ancestors before it, stood.  -> (B, T,
+    """Return where each particle of the last step, and its ancestors before it, stood.  -> (B, T,
     N, *S).
     """
     last = history[-1]

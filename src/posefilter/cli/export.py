@@ -30,7 +30,7 @@ def export(job: Job) -> None:
         return
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
-    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.compact)
+    stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.quantize)
     recipe = stripped["recipe"]
     before = recipe["settings"]
     recipe["settings"] = changed(before, changes(job.cfg))
@@ -77,12 +77,12 @@ def write_weights(stripped: dict[str, Any], out: Path, max_mb: float) -> float:
     return size
 
 
-def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dict[str, Any]:
+def strip(checkpoint: dict[str, Any], points: int, quantize: bool = False) -> dict[str, Any]:
     """Return a checkpoint without optimizer, loops and callbacks, its object with so many surface
     points at most.
 
-    compact: kernels in 8 bits and the rest in 16, a quarter of the size (models/compact.py); they
-    are read back into 32.
+    quantize: kernels in 8 bits and the rest in 16, a quarter of the size
+    (models/quantization.py); they are read back into 32.
     """
     kept = {key: checkpoint[key] for key in _KEPT if key in checkpoint}
     model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
@@ -93,5 +93,5 @@ def strip(checkpoint: dict[str, Any], points: int, compact: bool = False) -> dic
     # no folders of the trainer's machine
     settings["data"] = {key: data[key] for key in OF_THE_CHECKPOINT if key in data}
     kept["recipe"] = {**kept["recipe"], "settings": settings}
-    state = pack(weights) if compact else {key: value.clone() for key, value in weights.items()}
+    state = pack(weights) if quantize else {key: value.clone() for key, value in weights.items()}
     return {**kept, "state_dict": state, "object_model": model}

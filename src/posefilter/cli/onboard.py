@@ -250,7 +250,7 @@ def evaluate(work: Onboarding) -> None:
 def export(work: Onboarding) -> None:
     """Write the weights that predict."""
     checkpoint = read_checkpoint(work.training / "checkpoints" / "best.ckpt")
-    write_weights(strip(checkpoint, points=200, compact=True), work.weights, max_mb=5)
+    write_weights(strip(checkpoint, points=200, quantize=True), work.weights, max_mb=5)
 
 
 def calibrate(work: Onboarding) -> None:

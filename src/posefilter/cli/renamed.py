@@ -55,6 +55,7 @@ KEYS = {
     "callbacks.figures.every": "callbacks.figures.every_n_validations",
     "callbacks.figures.without": "callbacks.figures.exclude",
     "most_mb": "max_mb",
+    "compact": "quantize",
     "model.relevance": "model.relevance_weight",
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}

@@ -18,7 +18,7 @@ from posefilter.cli.console import is_installed
 from posefilter.cli.main import COMMANDS
 
 _SETTING = re.compile(r"^(\w+): *(.*?) *(?:# *(.*))?$")  # a key at the top of a file
-_INNER = ("generate", "folder")  # settings that the others are handed on to
+_UNLISTED = ("generate", "folder", "debug")  # what others are handed on to, or has a line below
 _HIDDEN = ("trainer",)  # groups whose choice the command itself makes
 _MOST_CHOICES = 20
 _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
@@ -86,7 +86,7 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
         )
     ]
     if groups:
-        lines += ["", "choices, typed group=choice; the default is in brackets"]
+        lines += ["", f"choices, typed group=choice; {_explain_defaults(name)}"]
         for group in groups:
             shown = " ".join(f"[{c}]" if c == group.default else c for c in group.choices)
             lines += _entry(group.name, shown, width)
@@ -100,6 +100,14 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
     if name != "train":  # where it is one of the choices
         lines += _entry("debug=traceback", "show where a mistake came from", width)
     return "\n".join(lines)
+
+
+def _explain_defaults(name: str) -> str:
+    """Return what is chosen where nothing is typed."""
+    marked = "the default is in brackets"
+    if name == "train":
+        return f"{marked}, else the variant's preset chooses"
+    return marked if name == "check_data" else "where none is typed, as trained"
 
 
 def list_groups(name: str, folders: Sequence[Path]) -> Iterator[Group]:
@@ -134,7 +142,7 @@ def list_settings(text: str) -> Iterator[tuple[str, str, str]]:
     """Yield (key, value, comment) of the settings at the top of a file, as they are written."""
     for line in text.splitlines():
         found = _SETTING.match(line)
-        if found and found[2] and found[1] not in _INNER and not found[2].startswith("{"):
+        if found and found[2] and found[1] not in _UNLISTED and not found[2].startswith("{"):
             yield found[1], found[2], found[3] or ""
 
 

@@ -40,7 +40,7 @@ from posefilter.types import Trace
 
 
 class Animation:
-    """A animation of one image's particles, from each cloud to the next.
+    """An animation of one image's particles, from each iteration to the next.
 
     rgb (H, W, 3) uint8; K (3, 3) [px]; trace: of one image; hull (V, 3) [m]; target: lines round
     the true object [px]. Pixels are dots, colored by weight. Poses are outlines of some and the
@@ -72,10 +72,10 @@ class Animation:
         self.foot = np.concatenate([draw_legend(entries), draw_weight_scale()])
 
     def frames(self, between: int | None = None, most: int = 15) -> Iterator[np.ndarray]:
-        """Yield the pictures, `between` of them from each cloud to the next; None: two where clouds
-        are few, else one.
+        """Yield the pictures, `between` of them from each iteration to the next; None: two where
+        iterations are few, else one.
 
-        most: clouds that are shown, evenly chosen, the first and the last among them.
+        most: iterations that are shown, evenly chosen, the first and the last among them.
         """
         shown = choose_steps(len(self.trace.particles), most)
         between = between or (2 if len(shown) <= 8 else 1)
@@ -93,8 +93,8 @@ class Animation:
                 yield self.frame(dots, lines, weights.numpy(), caption)
 
     def ancestors(self, number: int, before: int) -> torch.Tensor:
-        """Return which particles of an earlier cloud a cloud's own stem from; themselves, if that
-        is the same.  -> (N,).
+        """Return which particles of an earlier iteration those of one stem from; themselves, if
+        that is the same.  -> (N,).
         """
         index = torch.arange(self.trace.particles[number].state.shape[1])
         for particles in self.trace.particles[number:before:-1]:

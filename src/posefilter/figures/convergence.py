@@ -1,4 +1,4 @@
-"""An animation that is good to look at: a cloud of poses that closes in on the object, from blank
+"""An animation that is good to look at: poses that close in on the object, from blank
 to certain.
 """
 
@@ -30,7 +30,7 @@ _SOFT = (120, 128, 142)
 class Keyframe(NamedTuple):
     """Some particles of one iteration, and where their ancestors were at the one before.
 
-    The first is the cloud that the filter begins with, before anything is known of it.
+    The first has the particles that the filter begins with, before anything is known of it.
     """
 
     before: torch.Tensor  # (n, 4, 4)
@@ -89,7 +89,7 @@ def animate_convergence(
 
 def choose_keyframes(trace: Trace, count: int) -> list[Keyframe]:
     """Return some particles of each iteration, chosen by weight, with their ancestors; of the first
-    cloud any of them.
+    iteration any of them.
     """
     first = trace.particles[0].state[0].detach().cpu().double()
     some = first[torch.linspace(0, len(first) - 1, count).long()]

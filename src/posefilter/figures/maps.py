@@ -139,8 +139,8 @@ def draw_relevance(
     last: tuple[np.ndarray, np.ndarray],
     title: str,
 ) -> np.ndarray:
-    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last cloud: pixels (N, 2),
-    weights (N,) each.
+    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last particles: pixels
+    (N, 2), weights (N,) each.
 
     mask (H, W) bool: the object's visible part, whose rim is drawn.
     """

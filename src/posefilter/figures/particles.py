@@ -1,4 +1,4 @@
-"""Draw clouds of particles on the image, colored by weight: one step, or a row of steps over the
+"""Draw particles on the image, colored by weight: one step, or a row of steps over the
 filter's run.
 """
 
@@ -123,13 +123,13 @@ def project_axes(
 def draw_iterations(
     rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = ""
 ) -> np.ndarray:
-    """Draw the clouds of one image at several of the filter's steps, the first and the last
+    """Draw the particles of one image at several of the filter's steps, the first and the last
     included.
 
     rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are
     dots, at eight steps. Those in pose space are dots at the object's center, with the axes of a
     few drawn by weight, at four steps: on the whole photograph, and beside it on a close-up of the
-    object, since the last clouds are too small to be seen otherwise.
+    object, since the last particles lie too close to be seen otherwise.
     """
     height, wide = rgb.shape[:2]
     width = tile_width(2)
@@ -223,7 +223,7 @@ class PoseStep:
         self.caption = describe_step(trace, image, number, "mm")
 
     def extent(self) -> np.ndarray:
-        """Return two corners that hold the object, as the mean of the cloud has it.  -> (2, 2)
+        """Return two corners that hold the object, as the mean of the particles has it.  -> (2, 2)
         [px].
         """
         middle = self.weights @ self.pixels

@@ -365,7 +365,7 @@ _METRICS = (
         HIGHER,
         100.0,
         PERCENT,
-        "began on it",
+        "on object at start",
     ),
     MetricInfo(
         "diagnostics/on_object/last",
@@ -402,15 +402,15 @@ _METRICS = (
         ".1f",
         factor=100.0,
         limits=PERCENT,
-        short="began along a line",
+        short="along a line at start",
     ),
     MetricInfo(
         "diagnostics/pairwise_cosine",
-        "same direction (pairwise cosine)",
+        "pairwise cosine of the displacements",
         form=".2f",
         direction=LOWER,
         limits=(-1.05, 1.05),
-        short="same direction",
+        short="pairwise cosine",
     ),
     MetricInfo(
         "diagnostics/offset_r2",
@@ -426,7 +426,7 @@ _METRICS = (
         form=".2f",
         direction=HIGHER,
         limits=(-1.05, 1.05),
-        short="heading",
+        short="offset cosine",
     ),
     MetricInfo(
         "diagnostics/auroc",
