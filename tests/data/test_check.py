@@ -6,10 +6,21 @@ import re
 import cv2
 import numpy as np
 import pytest
-from dataset_trees import HIGH, LOW, K, bop_scene, pose, write_mesh, ycb_frame
+from dataset_trees import (
+    HIGH,
+    LOW,
+    K,
+    bop_scene,
+    fat_folder,
+    fat_frame,
+    pose,
+    write_mesh,
+    ycb_frame,
+)
 
 from posefilter.data.checking.check import check_dataset, format_report
 from posefilter.data.readers.bop import BopReader
+from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import UserError
 from posefilter.meshes import ycb
@@ -45,7 +56,7 @@ def test_a_true_dataset_passes(tmp_path, meshes):
     reader = YCBVideoReader(tree(tmp_path), NAME, meshes)
     report = check_dataset(reader, meshes, out=tmp_path / "out")
     (row,) = report["objects"]
-    assert set(report) == {"objects", "problems"}
+    assert set(report) == {"objects", "problems", "left_out"}
     assert set(row) == {"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}
     assert report["problems"] == []
     assert (row["object"], row["frames"]) == (NAME, 4)
@@ -143,6 +154,17 @@ def test_a_wrong_mesh_is_a_problem_without_a_cause(tmp_path, meshes):
     report = check(tree(tmp_path / "data"), MeshStore(wrong))
     assert "no cause that was tried explains it" in report["problems"][0]
     assert report["objects"][0]["silhouette_iou"] < 0.9
+
+
+def test_lookalikes_of_rendered_scenes_are_left_out_and_named(tmp_path, meshes):
+    folder = fat_folder(tmp_path / "mixed" / "temple_1", {NAME: 24, "lookalike_00": 36})
+    for number in range(3):
+        fat_frame(folder, number, [(NAME, 24, POSES[number]), ("lookalike_00", 36, FRONT)])
+    report = check_dataset(FatReader(tmp_path, None, meshes), meshes)
+    assert report["left_out"] == ["lookalike_00"]
+    assert report["problems"] == []
+    assert [row["object"] for row in report["objects"]] == [NAME]
+    assert "left out, look-alikes without a mesh: lookalike_00" in format_report(report)
 
 
 def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):

@@ -42,7 +42,7 @@ def check_data(job: Job) -> None:
         if report["problems"]
         else [
             train_on(cfg, name, sum(record.object == name for record in reader.records()))
-            for name in reader.objects
+            for name in (row["object"] for row in report["objects"])
         ]
     )
     ended(

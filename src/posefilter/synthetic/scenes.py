@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from posefilter.data.generated_scenes import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
 from posefilter.synthetic.copies import place_copies
@@ -120,7 +121,7 @@ def draw_scene_set(
     goal = library.solid(target)
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
-    names = [f"lookalike_{k:02d}" for k in range(settings.lookalikes)]
+    names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
     lookalikes = tuple(make_solid(make_lookalike(goal.mesh, name, photos, rng)) for name in names)
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
     tiles = (

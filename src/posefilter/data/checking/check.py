@@ -17,6 +17,7 @@ from posefilter.data.checking.compare import Fit, View, compare, half_pixel, lik
 from posefilter.data.checking.contact_figure import tile, write_sheet
 from posefilter.data.checking.frames import Suspect, describe_suspects, is_suspect
 from posefilter.data.frames import Implausible, NotShown, Reader
+from posefilter.data.generated_scenes import LOOKALIKE
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
 from posefilter.files import write_whole
@@ -49,8 +50,9 @@ def check_dataset(
 
     Returns:
         `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}],
-        "problems": [...]}`, medians all; None stands for what could not be measured. Problems are
-        sentences that name the likely cause: of most frames of an object, or of a single one.
+        "problems": [...], "left_out": [...]}`, medians all; None stands for what could not be
+        measured. Problems are sentences that name the likely cause: of most frames of an object, or
+        of a single one. Left out are look-alikes of rendered scenes, which have no mesh file.
 
     Raises:
         UserError: The limit is not positive.
@@ -63,13 +65,17 @@ def check_dataset(
         for cause, count in reader.skipped.items()
     ]
     rows, tiles = [], []
-    share = max(1, _TILES // max(len(reader.objects), 1))
-    for name in reader.objects:
+    left_out = [
+        name for name in reader.objects if name.startswith(LOOKALIKE) and not meshes.has(name)
+    ]
+    names = [name for name in reader.objects if name not in left_out]
+    share = max(1, _TILES // max(len(names), 1))
+    for name in names:
         row, found, drawn = _check_object(reader, geometry, name, limit, share, progress)
         rows.append(row)
         problems += found
         tiles += drawn
-    report = {"objects": rows, "problems": problems}
+    report = {"objects": rows, "problems": problems, "left_out": left_out}
     if out is not None:
         folder = Path(out)
         write_whole(folder / "data_report.json", json.dumps(report, indent=2) + "\n")
@@ -91,8 +97,12 @@ def format_report(report: dict[str, Any]) -> str:
     console = Console(width=110, record=True, file=io.StringIO(), color_system=None)
     console.print(table)
     lines = [f"  - {problem}" for problem in report["problems"]]
-    return console.export_text() + (
-        "\n".join(["problems:", *lines]) if lines else "no problems found"
+    left_out = report["left_out"]
+    note = f"left out, look-alikes without a mesh: {', '.join(left_out)}\n" if left_out else ""
+    return (
+        console.export_text()
+        + note
+        + ("\n".join(["problems:", *lines]) if lines else "no problems found")
     )
 
 
