@@ -162,6 +162,35 @@ class Result:
         )
         return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
 
+    def draw_band(
+        self,
+        rgb: np.ndarray,
+        intrinsics: np.ndarray,
+        shape: "Shape | None" = None,
+        level: float = 0.95,
+    ) -> np.ndarray:
+        """Draw how sure the belief is of the object's outline: the band in which, at a point of
+        the outline, it lies with the probability `level`, if the belief is right.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+            shape: A mesh, for the exact outline; None: the convex hull.
+            level: That probability.
+
+        Returns:
+            The picture (h, w, 3) uint8.
+
+        Raises:
+            UserError: The level is not in [0, 1].
+        """
+        from posefilter.figures.band import draw_band  # slow to import, needed for pictures
+
+        check_share(level)
+        shape, K = self.model.hull if shape is None else shape, np.asarray(intrinsics)
+        poses, weights = self.belief.samples, self.belief.weights
+        return draw_band(rgb, K, poses, weights, shape, level, caption=self.describe())
+
 
 class Run(NamedTuple):
     """One object's filter on a batch of images."""
