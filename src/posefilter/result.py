@@ -46,7 +46,7 @@ class Result:
         calibration_note: In words, why there is no probability; empty where there is one.
         conformal: What `conformal_set` goes by; None where the calibration has none.
         surface: The share of the object's surface points at which the depth shows a surface, by
-            which the group of a conformal set is chosen.
+            which earlier calibrations choose the group of a conformal set.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
@@ -109,7 +109,9 @@ class Result:
             why = self.calibration_note or "it was calibrated by an earlier version, without sets"
             raise UserError(f"{self.object}: has no conformal sets ({why})")
         check_share(level)
-        limit = self.conformal.find_limit(level, self.surface)
+        value = self.surface if self.conformal.by == "surface" else self.probability
+        assert value is not None  # where there are sets there is a probability
+        limit = self.conformal.find_limit(level, value)
         return self.belief.level_set(level, -self.belief.differential_entropy - limit)
 
     def draw_overlay(
