@@ -30,7 +30,10 @@ import numpy as np
 
 By = Literal["surface", "probability"]
 GROUPED_BY: tuple[str, ...] = get_args(By)
-_MOST, _FEWEST = 5, 20  # groups; frames of a group, by which a set of 95 % is not that of all poses
+_FEWEST = 20  # frames of a group: with as many, a set of 95 % is not that of all poses
+# of the frames, below each limit between groups: the surest are much alike, the others are not
+_SHARES = (0.1, 0.25, 0.45, 0.7)
+_EVEN = 4  # groups at most where frames are too few for these
 # of the evidence `surface`: about half of an object's surface faces the camera, so that below a
 # quarter the depth shows less than half of what could be seen
 EDGES = (0.25,)
@@ -70,12 +73,17 @@ class Conformal:
 
 
 def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
-    """Return limits between groups of as many frames each: five groups, fewer where that leaves
-    less than 20 frames to one.  (n,) probabilities of the frames.
+    """Return limits between five groups, of 10, 15, 20, 25 and 30 % of the frames.
+
+    Below 200 frames there are fewer groups, of as many frames each, and of 20 at least.
+
+    (n,) probabilities of the frames.
     """
-    groups = max(1, min(_MOST, len(probability) // _FEWEST))
-    edges = np.quantile(probability, np.arange(1, groups) / groups) if groups > 1 else []
-    return tuple(float(one) for one in np.unique(edges))
+    count = len(probability)
+    even = max(1, min(_EVEN, count // _FEWEST))
+    enough = round(_SHARES[0] * count, 6) >= _FEWEST
+    shares = _SHARES if enough else tuple(k / even for k in range(1, even))
+    return tuple(float(one) for one in np.unique(np.quantile(probability, shares)))
 
 
 def fit_conformal(
