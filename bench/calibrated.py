@@ -3,6 +3,10 @@
     python bench/calibrated.py --root DIR --meshes DIR --rows FILE.jsonl [--frames 200]
         [--without 100] [--minutes 5] FILE.ckpt ...
     python bench/calibrated.py --table FILE.jsonl      # only prints the tables
+    python bench/calibrated.py --cross FILE.jsonl      # the same, of calibrations on these frames
+
+With --cross the checkpoints' own calibrations do not count: the frames of each object are divided
+into five parts by scene, and each part is judged by a calibration on the other four.
 
 Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
 --without that lack the object.  A row an image is added to the file; started again, it goes on, and
@@ -31,6 +35,7 @@ from posefilter.cli.calibrate import is_right
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
 from posefilter.cli.evaluate import data_settings
+from posefilter.confidence.fit import Frames, fit_calibration
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.figures.band import find_band, measure_cover
@@ -79,8 +84,10 @@ def measure_band(
     return 1 - 2 * missed / total if total else float("nan")
 
 
-def look(method: PoseEstimator, batch: Batch, number: int, there: bool) -> Iterator[Row]:
-    """Run the filter on a batch, and yield a row an image."""
+def look(
+    method: PoseEstimator, batch: Batch, number: int, there: bool, scenes: Sequence[str]
+) -> Iterator[Row]:
+    """Run the filter on a batch, and yield a row an image; `scenes` are those of its images."""
     model, calibration = method.model, method.calibration
     assert calibration is not None
     seen = Batch(*hide_annotation(batch))
@@ -94,6 +101,7 @@ def look(method: PoseEstimator, batch: Batch, number: int, there: bool) -> Itera
     for i in range(len(batch.rgb)):
         row: Row = {"object": model.name, "there": there, "right": there and bool(right[i])}
         row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
+        row |= {"scene": scenes[i], "evidence": {k: float(v[i]) for k, v in evidence.items()}}
         if truths is not None:
             row |= {"visibility": float(batch.visibility[i]), "shown": float(shown[i])}
             row |= {"rank": float(truths.rank[i]), "log_density": float(truths.log_density[i])}
@@ -102,6 +110,7 @@ def look(method: PoseEstimator, batch: Batch, number: int, there: bool) -> Itera
             by_surface = sets.by == "surface"
             value = float(evidence["surface"][i]) if by_surface else row["probability"]
             surprise = float(truths.surprise[i])
+            row["surprise"] = surprise
             row["held"] = [surprise <= sets.find_limit(level / 100, value) for level in SHOWN]
             weights = trace.belief.log_weights[i].double().softmax(0).numpy()
             one = Batch(*(part[i : i + 1] for part in batch))
@@ -135,8 +144,10 @@ def collect(file: str, options: Any, end: float) -> bool:
                 continue
             if time.monotonic() > end:
                 return False
+            first = 8 * number
+            scenes = [one.group for one in dataset.records[first : first + 8]]
             with options.rows.open("a") as out:
-                lines = [json.dumps(row) for row in look(method, batch, number, there)]
+                lines = [json.dumps(row) for row in look(method, batch, number, there, scenes)]
                 out.write("\n".join(lines) + "\n")
     return True
 
@@ -144,6 +155,39 @@ def collect(file: str, options: Any, end: float) -> bool:
 def read_rows(file: Path) -> list[Row]:
     """Return the rows of a file."""
     return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def judge_across(rows: Sequence[Row], folds: int = 5, seed: int = 0) -> list[Row]:
+    """Return the rows with the probabilities and sets of calibrations on other scenes' rows."""
+    out = []
+    for name in dict.fromkeys(row["object"] for row in rows):
+        own = [row for row in rows if row["object"] == name]
+        scenes = sorted({row["scene"] for row in own})
+        order = np.random.default_rng(seed).permutation(scenes)
+        fold = {scene: k % folds for k, scene in enumerate(order)}
+        part = np.array([fold[row["scene"]] for row in own])
+        frames = gather_frames(own)
+        for k in range(folds):
+            made = fit_calibration(frames.select(np.flatnonzero(part != k)), "fat")
+            held = np.flatnonzero(part == k)
+            found = made.assess_features(torch.from_numpy(frames.evidence[held]))
+            assert made.conformal is not None
+            for i, presence, probability in zip(held, *(x.tolist() for x in found), strict=True):
+                row = own[i] | {"presence": presence, "probability": probability}
+                if row["there"]:
+                    limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
+                    row["held"] = [row["surprise"] <= limit for limit in limits]
+                out.append(row)
+    return out
+
+
+def gather_frames(rows: Sequence[Row]) -> Frames:
+    """Return rows of one object as calibration frames."""
+    names = tuple(rows[0]["evidence"])
+    evidence = np.array([[row["evidence"][name] for name in names] for row in rows])
+    there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
+    surprise = np.array([row.get("surprise", np.nan) for row in rows])
+    return Frames(names, evidence, there, right, surprise)
 
 
 def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -232,16 +276,18 @@ def main() -> int:
     parser.add_argument("--without", type=int, default=100)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--table", type=Path, help="only print the tables of these rows")
+    parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
     options = parser.parse_args()
     torch.set_num_threads(1)
     whole = True
-    if options.table is None:
+    if options.table is None and options.cross is None:
         if not (options.files and options.root and options.meshes and options.rows):
             parser.error("checkpoints, --root, --meshes and --rows are needed")
         end = time.monotonic() + 60 * options.minutes
         left = [file for file in options.files if not collect(file, options, end)]
         whole = not left
-    rows = read_rows(options.table or options.rows)
+    rows = read_rows(options.table or options.cross or options.rows)
+    rows = rows if options.cross is None else judge_across(rows)
     print(tabulate_coverage(rows), tabulate_confidence(rows), sep="\n\n")
     return 0 if whole else 3
 

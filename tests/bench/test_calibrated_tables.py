@@ -79,3 +79,23 @@ def test_the_band_of_a_belief_at_the_truth_holds_the_outline_and_one_beside_it_d
     for pose, least, most in ((truth, 1.0, 1.0), (beside, -1.0, 0.2)):
         held = bench.measure_band(pose[None], np.ones(1), truth, hull, one)
         assert least <= held <= most
+
+
+def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
+    rng = np.random.default_rng(0)
+    rows = []
+    for i in range(300):
+        there, scene = i % 2 == 0, f"scene{i // 6}"
+        seen = {"exact": float(rng.normal(2.0 * there)), "score": float(rng.normal())}
+        own = row(there, 0.5, there and seen["exact"] > 1.5, scene=scene, evidence=seen)
+        # of one scene every truth surprises: its own calibration would hold it
+        own |= {"surprise": 100.0 if scene == "scene3" else float(rng.normal())} if there else {}
+        rows.append(own)
+    judged = bench.judge_across(rows)
+    assert len(judged) == len(rows)
+    own = [one for one in judged if one["there"]]
+    assert all(one["held"] == [False] * 4 for one in own if one["scene"] == "scene3")
+    others = np.mean([one["held"] for one in own if one["scene"] != "scene3"], axis=0)
+    assert np.abs(others - [0.5, 0.8, 0.9, 0.95]).max() < 0.1
+    assert np.mean([one["presence"] for one in own]) > 0.6
+    assert rows[0]["presence"] == 0.5  # what was given stays
