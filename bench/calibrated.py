@@ -3,10 +3,12 @@
     python bench/calibrated.py --root DIR --meshes DIR --rows FILE.jsonl [--frames 200]
         [--without 100] [--minutes 5] FILE.ckpt ...
     python bench/calibrated.py --table FILE.jsonl      # only prints the tables
-    python bench/calibrated.py --cross FILE.jsonl      # the same, of calibrations on these frames
+    python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out exact spotted]
+        # the same, of calibrations on these frames
 
 With --cross the checkpoints' own calibrations do not count: the frames of each object are divided
-into five parts by scene, and each part is judged by a calibration on the other four.
+into five parts by scene, and each part is judged by a calibration on the other four.  --most takes
+so many of their frames with the object and as many without, --leave-out leaves out witnesses.
 
 Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
 --without that lack the object.  A row an image is added to the file; started again, it goes on, and
@@ -157,18 +159,35 @@ def read_rows(file: Path) -> list[Row]:
     return [json.loads(line) for line in file.read_text().splitlines()]
 
 
-def judge_across(rows: Sequence[Row], folds: int = 5, seed: int = 0) -> list[Row]:
-    """Return the rows with the probabilities and sets of calibrations on other scenes' rows."""
+def judge_across(
+    rows: Sequence[Row],
+    most: int | None = None,
+    leave_out: Sequence[str] = (),
+    folds: int = 5,
+    seed: int = 0,
+) -> list[Row]:
+    """Return the rows with the probabilities and sets of calibrations on other scenes' rows.
+
+    Args:
+        rows: Of `look`.
+        most: Frames with the object, and without, that a calibration takes; None: all.
+        leave_out: Witnesses that it does without.
+        folds: Parts of the scenes.
+        seed: Of their shuffle.
+    """
     out = []
     for name in dict.fromkeys(row["object"] for row in rows):
         own = [row for row in rows if row["object"] == name]
         scenes = sorted({row["scene"] for row in own})
-        order = np.random.default_rng(seed).permutation(scenes)
+        rng = np.random.default_rng(seed)
+        order = rng.permutation(scenes)
         fold = {scene: k % folds for k, scene in enumerate(order)}
         part = np.array([fold[row["scene"]] for row in own])
-        frames = gather_frames(own)
+        frames = gather_frames(own, leave_out)
         for k in range(folds):
-            made = fit_calibration(frames.select(np.flatnonzero(part != k)), "fat")
+            learned = rng.permutation(np.flatnonzero(part != k))
+            both = [learned[frames.there[learned] == there][:most] for there in (True, False)]
+            made = fit_calibration(frames.select(np.concatenate(both)), "fat")
             held = np.flatnonzero(part == k)
             found = made.assess_features(torch.from_numpy(frames.evidence[held]))
             assert made.conformal is not None
@@ -181,9 +200,9 @@ def judge_across(rows: Sequence[Row], folds: int = 5, seed: int = 0) -> list[Row
     return out
 
 
-def gather_frames(rows: Sequence[Row]) -> Frames:
-    """Return rows of one object as calibration frames."""
-    names = tuple(rows[0]["evidence"])
+def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
+    """Return rows of one object as calibration frames, without some witnesses."""
+    names = tuple(name for name in rows[0]["evidence"] if name not in leave_out)
     evidence = np.array([[row["evidence"][name] for name in names] for row in rows])
     there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
     surprise = np.array([row.get("surprise", np.nan) for row in rows])
@@ -277,6 +296,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--table", type=Path, help="only print the tables of these rows")
     parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
+    parser.add_argument("--most", type=int, help="frames with the object, and without, of these")
+    parser.add_argument("--leave-out", nargs="+", default=[], help="witnesses")
     options = parser.parse_args()
     torch.set_num_threads(1)
     whole = True
@@ -287,7 +308,8 @@ def main() -> int:
         left = [file for file in options.files if not collect(file, options, end)]
         whole = not left
     rows = read_rows(options.table or options.cross or options.rows)
-    rows = rows if options.cross is None else judge_across(rows)
+    if options.cross is not None:
+        rows = judge_across(rows, options.most, options.leave_out)
     print(tabulate_coverage(rows), tabulate_confidence(rows), sep="\n\n")
     return 0 if whole else 3
 

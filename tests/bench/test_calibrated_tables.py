@@ -99,3 +99,7 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
     assert np.abs(others - [0.5, 0.8, 0.9, 0.95]).max() < 0.1
     assert np.mean([one["presence"] for one in own]) > 0.6
     assert rows[0]["presence"] == 0.5  # what was given stays
+    blind = bench.judge_across(rows, leave_out=["exact"])
+    assert np.mean([one["presence"] for one in blind if one["there"]]) < 0.55
+    few = bench.judge_across(rows, most=15)
+    assert all(one["held"][3] for one in few if one["there"])  # fewer than 19: every pose
