@@ -124,6 +124,8 @@ def look(
 
 def collect(file: str, options: Any, end: float) -> bool:
     """Add the rows of one checkpoint that are missing; tell whether none is left."""
+    if time.monotonic() > end:
+        return False
     checkpoint = read_checkpoint(file)
     method = method_of(checkpoint, lightning=False)
     name, method.seed = method.model.name, 0
