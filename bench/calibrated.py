@@ -3,7 +3,7 @@
     python bench/calibrated.py --root DIR --meshes DIR --rows FILE.jsonl [--frames 200]
         [--without 100] [--minutes 5] FILE.ckpt ...
     python bench/calibrated.py --table FILE.jsonl      # only prints the tables
-    python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out exact spotted]
+    python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out score]
         # the same, of calibrations on these frames
 
 With --cross the checkpoints' own calibrations do not count: the frames of each object are divided

@@ -86,8 +86,8 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
     rows = []
     for i in range(300):
         there, scene = i % 2 == 0, f"scene{i // 6}"
-        seen = {"exact": float(rng.normal(2.0 * there)), "score": float(rng.normal())}
-        own = row(there, 0.5, there and seen["exact"] > 1.5, scene=scene, evidence=seen)
+        seen = {"coordinates": float(rng.normal(2.0 * there)), "score": float(rng.normal())}
+        own = row(there, 0.5, there and seen["coordinates"] > 1.5, scene=scene, evidence=seen)
         # of one scene every truth surprises: its own calibration would hold it
         own |= {"surprise": 100.0 if scene == "scene3" else float(rng.normal())} if there else {}
         rows.append(own)
@@ -99,7 +99,7 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
     assert np.abs(others - [0.5, 0.8, 0.9, 0.95]).max() < 0.1
     assert np.mean([one["presence"] for one in own]) > 0.6
     assert rows[0]["presence"] == 0.5  # what was given stays
-    blind = bench.judge_across(rows, leave_out=["exact"])
+    blind = bench.judge_across(rows, leave_out=["coordinates"])
     assert np.mean([one["presence"] for one in blind if one["there"]]) < 0.55
     few = bench.judge_across(rows, most=15)
     assert all(one["held"][3] for one in few if one["there"])  # fewer than 19: every pose

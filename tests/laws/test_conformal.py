@@ -147,7 +147,7 @@ def draw_hard_and_easy(count: int, rng: np.random.Generator) -> tuple[Frames, np
     right = there & (rng.random(count) < 1 / (1 + np.exp(-12 * (seen - 0.4))))
     scale = np.where(seen < 0.4, 8.0, 1.0)
     surprise = np.where(there, scale * rng.standard_t(4, size=count), np.nan)
-    return Frames(("exact", "score"), evidence, there, right, surprise), seen
+    return Frames(("coordinates", "score"), evidence, there, right, surprise), seen
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])

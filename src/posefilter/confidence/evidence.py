@@ -88,9 +88,8 @@ def measure_coordinates(
         probability, the share that is on it. `recognized`: of the cells that are on the object, the
         share that the network takes for it. `coordinates`: of the cells that the network takes for
         the object, the share whose predicted object point is the one that the pose puts there,
-        within a fifth of the radius. `exact`: of those of them that are on it, the share that is
-        within a tenth. `glimpsed`: the mean probability of the cells that the network is surest of,
-        wherever they are. `spotted`: the logarithm of its odds.
+        within a fifth of the radius. `glimpsed`: the mean probability of the cells that the network
+        is surest of, wherever they are.
     """
     share = torch.sigmoid(coordinates.logit).flatten(1) * cells.valid.flatten(1)
     points = transform(invert(best), cells.point.flatten(1, 2))
@@ -99,14 +98,10 @@ def measure_coordinates(
     on = (nearest < _NOISE + 0.08 * model.diameter) & cells.valid.flatten(1)
     predicted = coordinates.coordinate.flatten(1, 2)
     error = (predicted - (points - model.center.to(best)) / model.radius).norm(dim=-1)
-    seen = share * on
-    surest = share.topk(min(_CELLS, share.shape[1]), dim=1).values.mean(1)
     total, few = share.sum(1), 0.5  # cells, so that few of them tell little
     return {
-        "explained": seen.sum(1) / (total + few),
-        "recognized": seen.sum(1) / (on.sum(1) + few),
+        "explained": (share * on).sum(1) / (total + few),
+        "recognized": (share * on).sum(1) / (on.sum(1) + few),
         "coordinates": (share * (error < 0.2)).sum(1) / (total + few),
-        "exact": (seen * (error < 0.1)).sum(1) / (seen.sum(1) + few),
-        "glimpsed": surest,
-        "spotted": torch.logit(surest, 1e-4),
+        "glimpsed": share.topk(min(_CELLS, share.shape[1]), dim=1).values.mean(1),
     }
