@@ -1,6 +1,6 @@
 """Compare the filter's belief with posteriors that are known exactly.
 
-    python bench/toy_posteriors.py [--particles 1000] [--runs 5] [--truths 400]
+    python bench/toy_posteriors.py [--particles 1000] [--runs 5] [--first-seed 0] [--truths 400]
         [--only NAME ...] [--ways NAME ...]
 
 Posteriors on SE(3), each with an exact density and exact draws: a Gaussian in which shifts and
@@ -168,7 +168,7 @@ HEAD += ("evaluations",)
 def measure(name: str, options: Any, way: str) -> list[str]:
     """Return a row of the table."""
     exact, found, held, counts, masses, off = [], [], [], [], [], []
-    for seed in range(options.runs):
+    for seed in range(options.first_seed, options.first_seed + options.runs):
         posterior = POSTERIORS[name](seed)
         truths = posterior.draw(options.truths, torch.Generator().manual_seed(1000 + seed))
         belief, count = run(posterior, options.particles, seed, way)
@@ -199,6 +199,9 @@ def main() -> int:
     )
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument(
+        "--first-seed", type=int, default=0, help="even: as many odd ones as with 0"
+    )
     parser.add_argument("--truths", type=int, default=400)
     parser.add_argument("--only", nargs="+", choices=POSTERIORS, default=list(POSTERIORS))
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))

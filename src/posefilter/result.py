@@ -46,7 +46,7 @@ class Result:
         calibration_note: In words, why there is no probability; empty where there is one.
         conformal: What `conformal_set` goes by; None where the calibration has none.
         surface: The share of the object's surface points at which the depth shows a surface, by
-            which the group of a conformal set is chosen.
+            which earlier calibrations choose the group of a conformal set.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
@@ -109,7 +109,9 @@ class Result:
             why = self.calibration_note or "it was calibrated by an earlier version, without sets"
             raise UserError(f"{self.object}: has no conformal sets ({why})")
         check_share(level)
-        limit = self.conformal.find_limit(level, self.surface)
+        value = self.surface if self.conformal.by == "surface" else self.probability
+        assert value is not None  # where there are sets there is a probability
+        limit = self.conformal.find_limit(level, value)
         return self.belief.level_set(level, -self.belief.differential_entropy - limit)
 
     def draw_overlay(
@@ -161,6 +163,35 @@ class Result:
             torch.tensor(self.score),
         )
         return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
+
+    def draw_band(
+        self,
+        rgb: np.ndarray,
+        intrinsics: np.ndarray,
+        shape: "Shape | None" = None,
+        level: float = 0.95,
+    ) -> np.ndarray:
+        """Draw how sure the belief is of the object's outline: the band in which, at a point of
+        the outline, it lies with the probability `level`, if the belief is right.
+
+        Args:
+            rgb: The image (H, W, 3) uint8, RGB.
+            intrinsics: Its camera matrix (3, 3) [px].
+            shape: A mesh, for the exact outline; None: the convex hull.
+            level: That probability.
+
+        Returns:
+            The picture (h, w, 3) uint8.
+
+        Raises:
+            UserError: The level is not in [0, 1].
+        """
+        from posefilter.figures.band import draw_band  # slow to import, needed for pictures
+
+        check_share(level)
+        shape, K = self.model.hull if shape is None else shape, np.asarray(intrinsics)
+        poses, weights = self.belief.samples, self.belief.weights
+        return draw_band(rgb, K, poses, weights, shape, level, caption=self.describe())
 
 
 class Run(NamedTuple):

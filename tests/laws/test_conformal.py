@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from posefilter.confidence.calibration import read_calibration
-from posefilter.confidence.conformal import Conformal, fit_conformal
+from posefilter.confidence.conformal import Conformal, choose_edges, fit_conformal
 from posefilter.confidence.fit import Frames, fit_calibration
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, move_about
@@ -132,6 +132,57 @@ def test_a_calibration_carries_the_surprises_of_the_frames_with_the_object() -> 
     assert read_calibration(earlier, "x").conformal is None
 
 
+def test_what_an_earlier_version_stored_is_grouped_by_surface() -> None:
+    content = fit_calibration(frames(), "scenes").to_plain()
+    content["conformal"] = {"edges": [0.25], "surprises": [[1.0], [2.0]]}
+    read = read_calibration(content, "x").conformal
+    assert read == Conformal((0.25,), ((1.0,), (2.0,)), "surface")
+
+
+def draw_hard_and_easy(count: int, rng: np.random.Generator) -> tuple[Frames, np.ndarray]:
+    """Draw frames whose truths surprise the more the less is seen, which is a hidden number."""
+    seen = rng.random(count)
+    there = rng.random(count) < 0.6
+    evidence = np.stack([seen + 0.1 * rng.normal(size=count), rng.normal(size=count)], 1)
+    right = there & (rng.random(count) < 1 / (1 + np.exp(-12 * (seen - 0.4))))
+    scale = np.where(seen < 0.4, 8.0, 1.0)
+    surprise = np.where(there, scale * rng.standard_t(4, size=count), np.nan)
+    return Frames(("coordinates", "score"), evidence, there, right, surprise), seen
+
+
+@pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
+def test_groups_by_probability_cover_the_hard_frames_as_often_as_the_easy_ones(
+    level: float,
+) -> None:
+    rng = np.random.default_rng(4)
+    held: dict[str, list[np.ndarray]] = {"hard": [], "easy": []}
+    for _ in range(12):
+        made = fit_calibration(draw_hard_and_easy(650, rng)[0], "scenes")
+        assert made.conformal is not None
+        assert made.conformal.by == "probability"
+        assert len(made.conformal.surprises) == 5
+        assert all(30 < len(own) < 150 for own in made.conformal.surprises)
+        new, seen = draw_hard_and_easy(2000, rng)
+        own = new.there
+        assert new.surprise is not None
+        probability = made.assess_features(torch.from_numpy(new.evidence[own])).probability
+        limit = [made.conformal.find_limit(level, float(p)) for p in probability]
+        inside = new.surprise[own] <= np.array(limit)
+        held["hard"].append(inside[seen[own] < 0.3])
+        held["easy"].append(inside[seen[own] > 0.6])
+    share = {name: float(np.concatenate(rows).mean()) for name, rows in held.items()}
+    assert share["hard"] == pytest.approx(level, abs=0.06)
+    assert share["easy"] == pytest.approx(level, abs=0.06)
+
+
+def test_few_frames_are_one_group() -> None:
+    assert choose_edges(np.linspace(0, 1, 39)) == ()
+    assert choose_edges(np.linspace(0, 1, 41)) == pytest.approx((0.5,))
+    assert choose_edges(np.linspace(0, 1, 199)) == pytest.approx((0.25, 0.5, 0.75))
+    assert choose_edges(np.linspace(0, 1, 200)) == pytest.approx((0.1, 0.25, 0.45, 0.7))
+    assert len(choose_edges(np.zeros(400))) == 1  # all alike: no limit tells them apart
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -143,6 +194,9 @@ def test_a_calibration_carries_the_surprises_of_the_frames_with_the_object() -> 
         {"edges": [0.25], "surprises": [["1"], []]},
         {"edges": [0.25, 0.2], "surprises": [[], [], []]},
         {"edges": [0.1] * 40, "surprises": [[]] * 41},
+        {"edges": [], "surprises": [[1.0]], "by": "score"},
+        {"edges": [], "surprises": [[1.0]], "by": []},
+        {"edges": [], "surprises": [[1.0]], "more": 1},
     ],
 )
 def test_surprises_that_are_none_are_refused(wrong: object) -> None:

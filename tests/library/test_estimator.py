@@ -201,6 +201,11 @@ def test_pictures(small: posefilter.Estimator) -> None:
     assert drawn.dtype == np.uint8
     assert drawn.shape[1] >= rgb.shape[1]
     assert len(np.unique(result.draw_belief(rgb, K).reshape(-1, 3), axis=0)) > 100
+    band = result.draw_band(rgb, K, level=0.5)
+    assert band.shape[1] == drawn.shape[1]
+    assert len(np.unique(band.reshape(-1, 3), axis=0)) > 100
+    with pytest.raises(posefilter.UserError, match="a share is between 0 and 1"):
+        result.draw_band(rgb, K, level=1.5)
     assert posefilter.figures.draw_overlay is not None
 
 

@@ -231,6 +231,7 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     assert belief["weights"].sum() == pytest.approx(1, abs=1e-4)
     assert (out / "overlay.png").is_file()
     assert (out / "belief.png").is_file()
+    assert (out / "band.png").is_file()
 
 
 @pytest.mark.parametrize(

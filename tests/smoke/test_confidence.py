@@ -193,3 +193,33 @@ def test_a_detector_is_refused(tiny_scenes: Path, tmp_path: Path) -> None:
     typed = [f"checkpoint={tmp_path / 'detector.ckpt'}"]
     with pytest.raises(UserError, match="estimates no pose"):
         calibrate(compose_job("calibrate", HOME / "conf", typed, tmp_path))
+
+
+@pytest.mark.parametrize("name", ["patch_pf", "pixel_pf"])
+def test_methods_in_image_space_are_calibrated_too(
+    name: str, tiny_scenes: Path, without: Path, tmp_path: Path
+) -> None:
+    typed = [f"model={name}", *TINY, f"data.root={tiny_scenes}", "filter.steps=3"]
+    job = compose_job("train", HOME / "conf", typed, tmp_path)
+    data = build_data(job.cfg.data, "json")
+    method = build_method(recipe(job), data.object_model(0), lightning=False)
+    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
+    method.on_save_checkpoint(content)
+    torch.save(content, tmp_path / "bare.ckpt")
+    out = tmp_path / "calibrated.ckpt"
+    words = [f"checkpoint={tmp_path / 'bare.ckpt'}", f"data.root={tiny_scenes}"]
+    words += ["data.split={train: 0, val: 1.0, test: 0}", "data.min_visibility_test=0"]
+    words += [f"absent={without}", "frames=12", f"out={out}", *QUIET]
+    assert run_command("calibrate", HOME, words) == 0
+    stored = torch.load(out, weights_only=True)["calibration"]
+    assert set(stored["features"]) == {"score", "concentration", "surface", "solid"}
+    rgb = min(tiny_scenes.rglob("*.left.jpg"))
+    depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
+    color = cv2.cvtColor(cv2.imread(str(rgb)), cv2.COLOR_BGR2RGB)
+    z = cv2.imread(str(depth), cv2.IMREAD_UNCHANGED) / 10_000
+    K = np.array([[266.0, 0, 78], [0, 266, 60], [0, 0, 1]])
+    result = load(str(out)).predict(color, z, K)
+    assert result.probability is not None
+    assert result.presence is not None
+    assert 0 < result.probability < result.presence < 1
+    assert result.conformal_set(0.8).level == 0.8

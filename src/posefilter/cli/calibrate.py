@@ -157,7 +157,7 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     ]
     if calibration.conformal is not None:
         shown = " and ".join(str(len(own)) for own in calibration.conformal.surprises)
-        rows.append(("of those with it, little of it and much of it seen", shown))
+        rows.append(("groups of those with it, by rising probability", shown))
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
     if job.cfg.console != JSON:

@@ -61,7 +61,9 @@ def predict(job: Job) -> None:
 
 
 def predict_one(job: Job) -> list[Result]:
-    """Write pose.json, overlay.png, belief.png, belief.npz, and where asked for view.rrd."""
+    """Write pose.json, overlay.png, band.png, belief.png, belief.npz, and where asked for
+    view.rrd.
+    """
     cfg, folder = job.cfg, job.folder
     costs = read_costs(cfg)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
@@ -75,6 +77,7 @@ def predict_one(job: Job) -> list[Result]:
     ((result,),) = collect_results([run], costs)
     folder.mkdir(parents=True, exist_ok=True)
     save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
+    save_image(result.draw_band(rgb, K, mesh), folder / "band.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     result.belief.save(folder / "belief.npz")
     answer = describe(result, cfg.checkpoint, job)
@@ -86,6 +89,7 @@ def predict_one(job: Job) -> list[Result]:
     files = {
         "pose": "pose.json",
         "overlay": "overlay.png",
+        "band": "band.png",
         "belief": "belief.png",
         "numbers": "belief.npz",
     }

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.conformal import GROUPED_BY, Conformal
 from posefilter.errors import UserError
 
 LIMIT = 3.0  # standard deviations
@@ -106,7 +106,8 @@ class Calibration:
             plain[name] = {"weights": list(one.weights), "bias": one.bias}
         if self.conformal is not None:
             surprises = [list(own) for own in self.conformal.surprises]
-            plain["conformal"] = {"edges": list(self.conformal.edges), "surprises": surprises}
+            edges, by = list(self.conformal.edges), self.conformal.by
+            plain["conformal"] = {"by": by, "edges": edges, "surprises": surprises}
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
@@ -177,8 +178,11 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
 def _conformal(content: Any) -> Conformal | None:
     if content is None:
         return None
-    if not isinstance(content, dict) or set(content) != {"edges", "surprises"}:
+    if not isinstance(content, dict) or set(content) - {"by"} != {"edges", "surprises"}:
         raise ValueError("should have edges and surprises in conformal")
+    by = content.get("by", "surface")  # earlier versions name none
+    if by not in GROUPED_BY:
+        raise ValueError(f"should group conformal by {' or '.join(GROUPED_BY)}")
     groups = content["surprises"]
     if not isinstance(groups, list) or not 1 <= len(groups) <= _MOST_GROUPS:
         raise ValueError(f"should have 1 to {_MOST_GROUPS} groups in conformal")
@@ -190,7 +194,7 @@ def _conformal(content: Any) -> Conformal | None:
         read.append(_numbers(one, len(one), "conformal's surprises"))
     if any(list(one) != sorted(one) for one in [edges, *read]):
         raise ValueError("has numbers of conformal that do not rise")
-    return Conformal(edges, tuple(read))
+    return Conformal(edges, tuple(read), by)
 
 
 def _numbers(values: Any, count: int, name: str, least: float = -_LARGEST) -> tuple[float, ...]:

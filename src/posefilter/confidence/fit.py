@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from posefilter.confidence.calibration import LIMIT, Assessment, Calibration, Logistic
-from posefilter.confidence.conformal import fit_conformal
+from posefilter.confidence.conformal import choose_edges, fit_conformal
 from posefilter.errors import UserError
 
 FEWEST = 10  # frames with the object, and without
@@ -79,11 +79,12 @@ def fit_calibration(
                 f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
             )
     fitted = _fit(frames, source, quality or {})
-    if frames.surprise is None or "surface" not in frames.features:
+    if frames.surprise is None:
         return fitted
-    surface = frames.evidence[:, frames.features.index("surface")]
     own = frames.there
-    return replace(fitted, conformal=fit_conformal(frames.surprise[own], surface[own]))
+    held = cross_validate(frames).probability.numpy()[own]
+    sets = fit_conformal(frames.surprise[own], held, choose_edges(held), by="probability")
+    return replace(fitted, conformal=sets)
 
 
 def _fit(frames: Frames, source: str, quality: Mapping[str, float]) -> Calibration:

@@ -1,0 +1,320 @@
+"""Test what calibrated checkpoints say of themselves, on rendered frames that no calibration saw.
+
+    python bench/calibrated.py --root DIR --meshes DIR --rows FILE.jsonl [--frames 200]
+        [--without 100] [--minutes 5] FILE.ckpt ...
+    python bench/calibrated.py --table FILE.jsonl      # only prints the tables
+    python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out score]
+        # the same, of calibrations on these frames
+
+With --cross the checkpoints' own calibrations do not count: the frames of each object are divided
+into five parts by scene, and each part is judged by a calibration on the other four.  --most takes
+so many of their frames with the object and as many without, --leave-out leaves out witnesses.
+
+Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
+--without that lack the object.  A row an image is added to the file; started again, it goes on, and
+--minutes ends it early.
+
+Shown is the share of the object that is seen: the visible share of what lies in the frame, times
+the share of its surface points that the frame holds, since the frame cuts many off.  Coverage is
+that of conformal and of credible sets.  In the band: the share of the true outline's points, of the
+hull, that lie in the 95 % band of the belief (`Result.draw_band`).
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from posefilter.cli.build import build_data
+from posefilter.cli.calibrate import is_right
+from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.command import compose_job
+from posefilter.cli.evaluate import data_settings
+from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.data.absent import hide_annotation
+from posefilter.data.loaders import make_loader
+from posefilter.figures.band import find_band, measure_cover
+from posefilter.figures.canvas import View
+from posefilter.geometry.camera import project
+from posefilter.geometry.pose import transform
+from posefilter.metrics.confidence import calibration_error, error_at_coverage
+from posefilter.metrics.credibility import SHOWN, score_truth
+from posefilter.metrics.diagnostics import auroc
+from posefilter.models.base import PoseEstimator
+from posefilter.types import Batch
+
+HOME = Path(__file__).parents[1]
+QUARTERS = (0.0, 0.25, 0.5, 0.75)
+LEVEL = 0.95  # of the band
+SURE, LOST = 0.8, 0.2  # found from this probability, absent below this presence
+Row = dict[str, Any]
+
+
+def measure_shown(batch: Batch, points: torch.Tensor) -> torch.Tensor:
+    """Return the share of the object that is seen.  points (P, 3) [m] -> (B,)."""
+    at = transform(batch.camera_from_object, points)
+    u, v = project(at, batch.intrinsics).unbind(-1)
+    height, width = batch.depth.shape[-2:]
+    inside = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5) & (at[..., 2] > 0.01)
+    return batch.visibility * inside.float().mean(1)
+
+
+def measure_band(
+    poses: np.ndarray, weights: np.ndarray, truth: np.ndarray, hull: np.ndarray, batch: Batch
+) -> float:
+    """Return the share of the true outline's points that lie in the band; NaN where there are none.
+
+    (N, 4, 4), (N,), (4, 4), (V, 3) [m]; a batch of one image.
+    """
+    height, width = batch.depth.shape[-2:]
+    view, K = View(-0.5, -0.5, 1.0, width, height), batch.intrinsics[0].double().numpy()
+    surely, maybe = find_band(measure_cover(poses, weights, hull, K, view), LEVEL)
+    own = measure_cover(truth[None], np.ones(1), hull, K, view) > 0.5
+    mask, ring = own.astype(np.uint8), np.ones((3, 3), np.uint8)
+    # the outline's outermost pixels, and those beyond it; the frame's edge is no outline
+    inner = own & (np.asarray(cv2.erode(mask, ring, borderValue=1)) == 0)
+    outer = ~own & (np.asarray(cv2.dilate(mask, ring)) > 0)
+    total = int(inner.sum()) + int(outer.sum())
+    missed = int((inner & ~maybe).sum()) + int((outer & surely).sum())
+    return 1 - 2 * missed / total if total else float("nan")
+
+
+def look(
+    method: PoseEstimator, batch: Batch, number: int, there: bool, scenes: Sequence[str]
+) -> Iterator[Row]:
+    """Run the filter on a batch, and yield a row an image; `scenes` are those of its images."""
+    model, calibration = method.model, method.calibration
+    assert calibration is not None
+    seen = Batch(*hide_annotation(batch))
+    with torch.no_grad():
+        trace = method.predict_step(seen, number)
+        evidence = method.collect_evidence(trace, seen)
+    found = calibration.assess(evidence)
+    right = is_right(method, trace.belief.best, batch.camera_from_object)
+    truths = score_truth(trace.belief, batch.camera_from_object, model) if there else None
+    shown = measure_shown(batch, model.points[:: max(1, len(model.points) // 500)])
+    for i in range(len(batch.rgb)):
+        row: Row = {"object": model.name, "there": there, "right": there and bool(right[i])}
+        row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
+        row |= {"scene": scenes[i], "evidence": {k: float(v[i]) for k, v in evidence.items()}}
+        if truths is not None:
+            row |= {"visibility": float(batch.visibility[i]), "shown": float(shown[i])}
+            row |= {"rank": float(truths.rank[i]), "log_density": float(truths.log_density[i])}
+            sets = calibration.conformal
+            assert sets is not None
+            by_surface = sets.by == "surface"
+            value = float(evidence["surface"][i]) if by_surface else row["probability"]
+            surprise = float(truths.surprise[i])
+            row["surprise"] = surprise
+            row["held"] = [surprise <= sets.find_limit(level / 100, value) for level in SHOWN]
+            weights = trace.belief.log_weights[i].double().softmax(0).numpy()
+            one = Batch(*(part[i : i + 1] for part in batch))
+            belief, truth = trace.belief.poses[i].double().numpy(), batch.camera_from_object[i]
+            hull = model.hull.double().numpy()
+            row["band"] = measure_band(belief, weights, truth.double().numpy(), hull, one)
+        yield row
+
+
+def collect(file: str, options: Any, end: float) -> bool:
+    """Add the rows of one checkpoint that are missing; tell whether none is left."""
+    if time.monotonic() > end:
+        return False
+    checkpoint = read_checkpoint(file)
+    method = method_of(checkpoint, lightning=False)
+    name, method.seed = method.model.name, 0
+    if method.calibration is None or method.calibration.conformal is None:
+        raise SystemExit(f"{file}: is not calibrated, or without conformal sets")
+    rows = read_rows(options.rows) if options.rows.exists() else []
+    words = [f"checkpoint={file}", "data=fat", f"data.root={options.root}"]
+    words += [f"data.meshes={options.meshes}", f"data.object={name}", "data.split={val: 1.0}"]
+    words += ["data.min_visibility_test=0.1", "data.workers=0"]
+    job = compose_job("calibrate", HOME / "conf", words, Path())
+    settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
+    settings.limit_val = options.frames
+    data = build_data(settings, "json")
+    data.setup("validate")
+    parts = ((data.val_dataset, True), (data.absent_dataset("val", options.without), False))
+    for dataset, there in parts:
+        done = sum(row["object"] == name and row["there"] == there for row in rows)
+        for number, batch in enumerate(make_loader(dataset, 8, 0)):
+            if 8 * number < done:
+                continue
+            if time.monotonic() > end:
+                return False
+            first = 8 * number
+            scenes = [one.group for one in dataset.records[first : first + 8]]
+            with options.rows.open("a") as out:
+                lines = [json.dumps(row) for row in look(method, batch, number, there, scenes)]
+                out.write("\n".join(lines) + "\n")
+    return True
+
+
+def read_rows(file: Path) -> list[Row]:
+    """Return the rows of a file."""
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def judge_across(
+    rows: Sequence[Row],
+    most: int | None = None,
+    leave_out: Sequence[str] = (),
+    folds: int = 5,
+    seed: int = 0,
+) -> list[Row]:
+    """Return the rows with the probabilities and sets of calibrations on other scenes' rows.
+
+    Args:
+        rows: Of `look`.
+        most: Frames with the object, and without, that a calibration takes; None: all.
+        leave_out: Witnesses that it does without.
+        folds: Parts of the scenes.
+        seed: Of their shuffle.
+    """
+    out = []
+    for name in dict.fromkeys(row["object"] for row in rows):
+        own = [row for row in rows if row["object"] == name]
+        scenes = sorted({row["scene"] for row in own})
+        rng = np.random.default_rng(seed)
+        order = rng.permutation(scenes)
+        fold = {scene: k % folds for k, scene in enumerate(order)}
+        part = np.array([fold[row["scene"]] for row in own])
+        frames = gather_frames(own, leave_out)
+        for k in range(folds):
+            learned = rng.permutation(np.flatnonzero(part != k))
+            both = [learned[frames.there[learned] == there][:most] for there in (True, False)]
+            made = fit_calibration(frames.select(np.concatenate(both)), "fat")
+            held = np.flatnonzero(part == k)
+            found = made.assess_features(torch.from_numpy(frames.evidence[held]))
+            assert made.conformal is not None
+            for i, presence, probability in zip(held, *(x.tolist() for x in found), strict=True):
+                row = own[i] | {"presence": presence, "probability": probability}
+                if row["there"]:
+                    limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
+                    row["held"] = [row["surprise"] <= limit for limit in limits]
+                out.append(row)
+    return out
+
+
+def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
+    """Return rows of one object as calibration frames, without some witnesses."""
+    names = tuple(name for name in rows[0]["evidence"] if name not in leave_out)
+    evidence = np.array([[row["evidence"][name] for name in names] for row in rows])
+    there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
+    surprise = np.array([row.get("surprise", np.nan) for row in rows])
+    return Frames(names, evidence, there, right, surprise)
+
+
+def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """Return a Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def cover(rows: Sequence[Row]) -> list[str]:
+    """Return frames, coverage of conformal and of credible sets, and the share in the band."""
+    held = 100 * np.mean([row["held"] for row in rows], axis=0)
+    rank = np.array([row["rank"] for row in rows])
+    plain = [100 * float((rank < level / 100).mean()) for level in SHOWN]
+    band = 100 * float(np.nanmean([row["band"] for row in rows]))
+    sets = [" / ".join(f"{x:.0f}" for x in shares) for shares in (held, plain)]
+    return [str(len(rows)), *sets, f"{band:.0f}"]
+
+
+def tabulate_coverage(rows: Sequence[Row]) -> str:
+    """Return coverage by object, by visibility and by what is shown."""
+    own = [row for row in rows if row["there"]]
+    names = dict.fromkeys(row["object"] for row in own)
+    lines = [[name, *cover([row for row in own if row["object"] == name])] for name in names]
+    lines.append(["all", *cover(own)])
+    for key in ("visibility", "shown"):
+        for low in QUARTERS:
+            high = low + 0.25 if low < 0.75 else 2
+            some = [row for row in own if low <= row[key] < high]
+            if some:
+                lines.append([f"{key} {low:g} to {min(high, 1):g}", *cover(some)])
+    levels = " / ".join(f"{level}" for level in SHOWN)
+    head = ("frames of", "frames", f"conformal sets of {levels} %", "credible sets", "in the band")
+    return draw_table(head, lines)
+
+
+def tell_presence(rows: Sequence[Row], least: float) -> str:
+    """Return the AUROC of the presence, of frames that show so much of the object."""
+    some = [row for row in rows if not row["there"] or row["shown"] >= least]
+    presence = torch.tensor([row["presence"] for row in some], dtype=torch.float64)
+    return f"{float(auroc(presence, torch.tensor([row['there'] for row in some]))):.3f}"
+
+
+def tell_confidence(rows: Sequence[Row]) -> list[str]:
+    """Return the cells of a line about probabilities."""
+    own = [row for row in rows if row["there"]]
+    every = torch.tensor([row["probability"] for row in rows], dtype=torch.float64)
+    right = torch.tensor([row["right"] for row in rows])
+    at = torch.tensor([row["there"] for row in rows])
+    wrong = 1 - float(right[at].double().mean())
+    kept = float(error_at_coverage(every[at], right[at]))
+    found = (every >= SURE).numpy()
+    lost = sum(row["presence"] < LOST for row in own)
+    return [
+        f"{len(own)}, {len(rows) - len(own)}",
+        f"{float(auroc(every[at], right[at])):.3f}",
+        f"{float(calibration_error(every, right)):.3f}",
+        f"{100 * wrong:.0f} %, {100 * kept:.0f} %",
+        *(tell_presence(rows, least) for least in (0.0, 0.25, 0.5)),
+        f"{100 * found[at.numpy()].mean():.0f} %",
+        str(int((found & at.numpy() & ~right.numpy()).sum())),
+        str(int((found & ~at.numpy()).sum())),
+        str(lost),
+    ]
+
+
+def tabulate_confidence(rows: Sequence[Row]) -> str:
+    """Return what the probabilities are worth, by object and of all."""
+    head = ["object", "frames with it, without", "AUROC right", "ECE", "wrong, of 80 % kept"]
+    head += ["AUROC presence", "a quarter shown", "half shown", "found", "found wrongly"]
+    head += ["found where absent", "absent where there"]
+    names = dict.fromkeys(row["object"] for row in rows)
+    lines = [[n, *tell_confidence([row for row in rows if row["object"] == n])] for n in names]
+    return draw_table(head, [*lines, ["all", *tell_confidence(rows)]])
+
+
+def main() -> int:
+    """Collect rows, print the tables; the status is 3 where --minutes ended it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", nargs="*")
+    parser.add_argument("--root")
+    parser.add_argument("--meshes")
+    parser.add_argument("--rows", type=Path)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--without", type=int, default=100)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--table", type=Path, help="only print the tables of these rows")
+    parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
+    parser.add_argument("--most", type=int, help="frames with the object, and without, of these")
+    parser.add_argument("--leave-out", nargs="+", default=[], help="witnesses")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    whole = True
+    if options.table is None and options.cross is None:
+        if not (options.files and options.root and options.meshes and options.rows):
+            parser.error("checkpoints, --root, --meshes and --rows are needed")
+        end = time.monotonic() + 60 * options.minutes
+        left = [file for file in options.files if not collect(file, options, end)]
+        whole = not left
+    rows = read_rows(options.table or options.cross or options.rows)
+    if options.cross is not None:
+        rows = judge_across(rows, options.most, options.leave_out)
+    print(tabulate_coverage(rows), tabulate_confidence(rows), sep="\n\n")
+    return 0 if whole else 3
+
+
+if __name__ == "__main__":
+    sys.exit(main())

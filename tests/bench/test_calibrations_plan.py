@@ -1,0 +1,38 @@
+"""Scenes of calibrations are of seeds that neither trainings nor tests have."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))  # scripts import their neighbors
+Load = Callable[[str], ModuleType]
+
+
+def seeds_of(commands: list[list[str]]) -> set[str]:
+    return {word for words in commands for word in words if word.startswith("seed=")}
+
+
+def test_seeds_are_its_own_and_all_else_is_as_for_training(load_script: Load) -> None:
+    own, training = (
+        load_script(f"bench/{name}.py").render_commands(Path("r"), 300)
+        for name in ("calibrations", "photographs")
+    )
+    assert len(seeds_of(own)) == len(own) == 14
+    assert not seeds_of(own) & seeds_of(training)
+    for one in own:
+        (same,) = (other for other in training if one[2] in other)
+        differ = {*one} - {*same}
+        assert {word.split("=")[0] for word in differ} == {"seed", "progress"}
+
+
+def test_each_file_is_calibrated_in_place_after_the_scenes_are_rendered(
+    load_script: Load,
+) -> None:
+    files = [Path("a.ckpt"), Path("b.ckpt")]
+    commands = load_script("bench/calibrations.py").list_commands(files, Path("r"), 400, 90)
+    assert [words[0] for words in commands] == ["generate.py"] * 14 + ["calibrate.py"] * 2
+    for file, words in zip(files, commands[-2:], strict=True):
+        assert f"checkpoint={file.resolve()}" in words
+        assert {"frames=400", "replace=true", "data.split={val: 1.0}"} <= {*words}
+        assert not any(word.startswith("out=") for word in words)

@@ -1,0 +1,65 @@
+"""Witnesses count what they are named for."""
+
+import math
+
+import torch
+
+from posefilter.confidence.evidence import measure_coordinates
+from posefilter.geometry.pose import make_pose, transform
+from posefilter.geometry.rotation import exp_so3
+from posefilter.nets.coordinates import Cells, Coordinates
+from posefilter.types import ObjectModel
+
+RADIUS = 0.1
+
+
+def sphere(count: int = 200) -> torch.Tensor:
+    points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    return RADIUS * points / points.norm(dim=1, keepdim=True)
+
+
+MODEL = ObjectModel(
+    "ball", sphere(), torch.zeros(3), RADIUS, 2 * RADIUS, torch.eye(4)[None], sphere()
+)
+
+
+def look(error: float, member: float, beside: int = 0) -> dict[str, float]:
+    """Return the witnesses where 100 cells show the object.
+
+    error: of the predicted object points, in radii; member: probability of membership that the
+    network gives to the object's cells; beside: cells of the background that it takes for the
+    object, with the same probability.
+    """
+    pose = make_pose(exp_so3(torch.tensor([0.3, -0.2, 0.1])), torch.tensor([0.1, 0.0, 1.0]))[None]
+    on = sphere()[:100]
+    off = torch.randn(100, 3, generator=torch.Generator().manual_seed(1)) * 0.05 + 1.0
+    points = torch.cat([transform(pose, on[None])[0], off])[None].view(1, 10, 20, 3)
+    shift = torch.zeros(200, 3)
+    shift[:, 0] = error
+    place = (torch.cat([on / RADIUS, off]) + shift).view(1, 10, 20, 1, 3)
+    odds = math.log(member / (1 - member))
+    logit = torch.full((200,), -20.0)
+    logit[: 100 + beside] = odds
+    share = torch.zeros(1, 10, 20, 1)
+    nothing = torch.zeros(1, 10, 20, 0)
+    seen = Coordinates(logit.view(1, 10, 20), share, place, torch.zeros(1, 1, 3), nothing)
+    cells = Cells(points, torch.ones(1, 10, 20, dtype=torch.bool))
+    found = measure_coordinates(pose, seen, cells, MODEL)
+    return {name: float(value) for name, value in found.items()}
+
+
+def test_predicted_points_count_within_a_fifth_of_the_radius() -> None:
+    assert look(0.15, 0.99)["coordinates"] > 0.99
+    assert look(0.25, 0.99)["coordinates"] < 0.01
+
+
+def test_what_lies_beside_the_pose_speaks_against_it_where_it_should() -> None:
+    alone, more = look(0.05, 0.9), look(0.05, 0.9, beside=50)
+    assert more["explained"] < alone["explained"] - 0.3
+    for name in ("recognized", "glimpsed"):
+        assert abs(more[name] - alone[name]) < 0.01
+
+
+def test_cells_that_the_network_does_not_recognize_are_told_by_their_share() -> None:
+    assert abs(look(0.05, 0.3)["recognized"] - 0.3) < 0.01
+    assert abs(look(0.05, 0.3)["glimpsed"] - 0.3) < 0.01
