@@ -142,6 +142,9 @@ class Result:
             return f"{self.object}, score {self.score:.2f}"
         if self.verdict == "absent":
             return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
+        if self.verdict == "unsure":
+            there = f"{self.presence:.2f} that it is there"
+            return f"{self.object}: unsure, probability {self.probability:.2f}, {there}"
         return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
 
     def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:

@@ -174,7 +174,8 @@ def mark_result(result: Result, shape: Shape) -> Drawn:
     if result.probability is None:
         said = f"{result.score:.1f}"
     else:
-        said = f"unsure, {result.probability:.2f}" if unsure else f"{result.probability:.2f}"
+        there = f"unsure {result.probability:.2f}, there {result.presence:.2f}"
+        said = there if unsure else f"{result.probability:.2f}"
     known = f"{said}, implausible" if result.warnings else said
     tag = "" if result.probability is None else f"{result.object} {result.probability:.2f}"
     return Drawn(f"{result.object} ({known})", result.pose, shape, tag, unsure)
