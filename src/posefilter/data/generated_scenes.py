@@ -8,7 +8,6 @@ from typing import Any
 from posefilter.errors import UserError
 
 _MARK = "_generator.json"
-LOOKALIKE = "lookalike_"  # how the names of distractors begin that are made for one set of scenes
 
 
 def ensure_scenes(root: Path, generate: Callable[[Path], Any] | None) -> None:

@@ -17,6 +17,8 @@ _HULL_VERTICES = 128
 _HULL_DIRECTIONS = 5000  # some 2.9 degrees apart
 _HULL_ERROR = 2.5e-4  # [m] stop refining the outline hull here
 _PART_POINTS = 300  # of a part's surface, beside the vertices of its hull
+# how the names of distractors begin that are made for one set of rendered scenes: no file has them
+LOOKALIKE = "lookalike_"
 
 
 def _identity() -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posefilter.data.generated_scenes import LOOKALIKE
+from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
 from posefilter.synthetic.copies import place_copies

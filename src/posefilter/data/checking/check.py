@@ -17,10 +17,10 @@ from posefilter.data.checking.compare import Fit, View, compare, half_pixel, lik
 from posefilter.data.checking.contact_figure import tile, write_sheet
 from posefilter.data.checking.frames import Suspect, describe_suspects, is_suspect
 from posefilter.data.frames import Implausible, NotShown, Reader
-from posefilter.data.generated_scenes import LOOKALIKE
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
 from posefilter.files import write_whole
+from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.progress import watched
 
