@@ -119,6 +119,21 @@ def test_a_pickle_is_read_before_it_is_obeyed(what: str, good: Path, tmp_path: P
     assert "checkpoint=" in refuse(lambda: read_checkpoint(path))
 
 
+def test_what_training_keeps_is_no_attack(content: dict[str, Any], save: Save) -> None:
+    """States of optimizers, schedules and callbacks: counters, sets, numbers of 64 bits."""
+    weight = torch.nn.Parameter(torch.zeros(3, 2, 2, 2, 2, 2, dtype=torch.bfloat16))
+    optimizer = torch.optim.AdamW([weight], betas=(0.9, 0.99))
+    weight.sum().backward()
+    optimizer.step()
+    schedule = torch.optim.lr_scheduler.MultiStepLR(optimizer, [1, 2, 2])
+    kept = {"optimizer": optimizer.state_dict(), "schedule": schedule.state_dict()}
+    kept |= {"seen": {"a", "b"}, "seed": 2**63 - 1, 2: None, "kind": torch.float16, "a": weight}
+    content.update(kept)
+    read = read_checkpoint(save(content))
+    assert read["schedule"]["milestones"] == schedule.state_dict()["milestones"]
+    assert (read["seen"], read["seed"]) == (kept["seen"], kept["seed"])
+
+
 def laughing(way: str) -> dict[str, Any]:
     """Settings that refer to each other, ten times each, in a way that a count may overlook."""
     first: dict[str, Any] = {"l0": "x" * 900 if way == "select" else [[1]]}

@@ -11,13 +11,13 @@ import re
 from posefilter.errors import UserError
 
 _LARGEST, _MOST_STEPS = 1 << 24, 2_000_000  # bytes of a pickle; steps of it
-_HEAVIEST = 1000  # values in a tuple, those within its own tuples included
+_HEAVIEST = 100  # values in a tuple, those within its own tuples included
 _GLOBALS = re.compile(
     r"torch \w+Storage|torch\.storage (Typed|Untyped)Storage"
     r"|torch\._utils _rebuild_(tensor_v2|parameter)|torch\.nn\.parameter Parameter"
     r"|torch (Size|device|\w*float\w*|\w*int\d+|bool)|torch\.serialization _get_layout"
     r"|torch\._utils _rebuild_sparse_tensor|torch\._utils _rebuild_meta_tensor_no_storage"
-    r"|collections OrderedDict"
+    r"|collections (OrderedDict|Counter)|(__builtin__|builtins) set"
 )
 _LEAVES = (
     *("NONE", "NEWTRUE", "NEWFALSE", "BININT", "BININT1", "BININT2", "BINFLOAT", "BINUNICODE"),
