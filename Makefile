@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized dense_coordinates keypoints
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-all check format smoke bench methods board report tour pictures weights docs tables clean
+.PHONY: help setup train test test-all coverage check format smoke bench methods board report tour pictures weights docs tables clean
 
 help: ## print this list
 	@awk 'BEGIN {FS = ":.*## "} /^[a-z-]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -26,6 +26,12 @@ test: $(STAMP) ## run the tests but for the slow ones, two at a time, one thread
 
 test-all: $(STAMP) ## run all tests, also those of whole workflows
 	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist worksteal $(ARGS)
+
+coverage: $(STAMP) ## run them once more, and tell which lines of src none of them reaches (twice the time)
+	OMP_NUM_THREADS=1 $(PY) -m coverage erase
+	OMP_NUM_THREADS=1 $(PY) -m coverage run -m pytest -m "not slow" $(ARGS)
+	$(PY) -m coverage combine --quiet
+	$(PY) -m coverage report
 
 check: $(STAMP) ## check format, lint, types and import floors
 	.ci/check $(VENV)/bin

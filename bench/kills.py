@@ -1,17 +1,22 @@
 """Kill trainings at random times, go on with them, and compare them with trainings that were not.
 
     python bench/kills.py [COUNT] [--seed SEED] [--models A,B] [--workers 0,2] [--minutes MINUTES]
-        [--after SHARE]
+        [--after SHARE] [--first NUMBER] [--keep FOLDER]
 
 Each training is a process of its own, forked from this one, and is killed by SIGKILL at a random
-time of its length, in its later part with --after; it writes a checkpoint after every batch, so
-that many kills fall into the writing of one. It is then gone on with by `resume=`, or started anew
-where it had no checkpoint yet. Weights, optimizer, particles of the training's own and the test's
-numbers must be the same bits as those of a training that was never killed. Prints the counts; the
-exit status is 1 where one was not.
+share of the processor time that it takes, in its later part with --after; it writes a checkpoint
+after every batch, so that many kills fall into the writing of one. It is then gone on with by
+`resume=`, or started anew where it had no checkpoint yet. Weights, optimizer, particles of the
+training's own and the test's numbers must be the same bits as those of a training that was never
+killed. Prints the counts; the exit status is 1 where one was not.
+
+Kill n of a seed is always the same: a run that was stopped, by --minutes say, goes on with --first.
+With --keep, the data and what the trainings that are not killed came to stay in a folder, for the
+next run of the same code; they are made anew where the code is another.
 """
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -21,6 +26,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,21 +35,22 @@ import torch
 HOME = Path(__file__).parents[1]
 sys.path.insert(0, str(HOME / "bench"))
 
-from forking import prepare, run, start, wait  # noqa: E402
+from forking import prepare, run, start, wait, warm  # noqa: E402
 
 MODELS = ("pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized")
 _SMALL = (
     "debug=smoke", "console=json", "threads=1", "logger=none", "callbacks=checkpoints",
     "data.progress=false", "callbacks.last.minutes=0", "trainer.max_steps=6",
-    "trainer.val_check_interval=3", "data.limit_test=4", "data.limit_val=2",
+    "trainer.val_check_interval=3", "data.limit_test=2", "data.limit_val=2",
 )  # fmt: skip
+_TICKS = os.sysconf("SC_CLK_TCK")  # a second, of a process's clock
 _TIMES = ("seconds_per_image", "training", "git", "overrides", "checkpoint")
 
 
 class Whole(NamedTuple):
     """A training that was not killed."""
 
-    seconds: float
+    seconds: float  # of its own processor time, without that of its loader processes
     bits: dict[str, Any]
 
 
@@ -58,13 +65,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--after", type=float, default=0.0, help="share of a training before which none is killed"
     )
+    parser.add_argument("--first", type=int, default=0, help="kill to begin with")
+    parser.add_argument("--keep", type=Path, help="folder for what the next run can use")
     given = parser.parse_args(arguments)
     print(f"at most {given.count} kills, seed {given.seed}", flush=True)
     prepare()
     kinds = [(m, w) for w in given.workers.split(",") for m in given.models.split(",")]
-    with tempfile.TemporaryDirectory() as folder:
+    last = given.first + given.count
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        keep = given.keep or folder / "kept"
         counts = kill_many(
-            Path(folder), kinds[: given.count], given.count, given.seed, given.minutes, given.after
+            folder, kinds, last, given.seed, given.minutes, given.after, given.first, keep
         )
     print(f"{counts.total()} kills")
     for what, count in sorted(counts.items()):
@@ -79,47 +91,93 @@ def kill_many(
     seed: int,
     minutes: float = math.inf,
     after: float = 0.0,
+    first: int = 0,
+    keep: Path | None = None,
 ) -> Counter[str]:
     """Kill trainings of each kind in turn.
 
     Args:
-        folder: An empty one, for the data and the runs.
+        folder: An empty one, for the runs.
         kinds: Methods, each with a number of loader processes.
-        count: How many kills.
+        count: The number of the last kill, plus 1.
         seed: Decides when.
         minutes: After which no further training is begun.
         after: Share of a training's time before which it is not killed.
+        first: The number of the first kill.
+        keep: Folder for the data and for what the trainings that are not killed came to.
 
     Returns:
         How many ended how.
     """
     began = time.monotonic()
-    frames = ["frames=24", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=4"]
-    data = [*frames, "object=carton", "workers=1", "console=json", f"out={folder / 'data'}"]
-    assert run("generate", data, folder / "log").status == 0
+    keep = (keep or folder / "kept") / digest_code()
+    data = keep / "data"
+    if not data.is_dir():
+        frames = ["frames=24", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=4"]
+        typed = [*frames, "object=carton", "workers=1", "console=json", f"out={data}"]
+        assert run("generate", typed, folder / "log").status == 0
+    common = [*_SMALL, f"data.root={data}"]
+    warm({"train": [*common, "model=pose_pf", "trainer.max_steps=1", f"out={folder / 'warm'}"]})
     wholes: dict[tuple[str, str], Whole] = {}
     counts: Counter[str] = Counter()
-    for number in range(count):
+    for number in range(first, count):
         if time.monotonic() - began > 60 * minutes:
+            print(f"stopped before kill {number}", flush=True)
             break
         kind = kinds[number % len(kinds)]
-        settings = [*_SMALL, f"data.root={folder / 'data'}", f"model={kind[0]}"]
-        settings.append(f"data.workers={kind[1]}")
+        settings = [*common, f"model={kind[0]}", f"data.workers={kind[1]}"]
         if kind not in wholes:
-            wholes[kind] = train_whole(folder / f"whole_{kind[0]}_{kind[1]}", settings)
+            wholes[kind] = find_whole(keep / f"{kind[0]}_{kind[1]}.pt", folder, settings)
         part = after + (1 - after) * random.Random(f"{seed} {number}").random()
         found = kill_one(folder / f"{number:04d}", settings, wholes[kind], part)
         counts[found] += 1
         if found.startswith("NOT"):
-            print(f"kill {number} {kind} at {part:.3f}: {found}")
+            print(f"kill {number} {kind} at {part:.3f}: {found}", flush=True)
     return counts
+
+
+def digest_code() -> str:
+    """Return what changes when the code or the configuration does."""
+    digest = hashlib.sha256(" ".join(_SMALL).encode())
+    for file in sorted([*(HOME / "src").rglob("*.py"), *(HOME / "conf").rglob("*.yaml")]):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def find_whole(file: Path, folder: Path, settings: list[str]) -> Whole:
+    """Return what a training without a kill came to, of a file where it is kept."""
+    if file.is_file():
+        kept = torch.load(file, weights_only=True)
+        return Whole(kept["seconds"], kept["bits"])
+    whole = train_whole(folder / f"whole_{file.stem}", settings)
+    torch.save(whole._asdict(), file)
+    return whole
 
 
 def train_whole(out: Path, settings: list[str]) -> Whole:
     """Train without a kill."""
-    ended = run("train", [*settings, f"out={out}"], out.with_suffix(".log"))
+    log = out.with_suffix(".log")
+    number = start("train", [*settings, f"out={out}"], log)
+    seconds = follow(number, math.inf)
+    ended = wait(number, log, 10)
     assert ended.status == 0, ended.err
-    return Whole(ended.seconds, read_bits(out))
+    return Whole(seconds, read_bits(out))
+
+
+def follow(number: int, seconds: float) -> float:
+    """Wait until a process has used so much processor time, or has ended; return what it has used.
+
+    Its clock stands while it is suspended or waits for others, so that a busy machine does not
+    decide when a training is killed.
+    """
+    used = 0.0
+    while used < seconds:
+        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
+        if fields[0] == "Z":
+            break
+        used = (int(fields[11]) + int(fields[12])) / _TICKS
+        time.sleep(0.005)
+    return used
 
 
 def kill_one(out: Path, settings: list[str], whole: Whole, part: float) -> str:
@@ -129,11 +187,11 @@ def kill_one(out: Path, settings: list[str], whole: Whole, part: float) -> str:
         out: Its folder.
         settings: What is typed.
         whole: The same training, not killed.
-        part: When, as a share of the whole one's time.
+        part: When, as a share of the whole one's processor time.
     """
     log = out.with_suffix(".log")
     number = start("train", [*settings, f"out={out}"], log)
-    time.sleep(part * whole.seconds)
+    follow(number, part * whole.seconds)
     os.kill(number, signal.SIGKILL)
     wait(number, log, 10)
     checkpoints = out / "checkpoints"

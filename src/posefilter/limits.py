@@ -63,9 +63,11 @@ class PlainLoader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def check_picture(path: Path, data: bytes) -> None:
-    """Raise BadData where an image's header promises more pixels than photographs have: decoding
-    would fill the memory.
+def check_picture(path: Path, data: bytes) -> int:
+    """Return the number of an image's pixels.
+
+    Raises BadData where its header promises more than photographs have: decoding would fill the
+    memory.
     """
     try:
         with warnings.catch_warnings():
@@ -80,3 +82,4 @@ def check_picture(path: Path, data: bytes) -> None:
         raise BadData(
             path, "image too large", f"{width}x{height} pixels, at most {MOST_SIDE} a side"
         )
+    return int(width * height)

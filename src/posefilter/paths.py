@@ -3,6 +3,7 @@ leads out.
 """
 
 import os
+import unicodedata
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 
@@ -18,13 +19,17 @@ def find_conf() -> Path:
 
 def is_plain_name(name: str) -> bool:
     """Tell whether a name is one part of a path and nothing else: no separator, no leading dot,
-    only what can be printed.
+    only what can be printed, also where letters that mean the same are made one; a file of that
+    name, with a suffix, can be made.
     """
+    same = unicodedata.normalize("NFKC", name)
     return (
         0 < len(name) <= 100
         and name.isprintable()
-        and not name.startswith((".", "~"))
-        and not set(name) & set("/\\:")
+        and len(name.encode()) <= 200
+        and name == name.strip()
+        and not same.startswith((".", "~"))
+        and not set(same) & set("/\\:")
     )
 
 

@@ -1,6 +1,10 @@
 """The programs that attack: what they try is noticed, and what goes unnoticed is told."""
 
+import math
+import os
+import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -55,6 +59,22 @@ def test_killed_trainings_end_with_the_same_bits(load: Load, tmp_path: Path) -> 
     assert sum(counts.values()) == 2
     assert all(what.startswith("the same bits, killed") for what in counts), counts
     assert kills.list_differing({"a": [1, 2]}, {"a": [1, 3]}) == [".a[1]"]
+
+
+def test_a_process_is_followed_by_its_own_time(load: Load) -> None:
+    """So that a kill falls where it was drawn, however busy the machine is."""
+    kills = load("kills")
+    number = os.fork()
+    if not number:
+        while time.process_time() < 0.5:
+            pass
+        os.kill(os.getpid(), signal.SIGSTOP)  # while it is suspended, its time stands
+        os._exit(0)
+    assert 0.1 <= kills.follow(number, 0.1) < 0.4
+    os.waitpid(number, os.WUNTRACED)
+    os.kill(number, signal.SIGCONT)
+    assert 0.4 <= kills.follow(number, math.inf) < 1.0
+    assert os.waitpid(number, 0) == (number, 0)
 
 
 @pytest.mark.parametrize(

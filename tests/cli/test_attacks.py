@@ -9,6 +9,7 @@ import torch
 from posefilter.cli import run_command
 from posefilter.cli.build import make_trainer
 from posefilter.cli.command import compose_job
+from posefilter.cli.explain import explain_hydra
 from posefilter.cli.folders import read_metrics
 from posefilter.cli.instantiate import instantiate
 from posefilter.errors import UserError
@@ -88,3 +89,15 @@ def test_damaged_metrics_are_one_line(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
     file.write_text(json.dumps({"iou": 0.5}))
     assert read_metrics(file) == {"iou": 0.5}
+
+
+def test_a_launcher_that_fails_is_named() -> None:
+    """And no other choice is blamed, as it is where Hydra's own code fails."""
+    typed = ["debug=smoke", "hydra/launcher=submitit_slurm", "seed=0,1"]
+    for file, told in (
+        ("/x/hydra_plugins/y.py", "hydra/launcher=submitit_slurm: has failed (no srun)"),
+        ("/x/hydra/y.py", "debug=smoke: cannot be read (no srun)"),
+    ):
+        with pytest.raises(RuntimeError) as caught:
+            exec(compile("raise RuntimeError('no srun\\nhere')", file, "exec"))
+        assert explain_hydra(caught.value, HOME / "conf", typed) == told

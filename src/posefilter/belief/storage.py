@@ -40,8 +40,13 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
         with np.load(file, allow_pickle=False) as stored:
             read: dict[str, Any] = {name: stored[name] for name in stored.files}
         weights = read["weights"].astype(np.float64)
+        poses = np.ascontiguousarray(read["poses"], dtype=np.float64)
+        if weights.ndim != 1 or poses.shape != (len(weights), 4, 4):
+            raise ValueError(f"weights {weights.shape} of poses {poses.shape}")
+        if not (np.isfinite(poses).all() and (weights >= 0).all() and 0 < weights.sum() < np.inf):
+            raise ValueError("poses that are not finite, or weights that are none")
         return {
-            "samples": np.ascontiguousarray(read["poses"], dtype=np.float64),
+            "samples": poses,
             "weights": weights / weights.sum(),
             "center": read["center"].astype(np.float64).reshape(3),
             "radius": float(read["radius"]),
@@ -50,5 +55,9 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
             # of later files alone
             "symmetries": np.array(read.get("symmetries", np.eye(4)[None]), dtype=np.float64),
         }
-    except (KeyError, ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: holds no belief as posefilter writes it ({error})") from error
+    except UserError:
+        raise
+    # a damaged archive, a header that lies of its array: their readers raise anything
+    except Exception as error:
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise UserError(f"{path}: holds no belief as posefilter writes it ({reason})") from error

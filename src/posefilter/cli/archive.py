@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from posefilter.cli.pickles import check_pickle
 from posefilter.errors import UserError
 from posefilter.paths import is_plain_name
 
@@ -22,7 +23,10 @@ _MOST_FILES = 50_000  # in an archive
 _MOST_NODES, _DEEPEST = 500_000, 64
 _PART = re.compile(r"[\w.\-]{1,100}(/[\w.\-]{1,100}){0,4}")
 _POINTS = 1_000_000  # of an object's surface
+_SYMMETRIES = 10_000
 _PARTS = 100
+_FARTHEST = 1000.0  # length of an object [m]
+_SPREAD = 4  # times the bytes of a file that its weights may stand for
 
 
 def check_archive(file: Path, said: str) -> None:
@@ -60,8 +64,22 @@ def check_archive(file: Path, said: str) -> None:
             )
     if sum(part.file_size for part in parts) > size:
         raise UserError(f"{said}: its parts claim to be larger than the file")
-    if len({part.filename for part in parts}) < len(parts):
+    if len({part.filename.lower() for part in parts}) < len(parts):  # torch's reader sees no case
         raise UserError(f"{said}: two of its parts have one name")
+    for part in parts:
+        if part.filename.lower().endswith(".pkl"):
+            check_pickle(_read_part(file, part, said), said)
+
+
+def _read_part(file: Path, part: zipfile.ZipInfo, said: str) -> bytes:
+    try:
+        with zipfile.ZipFile(file) as archive, archive.open(part) as stream:
+            return stream.read(part.file_size)
+    # a damaged or encrypted part fails in many ways
+    except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, EOFError) as error:
+        raise UserError(
+            f"{said}: not readable as a checkpoint (its part {part.filename[:60]!r} is damaged)"
+        ) from error
 
 
 def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
@@ -82,6 +100,8 @@ def check_content(checkpoint: Any, file: Path, said: str) -> dict[str, Any]:
         isinstance(k, str) and isinstance(v, Tensor) for k, v in state.items()
     ):
         raise UserError(f"{said}: its state_dict should hold tensors by name")
+    if sum(value.numel() * value.element_size() for value in state.values()) > _SPREAD * size:
+        raise UserError(f"{said}: its weights claim to be larger than the file")
     _check_object(checkpoint["object_model"], said)
     return checkpoint
 
@@ -95,6 +115,7 @@ def check_tensor(value: Tensor, size: int, said: str) -> None:
         type(value) in (Tensor, nn.Parameter)
         and value.layout is torch.strided
         and value.device.type == "cpu"
+        and not value.is_complex()
     )
     if not plain or value.is_quantized:
         raise UserError(
@@ -134,14 +155,26 @@ def _check_object(model: Any, said: str) -> None:
             want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
         ):
             raise UserError(f"{said}: its object's {key} should be numbers of shape {shape}")
-        if len(value) > _POINTS or not bool(value.isfinite().all()):
+        most = _SYMMETRIES if key == "symmetries" else _POINTS
+        if not 0 < len(value) <= most or not bool((value.abs() < _FARTHEST).all()):
             raise UserError(
-                f"{said}: its object's {key} has more than {_POINTS} rows, or rows "
-                f"that are not finite"
+                f"{said}: its object's {key} should have 1 to {most} rows of finite lengths [m]"
             )
+    if not _are_rigid(model["symmetries"]):
+        raise UserError(f"{said}: its object's symmetries should be turns, each with a shift")
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")
+
+
+def _are_rigid(symmetries: Tensor) -> bool:
+    R, last = symmetries[:, :3, :3].double(), symmetries[:, 3].double()
+    square = R @ R.transpose(1, 2)
+    return (
+        torch.allclose(square, torch.eye(3, dtype=R.dtype).expand_as(square), atol=1e-3)
+        and bool((torch.linalg.det(R) > 0).all())
+        and torch.equal(last, last.new_tensor([0.0, 0, 0, 1]).expand_as(last))
+    )
 
 
 def _is_part_name(name: Any) -> bool:

@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.archive import Bounded, check_archive, check_content
 from posefilter.cli.components import changed
@@ -53,6 +54,7 @@ def build_method(
     """
     settings = OmegaConf.create(recipe["settings"])
     assert isinstance(settings, DictConfig)
+    _check_references(settings)
     check_fit(settings, recipe["choices"], Scope.RECIPE)
     try:
         method = instantiate_recipe(
@@ -69,6 +71,17 @@ def build_method(
     if model is not None:
         method.set_object(model)
     return method
+
+
+def _check_references(settings: DictConfig) -> None:
+    """Raise UserError where what a method is made of refers to what is not there."""
+    try:
+        node = settings.get("model")
+        if OmegaConf.is_config(node):
+            OmegaConf.to_container(node, resolve=True)
+    except OmegaConfBaseException as error:
+        reason = str(error).splitlines()[0][:200]
+        raise UserError(f"model: its settings refer to what is not there ({reason})") from error
 
 
 def _with_lightning(kind: Any) -> Any:

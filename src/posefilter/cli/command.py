@@ -30,7 +30,7 @@ from posefilter.cli.arguments import (
 )
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
-from posefilter.cli.explain import explain, first_line
+from posefilter.cli.explain import explain, explain_hydra, first_line
 from posefilter.cli.fit import check_fit
 from posefilter.cli.folders import forget_failure, hold_folder, note_failure, remove_if_empty
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
@@ -113,10 +113,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     except Exception as error:
         if begun or trace:
             raise
-        # Hydra's own code stumbles over a choice that is null or a number, and the like
-        groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
-        where = ", ".join(groups) or "the settings"
-        print(f"{name}: {where}: cannot be read ({first_line(error)})", file=sys.stderr)
+        print(f"{name}: {explain_hydra(error, conf, arguments)}", file=sys.stderr)
         return MISTAKE
     finally:
         sys.argv = before

@@ -1,6 +1,7 @@
 """From a mistake in a command line to one readable line."""
 
 import re
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,17 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
         return f"{error.full_key}: {first_line(error)}"
     return first_line(error)
+
+
+def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str:
+    """Return in one line what Hydra's own code, or a launcher or sweeper of it, stumbled over."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if any("hydra_plugins" in Path(frame.filename).parts for frame in frames):
+        chosen = [a for a in arguments if a.startswith(("hydra/launcher=", "hydra/sweeper="))]
+        return f"{', '.join(chosen) or 'the sweep'}: has failed ({first_line(error)})"
+    # a choice that is null or a number, and the like
+    groups = [a for a in arguments if (conf / a.partition("=")[0].lstrip("+~")).is_dir()]
+    return f"{', '.join(groups) or 'the settings'}: cannot be read ({first_line(error)})"
 
 
 def first_line(error: BaseException) -> str:

@@ -195,7 +195,8 @@ def _check_value(path: str, value: Any, said: str) -> None:
             raise UserError(
                 f"{said}: its recipe's {where} is no plain text of at most {_LONGEST} letters"
             )
-        if "${" in _REFERENCE.sub("", _SELECT.sub("", value)):
+        # a select stands alone: within a text, nobody would see what it refers to
+        if "${" in _REFERENCE.sub("", value) and not _SELECT.fullmatch(value):
             raise UserError(
                 f"{said}: its recipe's {where}={value[:60]!r} may only refer to another setting, "
                 f"such as ${{filter}}"
@@ -231,7 +232,13 @@ def _without_selects(node: Any, settings: dict[str, Any]) -> Any:
 
 def _at(settings: Any, path: str) -> Any:
     for key in path.split("."):
-        settings = settings.get(key) if isinstance(settings, dict) else None
+        if isinstance(settings, list):  # OmegaConf counts in lists: ${a.0}
+            try:
+                settings = settings[int(key)]
+            except (ValueError, IndexError):
+                settings = None
+        else:
+            settings = settings.get(key) if isinstance(settings, dict) else None
     return settings
 
 

@@ -6,7 +6,8 @@ from typing import Any
 
 import yaml
 
-from posefilter.errors import UserError
+from posefilter.errors import BadData, UserError
+from posefilter.limits import PlainLoader, read_bytes
 from posefilter.paths import check_links, stays_inside
 
 LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
@@ -67,8 +68,8 @@ def overrides_of(folder: Path) -> list[str]:
     """Return what was typed to start a run.  Raises UserError where its record is damaged."""
     file = folder / ".hydra" / "overrides.yaml"
     try:
-        before: Any = yaml.safe_load(file.read_text()) if file.stat().st_size <= _LONGEST else None
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError):
+        before: Any = yaml.load(read_bytes(file, _LONGEST).decode(), Loader=PlainLoader)
+    except (yaml.YAMLError, RecursionError, ValueError, BadData):
         before = None
     before = [] if before == [] else before
     if not (

@@ -8,7 +8,6 @@ on either side: what lies beyond what calibration saw counts as its edge. Each k
 such that more of it speaks for the estimate, and a, c >= 0: so both probabilities rise with each.
 """
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -203,6 +202,7 @@ def _numbers(values: Any, count: int, name: str, least: float = -_LARGEST) -> tu
         raise ValueError(f"should have {count} numbers in {name}")
     for value in values:
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and least <= value <= _LARGEST):
+        # nan is in no range; a whole number may be too large for a float
+        if not (number and least <= value <= _LARGEST):
             raise ValueError(f"has {str(value)[:30]!r} in {name}")
     return tuple(float(value) for value in values)

@@ -120,7 +120,8 @@ class DiskCache:
                 return None
             try:
                 self._records[record.key] = _read_prepared(path)
-            except (OSError, ValueError, KeyError, MemoryError, zipfile.BadZipFile) as error:
+            # a damaged archive, a header that lies of its array: their readers raise anything
+            except Exception as error:
                 raise UserError(
                     f"{path}: a damaged file of the cache; delete {self.folder}"
                 ) from error
@@ -154,7 +155,10 @@ class DiskCache:
         path, (height, width) = self._image_path(record), one.shape
         if path.stat().st_size > 5 * height * width + _HEADER:
             raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}")
-        return unpack(np.load(path), one, frame_id)
+        try:
+            return unpack(np.load(path), one, frame_id)
+        except Exception as error:  # as above
+            raise UserError(f"{path}: a damaged file of the cache; delete {self.folder}") from error
 
     def _image_path(self, record: FrameRecord) -> Path:
         return self._path(record.name, _stamp(record, 2), ".npy")

@@ -8,11 +8,13 @@ import numpy as np
 import trimesh
 
 from posefilter.errors import UserError
+from posefilter.limits import read_bytes
 from posefilter.meshes.glb import check_glb
 from posefilter.meshes.mesh import Mesh, creased_normals
-from posefilter.meshes.obj import PLAIN, Material, RawMesh, read_image, read_obj
+from posefilter.meshes.obj import MOST_TEXELS, PLAIN, Material, RawMesh, read_image, read_obj
 
 SUFFIXES = (".obj", ".ply", ".glb")
+_FARTHEST = 1e6  # [m]
 
 
 def read_mesh(path: Path, name: str, scale: float = 1.0) -> Mesh:
@@ -59,17 +61,22 @@ def _finish(raw: RawMesh, path: Path, name: str, scale: float) -> Mesh:
     used, faces = np.unique(raw.faces, return_inverse=True)
     faces = faces.reshape(-1, 3).astype(np.int64)
     vertices = raw.vertices[used].astype(np.float64) * scale
-    normals = creased_normals(vertices, faces)
+    if np.abs(vertices).max() > _FARTHEST:
+        raise UserError(f"{path}: vertices farther than {_FARTHEST:,.0f} m; mind the unit")
+    try:
+        normals = creased_normals(vertices, faces)
+    except ValueError as error:
+        raise UserError(f"{path}: not a readable mesh ({error})") from error
     if raw.corner_normals is not None:
         length = np.linalg.norm(raw.corner_normals, axis=-1, keepdims=True)
         given = raw.corner_normals / np.maximum(length, 1e-12)
         normals = np.where(length > 1e-6, given, normals).astype(np.float32)
-    uv, texture = _one_texture(raw)
+    uv, texture = _one_texture(raw, path)
     colors = None if raw.corner_colors is None else raw.corner_colors.astype(np.float32)
     return Mesh(name, vertices, faces, uv, texture, colors, normals)
 
 
-def _one_texture(raw: RawMesh) -> tuple[np.ndarray | None, np.ndarray]:
+def _one_texture(raw: RawMesh, path: Path) -> tuple[np.ndarray | None, np.ndarray]:
     """Stack all materials into one texture; a mesh of one plain color gets one pixel."""
     used = np.unique(raw.face_material)
     pictures = [_picture(raw.materials[i]) for i in used]
@@ -84,6 +91,10 @@ def _one_texture(raw: RawMesh) -> tuple[np.ndarray | None, np.ndarray]:
         return uv.astype(np.float32), pictures[0]
     height = max(p.shape[0] for p in pictures)
     width = max(p.shape[1] for p in pictures)
+    if len(used) * height * width > MOST_TEXELS:
+        raise UserError(
+            f"{path}: too large: {len(used)} textures of {width}x{height} pixels; scale them down"
+        )
     stack = np.concatenate([cv2.resize(p, (width, height)) for p in pictures])
     which = np.searchsorted(used, raw.face_material)
     # a stacked picture cannot repeat: fold each face back
@@ -137,7 +148,7 @@ def _check_ply_texture(path: Path) -> None:
     """Raise UserError unless the texture that a PLY's header names can be read: trimesh ignores
     it.
     """
-    header = path.read_bytes()[:4096].partition(b"end_header")[0].decode(errors="replace")
+    header = read_bytes(path)[:4096].partition(b"end_header")[0].decode(errors="replace")
     for line in header.splitlines():
         if line.lower().startswith("comment texturefile "):
             read_image(path.parent / line.split(maxsplit=2)[2].strip(), path)

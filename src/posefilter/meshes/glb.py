@@ -13,6 +13,7 @@ from typing import Any
 
 from posefilter.errors import UserError
 from posefilter.limits import check_picture, read_bytes
+from posefilter.meshes.obj import MOST_TEXELS
 
 MOST_ELEMENTS = 1 << 24  # of an accessor, and of all that the nodes show
 _MOST_NODES = 10_000
@@ -79,7 +80,10 @@ def _check_nodes(content: Mapping[str, Any], path: Path) -> None:
 
 def _check_images(content: Mapping[str, Any], binary: bytes, path: Path) -> None:
     views = content.get("bufferViews", [])
+    pixels = 0
     for image in content.get("images", []):
         view = views[image["bufferView"]]
         start = view.get("byteOffset", 0)
-        check_picture(path, binary[start : start + view["byteLength"]])
+        pixels += check_picture(path, binary[start : start + view["byteLength"]])
+        if pixels > MOST_TEXELS:
+            raise UserError(f"{path}: too large: textures of {pixels:,} pixels; scale them down")

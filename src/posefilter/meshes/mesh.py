@@ -13,6 +13,8 @@ from scipy.spatial.distance import pdist
 from posefilter.types import ObjectModel
 
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet at more than this share no normal
+_MOST_PAIRS = 4e8  # of faces that meet
+_CHUNK = 1 << 24  # of such pairs at once
 _HULL_VERTICES = 128
 _HULL_DIRECTIONS = 5000  # some 2.9 degrees apart
 _HULL_ERROR = 2.5e-4  # [m] stop refining the outline hull here
@@ -70,6 +72,9 @@ def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Returns:
         Unit normals of the corners (F, 3, 3) float32.
+
+    Raises:
+        ValueError: So many faces meet in one place that they are no surface.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     weighted = np.cross(b - a, c - a)  # length: twice the area
@@ -81,13 +86,17 @@ def creased_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     starts = np.searchsorted(corner_vertex[order], np.arange(corner_vertex.max() + 2))
     total = np.zeros((len(corner_vertex), 3))
     counts = np.diff(starts)
+    if (counts.astype(np.float64) ** 2).sum() > _MOST_PAIRS:
+        raise ValueError(f"{counts.max():,} faces meet in one place")
     # all vertices with the same number of corners at once
     for size in np.unique(counts[counts > 0]):
         # (vertices, size) corners
         group = order[starts[:-1][counts == size][:, None] + np.arange(size)]
-        face = group // 3
-        near = np.einsum("vic,vjc->vij", unit[face], unit[face]) >= _CREASE
-        total[group] = np.einsum("vij,vjc->vic", near, weighted[face])
+        for some in np.array_split(group, -(-group.size * size // _CHUNK)):
+            face = some // 3
+            for own in np.array_split(np.arange(size), -(-size * size // _CHUNK)):
+                near = np.einsum("vic,vjc->vij", unit[face[:, own]], unit[face]) >= _CREASE
+                total[some[:, own]] = np.einsum("vij,vjc->vic", near, weighted[face])
     norm = np.linalg.norm(total, axis=1, keepdims=True)
     fallback = np.where(length > 0, unit, [0.0, 0.0, 1.0]).repeat(3, axis=0)
     return (

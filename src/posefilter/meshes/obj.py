@@ -19,6 +19,7 @@ class Material(NamedTuple):
 
 
 PLAIN = Material(np.full(3, 0.7), None)
+MOST_TEXELS = 1 << 28  # pixels of all textures of a mesh
 
 
 class RawMesh(NamedTuple):
@@ -59,13 +60,14 @@ def read_image(path: Path, source: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _read_mtl(path: Path, source: Path) -> dict[str, Material]:
+def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[str, Material]:
+    """Read materials; their images, which others may share, are added to `images`."""
     check_inside(path, source.parent)
     if not path.is_file():
         raise UserError(f"{path}: missing material file, named by {source.name}")
     materials: dict[str, Material] = {}
     name = ""
-    for line in path.read_text(errors="replace").splitlines():
+    for line in read_bytes(path).decode(errors="replace").splitlines():
         key, _, rest = line.strip().partition(" ")
         rest = rest.strip()
         if key == "newmtl":
@@ -78,7 +80,15 @@ def _read_mtl(path: Path, source: Path) -> dict[str, Material]:
         elif key == "map_Kd" and name:
             # options such as -s come before the file
             file = rest.split()[-1] if rest.startswith("-") else rest
-            materials[name] = materials[name]._replace(image=read_image(path.parent / file, path))
+            image = path.parent / file
+            if image not in images:
+                images[image] = read_image(image, path)
+                pixels = sum(one.shape[0] * one.shape[1] for one in images.values())
+                if pixels > MOST_TEXELS:
+                    raise UserError(
+                        f"{path}: too large: textures of {pixels:,} pixels; scale them down"
+                    )
+            materials[name] = materials[name]._replace(image=images[image])
     # A picture is shown as it is: exporters leave Kd at any gray beside it.
     return {k: m if m.image is None else m._replace(color=np.ones(3)) for k, m in materials.items()}
 
@@ -89,9 +99,10 @@ def read_obj(path: Path) -> RawMesh:
     corners: list[tuple[int, int, int]] = []
     face_material: list[int] = []
     library: dict[str, Material] = {}
+    images: dict[Path, np.ndarray] = {}
     materials: dict[str, int] = {}
     current = 0
-    for line in path.read_text(errors="replace").splitlines():
+    for line in read_bytes(path).decode(errors="replace").splitlines():
         key, _, rest = line.partition(" ")
         if key in numbers:
             numbers[key].append([float(x) for x in rest.split()])
@@ -101,7 +112,7 @@ def read_obj(path: Path) -> RawMesh:
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_material.append(current)
         elif key == "mtllib":
-            library |= _read_mtl(path.parent / rest.strip(), path)
+            library |= _read_mtl(path.parent / rest.strip(), path, images)
         elif key == "usemtl":
             current = materials.setdefault(rest.strip(), len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)

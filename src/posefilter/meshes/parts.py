@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.limits import read_bytes
 from posefilter.meshes.mesh import Mesh
 
 FILE = "parts.json"
+_MOST_BYTES = 1 << 26  # parts may list their vertices
 SEPARATOR = "."
 _KINDS = "a part is {'box': [[x, y, z], [x, y, z]]} or {'vertices': [numbers]}"
 
@@ -47,8 +49,8 @@ def read_parts(file: Path, name: str, scale: float, mesh: Mesh) -> dict[str, np.
         UserError: The file cannot be read, or a part is none.
     """
     try:
-        table = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        table = json.loads(read_bytes(file, _MOST_BYTES))
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{file}: cannot be read as JSON ({error})") from error
     if not isinstance(table, dict):
         raise UserError(f"{file}: should map names to parts; {_KINDS}")

@@ -8,6 +8,10 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.geometry.rotation import exp_so3
+from posefilter.limits import read_bytes
+
+MOST = 10_000  # symmetries of an object
+_MOST_BYTES = 1 << 24  # of a file of them
 
 
 def symmetry_group(
@@ -20,8 +24,13 @@ def symmetry_group(
 
     `discrete`: (4, 4) each, as BOP lists them (all but the identity). `continuous`: (axis, a point
     on it [m]) each, cut into `steps` equal turns.
+
+    Raises:
+        ValueError: They are more than `MOST`.
     """
     group = [np.eye(4), *(discrete or [])]
+    if len(group) * steps ** len(continuous or []) > MOST:
+        raise ValueError(f"more than {MOST:,} symmetries")
     for axis, offset in continuous or []:
         unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
         turns = [rotation_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
@@ -45,7 +54,9 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
     the mesh file's unit.
     """
     try:
-        table = json.loads(info.read_text())
+        table = json.loads(read_bytes(info, _MOST_BYTES))
+        if not isinstance(table, dict):
+            raise ValueError("no mapping of names")
         digits = "".join(c for c in name if c.isdigit())
         keys = [name, digits.lstrip("0")] if name.startswith("obj_") else [name]
         entry = next(
@@ -65,7 +76,7 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
             for c in entry.get("symmetries_continuous", [])
         ]
         return identity_first(symmetry_group(discrete, continuous, steps), str(info))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise UserError(
             f"{info}: cannot read the symmetries of '{name}' ({error}); the format is BOP's "
             f"models_info"

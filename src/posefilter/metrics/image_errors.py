@@ -49,8 +49,11 @@ def read_errors(path: Path) -> list[ImageError]:
     Raises:
         ValueError: Where a row is malformed.
     """
-    with path.open(newline="") as file:
-        return [parse_row(row) for row in csv.DictReader(file)]
+    try:
+        with path.open(newline="") as file:
+            return [parse_row(row) for row in csv.DictReader(file)]
+    except csv.Error as error:
+        raise ValueError(str(error)) from error
 
 
 def parse_row(row: dict[str, str]) -> ImageError:

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from posefilter.errors import UserError
+
 _LEAST = 4096  # smaller tensors are not worth a scale
 _SUFFIX = "#scale"
 
@@ -37,12 +39,20 @@ def pack(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def unpack(packed: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return a state dict in full precision; one that was not packed is returned unchanged."""
+    """Return a state dict in full precision; one that was not packed is returned unchanged.
+
+    Raises:
+        UserError: A scale is not one number a channel: it would spread its kernel out.
+    """
     out: dict[str, Tensor] = {}
     for name, value in packed.items():
         if name.endswith(_SUFFIX):
             continue
         scale = packed.get(name + _SUFFIX)
+        if scale is not None and scale.shape != (*value.shape[:1], *[1] * (value.dim() - 1)):
+            raise UserError(
+                f"checkpoint: the scale of its weights {name[:60]!r} is not one number a channel"
+            )
         whole = value.float() if value.is_floating_point() or scale is not None else value
         out[name] = whole if scale is None else whole * scale
     return out

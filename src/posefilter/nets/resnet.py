@@ -106,30 +106,37 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
     Raises:
         UserError: It cannot be read, or its parameters do not match the trunk.
     """
-    if weights.startswith(("http://", "https://")):
-        try:
+    said = f"model.encoder.trunk.weights={weights}"
+    remote = weights.startswith(("http://", "https://"))
+    if not remote and not Path(weights).is_file():
+        raise UserError(f"{said}: no such file (a path, an http address, or null for none)")
+    try:
+        if remote:
             state = torch.hub.load_state_dict_from_url(
                 weights, map_location="cpu", weights_only=True
             )
-        except OSError as error:
-            raise UserError(
-                f"model.encoder.trunk.weights={weights}: cannot be fetched ({error})"
-            ) from error
-    else:
-        if not Path(weights).is_file():
-            raise UserError(
-                f"model.encoder.trunk.weights={weights}: no such file (a path, an http "
-                f"address, or null for none)"
-            )
-        state = torch.load(weights, map_location="cpu", weights_only=True)
+        else:
+            state = torch.load(weights, map_location="cpu", weights_only=True)
+    except OSError as error:
+        doing = "fetched" if remote else "read"
+        raise UserError(f"{said}: cannot be {doing} ({error})") from error
+    except Exception as error:  # a damaged file fails in many ways
+        raise UserError(f"{said}: not readable as weights ({type(error).__name__})") from error
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
+        raise UserError(f"{said}: should hold tensors by name, as torchvision's files do")
     own = {name for name in trunk.state_dict() if not name.startswith("geometry.")}
     missing = sorted(own - state.keys())
     unexpected = sorted(name for name in state.keys() - own if not name.startswith("fc."))
     if missing or unexpected:
         name = (missing or unexpected)[0]
         what = "lacks" if missing else "has the unexpected"
-        raise UserError(
-            f"model.encoder.trunk.weights={weights}: {what} {name}; is it another network "
-            f"than trunk.kind says?"
-        )
+        raise UserError(f"{said}: {what} {name}; is it another network than trunk.kind says?")
+    for name, value in trunk.state_dict().items():
+        if name in own and state[name].shape != value.shape:
+            raise UserError(
+                f"{said}: its {name} is of shape {tuple(state[name].shape)}, not "
+                f"{tuple(value.shape)}; is it another network than trunk.kind says?"
+            )
     trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})

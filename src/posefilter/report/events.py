@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALARS, EventAccumulator
 
+from posefilter.errors import UserError
+from posefilter.limits import MOST_BYTES
 from posefilter.report.images import StoredImage
 
 
@@ -25,8 +27,11 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
     A file that is still being written is read as far as it goes; steps that a resumed run took
     again count once.
     """
-    if not any(find_event_files(folder)):
+    files = list(find_event_files(folder))
+    if not files:
         return {}, []
+    for file in files:
+        check_records(file)
     # it warns of every step that was taken again
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     log = EventAccumulator(str(folder), size_guidance={SCALARS: 0, IMAGES: 1})
@@ -41,6 +46,22 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
         latest = log.Images(tag)[-1]
         pictures.append(StoredImage(tag, f"{tag}, step {latest.step}", latest.encoded_image_string))
     return curves, pictures
+
+
+def check_records(path: Path) -> None:
+    """Raise UserError where a record of an event file claims more bytes than one has: its reader
+    makes room for them first.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        # a record: its length, a checksum of that, as many bytes, a checksum of those
+        while len(head := file.read(12)) == 12:
+            length = int.from_bytes(head[:8], "little")
+            if length > MOST_BYTES:
+                raise UserError(f"{path}: is no event file (a record of {length:,} bytes)")
+            if file.tell() + length + 4 > size:  # still being written
+                return
+            file.seek(length + 4, 1)
 
 
 def rename_losses(curves: dict[str, Curve]) -> dict[str, Curve]:

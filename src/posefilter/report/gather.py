@@ -1,6 +1,7 @@
 """Gather what a run's folder holds; what it lacks is written down rather than fatal."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from posefilter.report.image_errors import read_image_errors
 from posefilter.report.images import StoredImage, read_images
 
 MARKS = ("metrics.json", ".hydra/config.yaml")
-_MOST_YAML = 1 << 20  # [bytes]
+_MOST_YAML, _MOST_JSON = 1 << 20, 1 << 26  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
 
 
@@ -52,9 +53,10 @@ def read_run(folder: Path) -> Run:
         read_yaml(folder / ".hydra" / "config.yaml"),
         read_yaml(folder / ".hydra" / "hydra.yaml"),
     )
-    runtime = (hydra.get("hydra") or {}).get("runtime") or {}
-    choices = {str(k): str(v) for k, v in (runtime.get("choices") or {}).items() if v is not None}
-    overrides = (hydra.get("hydra") or {}).get("overrides") or {}
+    said = folder / ".hydra" / "hydra.yaml"
+    chosen = read_part(hydra, ("hydra", "runtime", "choices"), said)
+    choices = {str(k): str(v) for k, v in chosen.items() if v is not None}
+    typed = read_part(hydra, ("hydra", "overrides"), said)
     curves, logged = read_events(folder)
     files = read_images(folder / "figures")
     return Run(
@@ -63,7 +65,8 @@ def read_run(folder: Path) -> Run:
         metrics_train=read_json(folder / "metrics_train.json"),
         config=config,
         choices=choices,
-        overrides=[str(o) for o in overrides.get("task") or metrics.get("overrides") or []],
+        overrides=read_texts(typed, "task", said)
+        or read_texts(metrics, "overrides", folder / "metrics.json"),
         data=read_json(folder / "data.json"),
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],
@@ -124,12 +127,41 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        content = json.loads(read_bytes(path, _MOST_JSON))
+    except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
         raise UserError(f"{path}: is no JSON ({error})") from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one JSON object")
     return content
+
+
+def read_part(content: dict[str, Any], keys: Sequence[str], path: Path) -> dict[str, Any]:
+    """Return a mapping within a file's content, empty where there is none.
+
+    Args:
+        content: The file's.
+        keys: Each within the one before.
+        path: The file, for messages.
+
+    Raises:
+        UserError: Something else is there.
+    """
+    for key in keys:
+        content = content.get(key) or {}
+        if not isinstance(content, dict):
+            raise UserError(f"{path}: its {key} should be a mapping")
+    return content
+
+
+def read_texts(content: dict[str, Any], key: str, path: Path) -> list[str]:
+    """Return a list within a file's content as texts, empty where there is none.
+
+    Raises UserError where something else is there.
+    """
+    found = content.get(key) or []
+    if not isinstance(found, list):
+        raise UserError(f"{path}: its {key} should be a list")
+    return [str(one) for one in found]
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -142,7 +174,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         # a SafeLoader, which makes nothing but plain data
         content = yaml.load(read_bytes(path, _MOST_YAML).decode(), Loader=PlainLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    # YAML, UTF-8, whole numbers too long to read, days that there are not
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: is no YAML ({str(error).splitlines()[0]})") from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one mapping")

@@ -8,12 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from posefilter.errors import UserError
 from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import flatten
-from posefilter.report.gather import SWEEP_MARKS, read_json, read_yaml
+from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 
 SILENT = ("out", "resume", "console", "threads")
 COLUMNS = {  # of summary.csv, and the metrics that they hold
@@ -110,8 +110,8 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
         read_json(path / "failed.json") or read_json(path / "metrics.json") for path in found
     ]
     settings = [
-        dict(o.lstrip("+~").split("=", 1) for o in own.get("overrides") or [] if "=" in o)
-        for own in metrics
+        dict(o.lstrip("+~").split("=", 1) for o in read_texts(own, "overrides", path) if "=" in o)
+        for path, own in zip(found, metrics, strict=True)
     ]
     keys = dict.fromkeys(key for pairs in settings for key in pairs)
     axes = [
@@ -131,8 +131,11 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
 
 def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file, restval=""))
+    except (csv.Error, ValueError) as error:
+        raise UserError(f"{path}: is no table of runs ({error})") from error
     others = (*COLUMNS, "folder", "error")
     axes = [name for name in (rows[0] if rows else {}) if name not in others]
     if not rows:
@@ -155,10 +158,11 @@ def read_declared(folder: Path) -> dict[str, list[Value]]:
     """Return the values of each axis in the order in which they were asked for, as far as that is
     told.
     """
-    hydra: dict[str, Any] = read_yaml(folder / "multirun.yaml").get("hydra") or {}
-    asked = dict((hydra.get("sweeper") or {}).get("params") or {})
-    for typed in (hydra.get("overrides") or {}).get("task") or []:
-        key, _, values = str(typed).lstrip("+~").partition("=")
+    file = folder / "multirun.yaml"
+    content = read_yaml(file)
+    asked = dict(read_part(content, ("hydra", "sweeper", "params"), file))
+    for typed in read_texts(read_part(content, ("hydra", "overrides"), file), "task", file):
+        key, _, values = typed.lstrip("+~").partition("=")
         asked[key] = values
     return {
         str(key): [parse_number(value.strip()) for value in str(values).split(",")]

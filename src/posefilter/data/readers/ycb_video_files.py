@@ -2,9 +2,10 @@
 
 import io
 import re
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import scipy.io
 
@@ -24,6 +25,8 @@ _KEYS = ["cls_indexes", "poses", "factor_depth", "intrinsic_matrix"]
 
 # bytes of a -meta.mat, of which there may be 2 MB, and of a list
 _LARGEST_META = 1 << 25
+# of a MATLAB file: bytes before its first array, the kind of a packed one, and how far its name is
+_MAT_HEADER, _PACKED, _MAT_NAMED = 128, 15, 1024
 
 
 _LONGEST_LIST = 1 << 22
@@ -78,10 +81,30 @@ def read_frame_list(root: Path, listed: str | Path) -> list[str]:
     return names
 
 
+def _check_packed(content: bytes) -> None:
+    """Raise ValueError where an array that is read of a MATLAB file is packed, and much larger
+    than those of a frame: unpacking it would fill the memory.
+    """
+    order: Literal["little", "big"] = "big" if content[126:128] == b"MI" else "little"
+    at = _MAT_HEADER
+    while at + 8 <= len(content):
+        kind, size = (int.from_bytes(content[i : i + 4], order) for i in (at, at + 4))
+        if kind == _PACKED:
+            unpacking = zlib.decompressobj()
+            head = unpacking.decompress(content[at + 8 : at + 8 + size], _MAT_NAMED)
+            if any(key.encode() in head for key in _KEYS):
+                unpacking.decompress(unpacking.unconsumed_tail, _LARGEST_META)
+                if unpacking.unconsumed_tail:
+                    raise ValueError(f"an array of more than {_LARGEST_META:,} bytes")
+        at += 8 + size
+
+
 def read_meta(path: Path) -> dict[str, Any]:
     """Return the few arrays that are needed of a -meta.mat file."""
-    data = io.BytesIO(read_bytes(path, _LARGEST_META))
+    content = read_bytes(path, _LARGEST_META)
+    data = io.BytesIO(content)
     try:
+        _check_packed(content)
         meta = scipy.io.loadmat(data, variable_names=_KEYS)
     except Exception as error:  # the file decides what breaks: the parser raises anything
         raise BadData(path, "not readable as a MATLAB file", f"truncated? {error}") from error

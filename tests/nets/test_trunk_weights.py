@@ -1,0 +1,57 @@
+"""The file that a trunk starts from: torchvision's is read, any other is refused in one line."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from posefilter.errors import UserError
+from posefilter.nets.resnet import ResNet, load_trunk
+
+
+@pytest.fixture(scope="module")
+def trunk() -> ResNet:
+    return ResNet("resnet18")
+
+
+def changed(trunk: nn.Module, **changes: Any) -> dict[str, Any]:
+    """Return what such a file holds; None leaves a tensor out."""
+    state = {k: v for k, v in trunk.state_dict().items() if not k.startswith("geometry.")}
+    return {k: v for k, v in {**state, **changes}.items() if v is not None}
+
+
+def test_torchvisions_file_is_read(trunk: ResNet, tmp_path: Path) -> None:
+    state = {k: v + 1 for k, v in changed(trunk).items()}
+    head = {"fc.weight": torch.zeros(1000, 512)}  # of the classifier, which is not needed
+    torch.save({**state, **head}, tmp_path / "x.pth")
+    other = ResNet("resnet18", weights=str(tmp_path / "x.pth"))
+    own = other.state_dict()
+    assert all(torch.equal(own[key], value) for key, value in state.items())
+
+
+FILES: dict[str, tuple[Any, str]] = {
+    "no file": (None, "no such file"),
+    "no weights": (b"hostile", r"not readable as weights \(\w+Error\)"),
+    "cut": (b"PK\x03\x04" + bytes(100), r"not readable as weights \(\w+Error\)"),
+    "a list": ([1], "should hold tensors by name"),
+    "texts": ({"conv1.weight": "x"}, "should hold tensors by name"),
+    "a tensor is missing": ({"conv1.weight": None}, r"lacks conv1\.weight"),
+    "a tensor too many": ({"x": torch.zeros(1)}, "has the unexpected x"),
+    "another shape": ({"conv1.weight": torch.zeros(1)}, r"conv1\.weight is of shape \(1,\), not"),
+}
+
+
+@pytest.mark.parametrize("what", FILES)
+def test_another_file_is_one_line(what: str, trunk: ResNet, tmp_path: Path) -> None:
+    content, told = FILES[what]
+    file = tmp_path / "x.pth"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    elif content is not None:
+        whole = told == "should hold tensors by name"
+        torch.save(content if whole else changed(trunk, **content), file)
+    with pytest.raises(UserError, match=rf"^model\.encoder\.trunk\.weights=.*{told}") as caught:
+        load_trunk(trunk, str(file))
+    assert "\n" not in str(caught.value)
