@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.checkpoints import methods_of
@@ -44,6 +45,7 @@ def track(job: Job) -> None:
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
     settle(cfg.threads, cfg.seed)
+    threads = torch.get_num_threads()
     settings = make_settings(cfg.tracker)
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     videos, native = open_videos(cfg, estimator.objects)
@@ -57,7 +59,7 @@ def track(job: Job) -> None:
     for video in videos:
         name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
         writer = VideoWriter(folder / name, cfg.video, float(cfg.fps))
-        rows += list(follow(video, estimator, settings, cfg, writer, shapes))
+        rows += list(follow(video, estimator, settings, cfg, writer, shapes, threads))
         if cfg.video != "none":
             files[name] = writer.path
     write_rows(folder, [finite(describe_row(row)) for row in rows])
@@ -82,6 +84,7 @@ def follow(
     cfg: DictConfig,
     writer: VideoWriter,
     shapes: dict[str, Shape],
+    threads: int,
 ) -> Iterator[TrackRow]:
     """Track the objects through one video, write its pictures, and yield its rows."""
     methods = [
@@ -89,7 +92,7 @@ def follow(
     ]
     if not methods:
         return
-    tracker = Tracker(Estimator(methods), settings, cfg.seed)
+    tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
     with writer:
         for frame in video:
