@@ -264,6 +264,8 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
         for group in list_groups(reader):
             video = SceneVideo(reader, group, names)
             frames, there = list(video), video.objects or ()
+            if not there:
+                continue
             order = sorted(names, key=lambda name: name not in there)
             for count in options.together:
                 chosen = [loaded[name] for name in order[:count]]
