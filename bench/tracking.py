@@ -264,7 +264,7 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
         for group in list_groups(reader):
             video = SceneVideo(reader, group, names)
             frames, there = list(video), video.objects or ()
-            if not there:
+            if not there or options.scene not in (None, group):
                 continue
             order = sorted(names, key=lambda name: name not in there)
             for count in options.together:
@@ -310,6 +310,7 @@ def main() -> None:
     parser.add_argument("--losses", action="store_true", help="the planted losses alone")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--together", type=int, action="append", help="objects at once")
+    parser.add_argument("--scene", help="of --together; all without it")
     parser.add_argument("--rounds", type=int, default=1, help="of --together")
     parser.add_argument("--table", default="together", help="that --together writes")
     options = parser.parse_args()
