@@ -273,7 +273,7 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
                 for line in measure_together(chosen, scene, frames, options.rounds):
                     lines.append(line)
                     print(line, flush=True)
-    write_table(options.table, TOGETHER, lines)
+    write_table("together", TOGETHER, lines)
 
 
 def run_sequences(folders: Sequence[str], meshes: str, name: str) -> None:
@@ -312,7 +312,6 @@ def main() -> None:
     parser.add_argument("--together", type=int, action="append", help="objects at once")
     parser.add_argument("--scene", help="of --together; all without it")
     parser.add_argument("--rounds", type=int, default=1, help="of --together")
-    parser.add_argument("--table", default="together", help="that --together writes")
     options = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(options.threads)
