@@ -4,13 +4,18 @@
 
     python bench/tracking.py --sequences DIR [DIR ...] --meshes DIR --only 003_cracker_box
 
+    python bench/tracking.py (--frames DIR | --sequences DIR) --meshes DIR --together 1 --together 4
+
 For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself,
 then the same frames tracked, in one process. Times are the processor's of this process, so that
 other work on the machine changes them little; the ratio of the two is what to go by. Then the
 frames once more, of which six are replaced by those of another scene: how many are said to show the
 object, and after how many frames it is found again. Sequences are folders of generate.py with
-moving= and covered_frames=: there the losses are in the frames. Writes the tables of
-docs/results/tracking.md.
+moving= and covered_frames=: there the losses are in the frames. With --together so many objects of
+a scene are tracked at once by one thread, by two that torch shares an operation's work out to, and
+by two that have an object each: in one process, by the clock, on an idle machine if the figures are
+to mean anything. Objects that a scene lacks are taken where it has too few, and are searched for in
+every frame. Writes the tables of docs/results/tracking.md.
 """
 
 import argparse
@@ -53,6 +58,15 @@ SEQUENCES = (
     "tracked", "of every", "all tracked", "lost", "covered: said to be there",
     "of these in the first", "found after",
 )  # fmt: skip
+TOGETHER = (
+    "scene", "objects", "of these away", "frames", "threads", "frame ms", "mean", "slowest",
+    "frames/s", "CPU ms", "ADD AUC, mean", "least", "frames lost",
+)  # fmt: skip
+WAYS = (
+    ("one", 1, None),
+    ("two, for an operation", 2, None),
+    ("two, side by side", 2, 2),
+)  # name, torch's threads, the tracker's
 EVERY = 3  # of the frames that are estimated as single images, too
 
 
@@ -193,6 +207,75 @@ def _error(result: Any, frame: VideoFrame) -> float:
     return float(add_s(torch.from_numpy(result.pose)[None], truth, result.model.points))
 
 
+def measure_together(
+    estimators: Sequence[posefilter.Estimator],
+    scene: str,
+    frames: Sequence[VideoFrame],
+    rounds: int,
+) -> Iterator[str]:
+    """Yield the rows of objects that are tracked at once, a way each; see `WAYS`.
+
+    Times are of the frames after the first: of each the median of the rounds.
+    """
+    names = [one.objects[0] for one in estimators]
+    present = [name for name in names if any(name in frame.truth for frame in frames)]
+    times = np.zeros((len(WAYS), rounds, len(frames), 2))
+    answers: list[list[list[Any]]] = [[] for _ in WAYS]
+    for turn in range(rounds):
+        for way, (_, threads, side) in enumerate(WAYS):
+            if side and len(names) == 1:
+                continue
+            torch.set_num_threads(threads)
+            tracker = posefilter.Tracker(estimators, threads=side)
+            answers[way] = []
+            for n, frame in enumerate(frames):
+                start = time.perf_counter(), time.process_time()
+                found = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
+                now = time.perf_counter(), time.process_time()
+                times[way, turn, n] = np.subtract(now, start)
+                answers[way].append(found)
+    for way, (title, _, _) in enumerate(WAYS):
+        if not answers[way]:
+            continue
+        wall, cpu = 1000 * np.median(times[way, :, 1:], axis=0).T
+        scores, lost = [], 0
+        for k, name in enumerate(names):
+            shown = [n for n, frame in enumerate(frames) if name in frame.truth]
+            if shown:
+                own = [answers[way][n][k] for n in shown]
+                scored = judge(own, [frames[n] for n in shown], [0.0])
+                scores.append(scored.add)
+                lost += scored.lost
+        cells = [scene, str(len(names)), str(len(names) - len(present)), str(len(frames)), title]
+        cells += [f"{x:.0f}" for x in (np.median(wall), wall.mean(), wall.max())]
+        cells += [f"{1000 / wall.mean():.1f}", f"{cpu.mean():.0f}"]
+        cells += [f"{np.mean(scores):.1f}", f"{min(scores):.1f}", str(lost)]
+        yield f"| {' | '.join(cells)} |"
+
+
+def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
+    """Measure objects that are tracked at once, print and write."""
+    lines, kind = [], "fat" if options.sequences else "ycb_video"
+    meshes = open_meshes(options.meshes, None, kind, names)
+    loaded = {name: posefilter.load(name, device="cpu") for name in names}
+    for folder in options.sequences or [options.frames]:
+        parts = {} if options.sequences else {"parts": ["data"]}
+        reader = open_reader(kind, folder, None if options.sequences else names, meshes, **parts)
+        for group in list_groups(reader):
+            video = SceneVideo(reader, group, names)
+            frames, there = list(video), video.objects or ()
+            if not there or options.scene not in (None, group):
+                continue
+            order = sorted(names, key=lambda name: name not in there)
+            for count in options.together:
+                chosen = [loaded[name] for name in order[:count]]
+                scene = Path(folder).name if options.sequences else group
+                for line in measure_together(chosen, scene, frames, options.rounds):
+                    lines.append(line)
+                    print(line, flush=True)
+    write_table("together", TOGETHER, lines)
+
+
 def run_sequences(folders: Sequence[str], meshes: str, name: str) -> None:
     """Measure rendered sequences, print and write."""
     estimator, lines = posefilter.load(name, device="cpu"), []
@@ -226,10 +309,16 @@ def main() -> None:
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
     parser.add_argument("--losses", action="store_true", help="the planted losses alone")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--together", type=int, action="append", help="objects at once")
+    parser.add_argument("--scene", help="of --together; all without it")
+    parser.add_argument("--rounds", type=int, default=1, help="of --together")
     options = parser.parse_args()
     keep_freed_memory()
     torch.set_num_threads(options.threads)
     names = options.only or [name for name in list_shipped() if name in ycb.CLASSES]
+    if options.together:
+        run_together(options, names)
+        return
     if options.sequences:
         run_sequences(options.sequences, options.meshes, names[0])
         return

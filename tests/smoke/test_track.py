@@ -1,6 +1,7 @@
 """The command `track`: on a folder of pictures, on a dataset, and its refusals."""
 
 import csv
+import importlib.util
 import json
 from pathlib import Path
 
@@ -57,6 +58,25 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 4
     assert video.read()[1].std() > 20
     assert run_command("track", HOME, typed) == 2  # nothing is overwritten
+
+
+def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    out = tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "view=true"]
+    assert run_command("track", HOME, typed) == 2
+    assert "rerun-sdk is missing" in "".join(capsys.readouterr())
+    assert not out.exists()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs the extra [viz]")
+def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "view=true", "video=none"]
+    assert run_command("track", HOME, typed) == 0
+    assert (out / "view.rrd").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
 from posefilter.cli.checkpoints import methods_of
 from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, say
@@ -69,7 +71,7 @@ def choose_finder(
 ) -> Callable[[BagFrame], list[Result]]:
     """Return what finds the objects in a frame: each frame by itself, or by tracking."""
     if track:
-        tracker = Tracker(estimator, seed=seed)
+        tracker = Tracker(estimator, seed=seed, threads=torch.get_num_threads())
         return lambda frame: [*tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)]
     return lambda frame: estimator.predict_batch(
         frame.rgb, frame.depth, frame.intrinsics, seed=seed

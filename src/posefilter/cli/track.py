@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli.checkpoints import methods_of
@@ -20,6 +21,8 @@ from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
+from posefilter.figures.recording import check_viewer
+from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
@@ -43,7 +46,10 @@ def track(job: Job) -> None:
     cfg, folder = job.cfg, job.folder
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
+    if cfg.view:
+        check_viewer()
     settle(cfg.threads, cfg.seed)
+    threads = torch.get_num_threads()
     settings = make_settings(cfg.tracker)
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     videos, native = open_videos(cfg, estimator.objects)
@@ -57,7 +63,11 @@ def track(job: Job) -> None:
     for video in videos:
         name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
         writer = VideoWriter(folder / name, cfg.video, float(cfg.fps))
-        rows += list(follow(video, estimator, settings, cfg, writer, shapes))
+        view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.view else None
+        recorder = TrackRecorder(view, shapes)
+        rows += list(follow(video, estimator, settings, cfg, writer, recorder, shapes, threads))
+        if view is not None:
+            files[view.stem] = view
         if cfg.video != "none":
             files[name] = writer.path
     write_rows(folder, [finite(describe_row(row)) for row in rows])
@@ -81,7 +91,9 @@ def follow(
     settings: TrackerSettings,
     cfg: DictConfig,
     writer: VideoWriter,
+    recorder: TrackRecorder,
     shapes: dict[str, Shape],
+    threads: int,
 ) -> Iterator[TrackRow]:
     """Track the objects through one video, write its pictures, and yield its rows."""
     methods = [
@@ -89,12 +101,13 @@ def follow(
     ]
     if not methods:
         return
-    tracker = Tracker(Estimator(methods), settings, cfg.seed)
+    tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
-    with writer:
+    with writer, recorder:
         for frame in video:
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
             writer.add(draw_frame(frame, results, shapes))
+            recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
             for number, result in enumerate(results):
                 ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
                 truth = frame.truth.get(result.object)
@@ -109,6 +122,19 @@ def draw_frame(
     drawn = [Drawn(f"{one.object}: {one.status}", one.pose, shapes[one.object]) for one in found]
     lost = [one.object for one in results if not one.found]
     return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=_name_lost(lost))
+
+
+def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
+    """Return the objects of a frame as the 3-D view takes them."""
+    return [
+        Seen(
+            one.object,
+            one.pose if one.found else None,
+            one.model.center.cpu().double().numpy(),
+            float("nan") if one.presence is None else float(one.presence),
+        )
+        for one in results
+    ]
 
 
 def _name_lost(lost: Sequence[str]) -> str:

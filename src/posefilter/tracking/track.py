@@ -17,17 +17,18 @@ from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.images import Images, make_batch
+from posefilter.images import Images
 from posefilter.models.base import PoseEstimator
 from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
+from posefilter.tracking.frame import Frame
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
 from posefilter.tracking.relevance import measure_presence, measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.watch import LOST, TRACKED, Watch
-from posefilter.tracking.window import Window, clean_depth, cut_window, place_window
+from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, Belief, Particles, Trace
 
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
@@ -83,6 +84,8 @@ class Track:
             the image's.
         settings: Of the tracker.
         seed: Decides every random draw.
+        turn: Frames by which its looks at the whole image, and its searches while it is lost, come
+            sooner: objects that are tracked together take turns.
 
     Raises:
         UserError: The method cannot be tracked with.
@@ -94,33 +97,39 @@ class Track:
         size: tuple[int | None, int | None],
         settings: TrackerSettings,
         seed: int = 0,
+        turn: int = 0,
     ) -> None:
         check_method(method)
         assert isinstance(method.space, PoseSpace)
         self.method, self.space = method, method.space
-        self.size, self.settings, self.seed = size, settings, seed
+        self.size, self.settings, self.seed, self.turn = size, settings, seed, turn
         self.reset()
 
     def reset(self) -> None:
         """Forget the object: the next frame is the first."""
         self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
         self.state: State | None = None
-        self.watch = Watch(self.settings)
+        self.watch = Watch(self.settings, self.turn)
         self.frames = 0
 
-    @torch.no_grad()
-    def update(self, images: Images) -> TrackResult:
-        """Return where the object is in the next frame.
-
-        Args:
-            images: One photograph.
+    @property
+    def burden(self) -> int:
+        """What the next frame will cost: 3 for the filter as trained, 2 for a search, 1 for the
+        whole image, 0 for a window.
         """
+        if self.state is None or self.watch.search_is_due:
+            return 3
+        return 2 if self.watch.lost else int(self._whole_is_due)
+
+    @torch.no_grad()
+    def update(self, frame: Frame) -> TrackResult:
+        """Return where the object is in the next frame."""
         start = time.perf_counter()
         predicted = None if self.state is None else self._predict(self.state)
         if predicted is None or self.watch.search_is_due:
-            sight = self._estimate(images)
+            sight = self._estimate(frame)
         else:
-            sight = self._follow(images, predicted)
+            sight = self._follow(frame, predicted)
         trusted, status = self.watch.judge(sight.presence)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
@@ -150,18 +159,19 @@ class Track:
         )
         return State(make_particles(draws, 0), expected, state.velocity)
 
-    def _estimate(self, images: Images) -> Sight:
+    def _estimate(self, frame: Frame) -> Sight:
         """Run the estimator's own filter on the whole image."""
-        batch = self._take(make_batch(clean_depth(images), *self.size))
+        batch = self._take(frame.see_whole(self.size))
         if not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
         return self._weigh(batch, self.method.predict_step(batch, 0))
 
-    def _follow(self, images: Images, predicted: State) -> Sight:
+    def _follow(self, frame: Frame, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
-        window = self._choose_window(images, predicted.best[0])
-        batch = self._take(self._look(images, window))
+        window = self._choose_window(frame.images, predicted.best[0])
+        seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
+        batch = self._take(seen)
         if not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         effort, settings = self._effort, self.settings
@@ -204,12 +214,17 @@ class Track:
     def _effort(self) -> Effort:
         return self.settings.search if self.watch.lost else self.settings.follow
 
+    @property
+    def _whole_is_due(self) -> bool:
+        every = self.settings.look_around
+        # what a window leaves in doubt the whole image may tell
+        return not self.watch.sure or (every > 0 and (self.frames + self.turn) % every == 0)
+
     def _choose_window(self, images: Images, pose: Tensor) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
-        settings, every = self.settings, self.settings.look_around
+        settings = self.settings
         height, width = images.depth.shape[1:]
-        # what a window leaves in doubt the whole image may tell
-        if not self.watch.sure or (every and self.frames % every == 0):
+        if self._whole_is_due:
             return None
         return place_window(
             pose.double().cpu().numpy(),
@@ -220,13 +235,6 @@ class Track:
             settings.side,
             settings.reach,
         )
-
-    def _look(self, images: Images, window: Window | None) -> Batch:
-        """Return a window of a photograph, or the whole of it, as the network is to see it."""
-        if window is None:
-            return make_batch(clean_depth(images), *self.size)
-        part = clean_depth(cut_window(images, window))
-        return make_batch(part, window.seen_width, window.seen_height)
 
     def _take(self, batch: Batch) -> Batch:
         return Batch(*(x.to(self.method.device) for x in batch))

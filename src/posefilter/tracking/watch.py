@@ -14,10 +14,11 @@ class Watch:
 
     Args:
         settings: Of the tracker.
+        turn: Frames by which searches come sooner.
     """
 
-    def __init__(self, settings: TrackerSettings) -> None:
-        self.settings = settings
+    def __init__(self, settings: TrackerSettings, turn: int = 0) -> None:
+        self.settings, self.turn = settings, turn
         self.lost, self.ever_found = True, False
         self.doubts = self.lost_for = 0
         self.sure = False  # of the last frame
@@ -48,4 +49,4 @@ class Watch:
     def search_is_due(self) -> bool:
         """Whether the estimator's own filter is to search in the next frame."""
         every = self.settings.full_every
-        return self.lost and every > 0 and self.lost_for % every == every - 1
+        return self.lost and every > 0 and (self.lost_for + self.turn) % every == every - 1

@@ -1,0 +1,142 @@
+"""Single images against batches, a cold estimate by the clock, and the share of the matmul peak.
+
+    python bench/batches.py --frames DIR --meshes DIR [--only 003_cracker_box] [--threads 2]
+
+An estimate without anything before it, image by image and 8 in one call; both in turn, in one
+process. Then what an estimate multiplies and adds in matrix products and convolutions, counted by
+torch, against the fastest bfloat16 product that this machine was seen to do in the same process:
+how much a batch could win at most. Writes the table of docs/performance.md.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from marked import format_row, put_table
+from torch.utils.flop_counter import FlopCounterMode
+
+import posefilter
+from posefilter.cli.machine import keep_freed_memory
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+
+PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
+HEAD = (
+    "threads", "images in a call", "an image, ms", "CPU ms", "throughput over single images",
+    "GFLOP an image", "GFLOP a CPU second", "peak", "share of the peak",
+)  # fmt: skip
+SIZE = 2048  # of the product that gives the peak
+
+
+def count_convolution(x: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+    """Return the operations of oneDNN's 3 x 3 convolution; its weight is in an order of its own."""
+    return int(2 * math.prod(out_shape) * x[1] * 9)
+
+
+def count_linear(x: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+    """Return the operations of oneDNN's linear layer."""
+    return int(2 * math.prod(out_shape) * x[-1])
+
+
+def count_added(into: Any, a: Any, b: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+    """Return the operations of a product that is added to what is there."""
+    return int(2 * math.prod(out_shape) * a[-1])
+
+
+def list_counts() -> dict[Any, Callable[..., int]]:
+    """Return how torch is to count the operations that it does not know."""
+    return {
+        torch.ops.mkldnn._convolution_pointwise: count_convolution,
+        torch.ops.mkldnn._linear_pointwise: count_linear,
+        torch.ops.aten.addmm_: count_added,
+    }
+
+
+def measure_peak() -> float:
+    """Return the operations a second of the processor of the fastest of some bfloat16 products."""
+    a = torch.randn(SIZE, SIZE).bfloat16()
+    return 2 * SIZE**3 / min(take_time(lambda: a @ a)[1] for _ in range(8))
+
+
+def stack(frames: Sequence[VideoFrame]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return frames as a batch."""
+    parts = [(one.rgb, one.depth, one.intrinsics) for one in frames]
+    rgb, depth, intrinsics = (np.stack(part) for part in zip(*parts, strict=True))
+    return rgb, depth, intrinsics
+
+
+def take_time(call: Callable[[], Any]) -> tuple[float, float]:
+    """Return the seconds of a call, by the clock and of the processor."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def measure(
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame], threads: int, rounds: int
+) -> list[str]:
+    """Return the rows of single images and of a batch, measured in turn."""
+    torch.set_num_threads(threads)
+    peak = measure_peak()
+    count = len(frames)
+    batch = stack(frames)
+    one = tuple(part[0] for part in batch)
+    with FlopCounterMode(display=False, custom_mapping=list_counts()) as counter:
+        estimator.predict(*one)
+    work = counter.get_total_flops()
+    estimator.predict(*batch)  # warm
+    seconds: dict[int, list[tuple[float, float]]] = {1: [], count: []}
+    for number in range(rounds):
+        for n in range(number % 2, count, 2):
+            frame = tuple(part[n] for part in batch)
+            seconds[1].append(take_time(lambda frame=frame: estimator.predict(*frame)))
+        taken = take_time(lambda: estimator.predict(*batch))
+        seconds[count].append((taken[0] / count, taken[1] / count))
+    medians = {size: np.median(np.array(all_), axis=0) for size, all_ in seconds.items()}
+    rows = []
+    for size, (wall, cpu) in medians.items():
+        rate = work / cpu
+        cells = [str(threads), str(size), f"{1000 * wall:.0f}", f"{1000 * cpu:.0f}"]
+        cells += [f"{medians[1][0] / wall:.2f}", f"{work / 1e9:.1f}", f"{rate / 1e9:.0f}"]
+        cells += [f"{peak / 1e9:.0f}", f"{100 * rate / peak:.0f} %"]
+        rows.append(format_row(cells))
+        print(rows[-1], flush=True)
+    return rows
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
+    parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
+    parser.add_argument("--only", default="003_cracker_box", help="the object")
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--size", type=int, default=8, help="images in a batch")
+    parser.add_argument("--rounds", type=int, default=4, help="batches")
+    options = parser.parse_args()
+    keep_freed_memory()
+    names = [options.only]
+    meshes = open_meshes(options.meshes, None, "ycb_video", names)
+    reader = open_reader("ycb_video", options.frames, names, meshes, parts=["data"])
+    frames = [frame for group in list_groups(reader) for frame in SceneVideo(reader, group, names)]
+    frames = [frame for frame in frames if options.only in frame.truth][: options.size]
+    estimator = posefilter.load(options.only, device="cpu")
+    first = frames[0]
+    torch.set_num_threads(max(options.threads))
+    wall, cpu = take_time(lambda: estimator.predict(first.rgb, first.depth, first.intrinsics))
+    print(f"the first estimate of the process: {wall:.2f} s by the clock, {cpu:.2f} s of CPU")
+    rows = []
+    for threads in options.threads:
+        rows += measure(estimator, frames, threads, options.rounds)
+    PAGE.write_text(put_table(PAGE.read_text(), "batches", HEAD, rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,38 @@
+"""One frame of a video, prepared once for all objects that are tracked in it."""
+
+from threading import Lock
+
+from posefilter.images import Images, make_batch
+from posefilter.tracking.window import Window, clean_depth, cut_window
+from posefilter.types import Batch
+
+
+class Frame:
+    """A photograph, and what objects that look at it have in common.
+
+    Objects may ask from several threads at once.
+
+    Args:
+        images: One photograph.
+    """
+
+    def __init__(self, images: Images) -> None:
+        self.images = clean_depth(images)
+        self._whole: dict[tuple[int | None, int | None], Batch] = {}
+        self._lock = Lock()
+
+    def see_whole(self, size: tuple[int | None, int | None]) -> Batch:
+        """Return the whole photograph at a size; of each size it is made once.
+
+        Args:
+            size: Width and height that a network was trained on [px]; None: see `make_batch`.
+        """
+        with self._lock:
+            if size not in self._whole:
+                self._whole[size] = make_batch(self.images, *size)
+            return self._whole[size]
+
+    def see_window(self, window: Window) -> Batch:
+        """Return a part of the photograph."""
+        part = cut_window(self.images, window)
+        return make_batch(part, window.seen_width, window.seen_height)
