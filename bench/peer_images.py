@@ -8,6 +8,7 @@ file: started again, what is there is not measured again.
 import json
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -49,13 +50,6 @@ PPF_TRIED: tuple[Settings, ...] = (
     {"step": 0.1, "share": 0.5, "best": 10, "pick": "support"},
     {"step": 0.08, "share": 0.2, "best": 10, "pick": "support"},
 )
-# the best of them, by ADD-S AUC
-CHOSEN: dict[tuple[str, bool], Settings] = {
-    ("Open3D", False): OPEN3D_TRIED[0],
-    ("Open3D", True): OPEN3D_TRIED[0],
-    ("PPF", False): PPF_TRIED[1],
-    ("PPF", True): PPF_TRIED[1],
-}
 TRIED = {"Open3D": OPEN3D_TRIED, "PPF": PPF_TRIED}
 
 
@@ -98,9 +92,7 @@ def read_photographs(root: str, meshes: str, names: Sequence[str], most: int) ->
     ]
 
 
-def read_renders(
-    root: str, meshes: str, names: Sequence[str], most: int, part: str
-) -> list[Shown]:
+def read_renders(root: str, meshes: str, names: Sequence[str], most: int, part: str) -> list[Shown]:
     """Return held-out renders that show the objects, those of bench/held_out.py."""
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", list(names)))
     chosen = split_records(reader.records(), SPLIT, 0, Path(root))[part]
@@ -154,7 +146,13 @@ def read_cases(folder: Path, only: Sequence[str] = ()) -> list[Case]:
             image = Image(data["rgb"], data["depth"], data["intrinsics"], data["truth"])
         files = (str(model), str(path))
         cases.append(Case(row["file"], row["object"], row["scene"], image, files))
-    return cases
+    seen: Counter[str] = Counter()
+    turns = []
+    for case in cases:
+        turns.append(seen[case.object])
+        seen[case.object] += 1
+    # the objects by turns, so that a run that is stopped has as many images of each
+    return [case for _, case in sorted(zip(turns, cases, strict=True), key=lambda pair: pair[0])]
 
 
 def draw_model(store: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +178,7 @@ def make_peer_way(method: str, peer: Peer, masked: bool, settings: Settings) -> 
 
 def make_own_way(names: Iterable[str]) -> Way:
     """Return `pose_pf` with the weights that ship."""
-    estimators = {name: posefilter.load(name, device="cpu") for name in names}
+    estimators = {name: posefilter.load(name, device="cpu") for name in dict.fromkeys(names)}
 
     def estimate(case: Case) -> tuple[np.ndarray, float, float]:
         estimator, image = estimators[case.object], case.image
@@ -203,7 +201,7 @@ def measure(
         title: What the results are of, such as "photographs"; others of the file are left alone.
         until: Stop before this time (`time.monotonic`), to be started again.
     """
-    rows = [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    rows = read_rows(file)
     done = {(row["title"], row["method"], row["told"], row["key"]) for row in rows}
     models: dict[str, Any] = {}
     for case in cases:
@@ -223,6 +221,11 @@ def measure(
             with file.open("a") as lines:
                 lines.write(json.dumps(row) + "\n")
     return rows
+
+
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """Return the results of a file, none if it is not there."""
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
 
 
 def judge(pose: np.ndarray, truth: np.ndarray, model: Any) -> dict[str, float]:
@@ -254,7 +257,9 @@ def make_lines(rows: Sequence[dict[str, Any]], title: str) -> list[str]:
     if not groups:
         return []
     common = set.intersection(*(set(group) for group in groups.values()))
-    kept = {way: [row for key, row in group.items() if key in common] for way, group in groups.items()}
+    kept = {
+        way: [row for key, row in group.items() if key in common] for way, group in groups.items()
+    }
     own = kept.get((OWN, "–"))
     seconds = float(np.median([row["cpu"] for row in own])) if own and common else math.nan
     return [summarize(group, seconds) for group in kept.values() if group]
@@ -263,22 +268,42 @@ def make_lines(rows: Sequence[dict[str, Any]], title: str) -> list[str]:
 def choose_few(cases: Sequence[Case], most: int) -> list[Case]:
     """Return the first cases of each object."""
     names = dict.fromkeys(case.object for case in cases)
-    return [
-        case
-        for name in names
-        for case in [one for one in cases if one.object == name][:most]
-    ]
+    return [case for name in names for case in [one for one in cases if one.object == name][:most]]
 
 
-def list_ways(programs: dict[str, Peer | None], tuning: bool) -> list[Way]:
-    """Return the ways of the peers: as chosen, or with every setting that is tried."""
+def choose(rows: Sequence[dict[str, Any]], method: str, masked: bool) -> Settings:
+    """Return the setting of the greatest mean of 1 - ADD-S / 0.1 m (0 beyond) on validation
+    renders; the first where none has been measured.
+    """
+    told = "mask" if masked else "–"
+    found = []
+    for settings in TRIED[method]:
+        own = [
+            row["add_s"]
+            for row in rows
+            if row["told"] == told and row["method"] == f"{method}: {describe(settings)}"
+        ]
+        if own:
+            gain = (1 - torch.tensor(own).double() / 0.1).clamp_min(0).mean()
+            found.append((float(gain), settings))
+    return max(found, key=lambda pair: pair[0])[1] if found else TRIED[method][0]
+
+
+def list_ways(
+    programs: dict[str, Peer | None], tuned: Sequence[dict[str, Any]], tuning: bool
+) -> list[Way]:
+    """Return the ways of the peers: as chosen by results of tuning, or with every setting that is
+    tried.
+    """
     ways = []
     for method, peer in programs.items():
         if peer is None:
             continue
         for masked in (False, True):
             if not tuning:
-                ways.append(make_peer_way(method, peer, masked, CHOSEN[method, masked]))
+                chosen = choose(tuned, method, masked)
+                print(f"{method}, {'mask' if masked else 'whole'}: {describe(chosen)}", flush=True)
+                ways.append(make_peer_way(method, peer, masked, chosen))
                 continue
             for settings in TRIED[method]:
                 if masked and settings.get("planes"):

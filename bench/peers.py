@@ -6,10 +6,11 @@
     python bench/peers.py images   --python-open3d PATH --python-ppf PATH [--minutes 5]
     python bench/peers.py times    --python-open3d PATH --python-ppf PATH
     python bench/peers.py roofline
+    python bench/peers.py tracks   --visp PROGRAM --frames DIR --meshes DIR
 
 Each PATH is the interpreter of a virtual environment that has the peer alone: pydpf needs Python
 3.12, `particles` a NumPy before 2, and opencv-contrib takes the place of OpenCV. A peer whose
-option is left out is left out, and said to be. `cases` reads the images once, into --out; `tune`
+option is left out is left out, and said to be. PROGRAM is what worker_visp.cpp compiles to. `cases` reads the images once, into --out; `tune`
 tries every setting on validation renders; `images` measures errors, and goes on where it was
 stopped; `times` measures seconds on few images. Tables go to docs/results/peers.md.
 """
@@ -23,6 +24,7 @@ from typing import Any
 
 import peer_filters
 import peer_images
+import peer_tracks
 import roofline
 import torch
 from marked import put_table
@@ -50,9 +52,8 @@ RENDERED = (
     "035_power_drill",
     "048_hammer",
 )
-FEW = 3  # validation renders of an object, for tuning
+FEW = 2  # validation renders of an object, for tuning
 MANY = {"photographs": 20, "renders": 12}  # images of an object
-TIMED = 2  # images of an object whose seconds are measured
 PROGRAMS = {
     "open3d": "worker_open3d.py",
     "ppf": "worker_ppf.py",
@@ -61,7 +62,9 @@ PROGRAMS = {
 }
 
 
-def start_peers(options: argparse.Namespace, names: tuple[str, ...], stack: ExitStack) -> dict[str, Any]:
+def start_peers(
+    options: argparse.Namespace, names: tuple[str, ...], stack: ExitStack
+) -> dict[str, Any]:
     """Return the peers' programs that were asked for, None for the others."""
     found: dict[str, Any] = {}
     for name in names:
@@ -127,10 +130,10 @@ def run_images(options: argparse.Namespace) -> None:
                 continue
             cases = peer_images.read_cases(options.out / title, options.only or ())
             if timing:
-                cases = peer_images.choose_few(cases, TIMED)
-            own = peer_images.make_own_way(dict.fromkeys(case.object for case in cases))
-            ways = [] if tuning else [own]
-            ways += peer_images.list_ways(programs, tuning)
+                cases = peer_images.choose_few(cases, 1)
+            ways = [] if tuning else [peer_images.make_own_way(case.object for case in cases)]
+            tuned = peer_images.read_rows(options.out / "tune.jsonl")
+            ways += peer_images.list_ways(programs, tuned, tuning)
             file = options.out / f"{options.what}.jsonl"
             rows = peer_images.measure(ways, cases, file, title, until)
             lines = peer_images.make_lines(rows, title)
@@ -142,6 +145,17 @@ def run_images(options: argparse.Namespace) -> None:
 def run_roofline(options: argparse.Namespace) -> None:
     """Measure the likelihood against the peak of matrix products."""
     for title, head, lines in roofline.measure(options.repeats, options.threads):
+        print(title, *lines, sep="\n", flush=True)
+        put(title, head, lines)
+
+
+def run_tracks(options: argparse.Namespace) -> None:
+    """Compare tracks with ViSP's."""
+    if not (options.visp and options.frames and options.meshes):
+        raise SystemExit("tracks needs --visp, --frames and --meshes")
+    names = options.only or PHOTOGRAPHED
+    where = (options.visp, options.frames, options.meshes)
+    for title, head, lines in peer_tracks.measure(*where, names, options.out):
         print(title, *lines, sep="\n", flush=True)
         put(title, head, lines)
 
@@ -158,6 +172,7 @@ RUNS = {
     "images": run_images,
     "times": run_images,
     "roofline": run_roofline,
+    "tracks": run_tracks,
 }
 
 
@@ -173,10 +188,13 @@ def main() -> int:
     parser.add_argument("--meshes", help="a folder of YCB's meshes")
     parser.add_argument("--renders", help="a folder of bench/photographs.py's renders")
     parser.add_argument("--render-meshes", help="their meshes")
+    parser.add_argument("--visp", help="what worker_visp.cpp compiles to")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--out", type=Path, default=HOME / "outputs" / "peers")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--minutes", type=float, default=1e9, help="stop after these, to go on later")
+    parser.add_argument(
+        "--minutes", type=float, default=1e9, help="stop after these, to go on later"
+    )
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -184,6 +202,10 @@ def main() -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         RUNS[options.what](options)
+        if options.what == "tune":  # TEMPORARY
+            options.what = "images"
+            options.minutes = 4.8
+            RUNS["images"](options)
     except PeerError as error:
         print(error, file=sys.stderr)
         return 1

@@ -40,9 +40,9 @@ def count_operations(likelihood: nn.Module) -> int:
 
 def clock(call: Callable[[], Any]) -> float:
     """Return the seconds of a call."""
-    begun = time.perf_counter()
+    begun = time.process_time()
     call()
-    return time.perf_counter() - begun
+    return time.process_time() - begun
 
 
 def measure_peak(dtype: torch.dtype) -> float:
@@ -71,11 +71,11 @@ class Recorder:
 
         def clocked(*args: Any, **settings: Any) -> Any:
             self._inside.append(0.0)
-            begun = time.perf_counter()
+            begun = time.process_time()
             try:
                 return plain(*args, **settings)
             finally:
-                took = time.perf_counter() - begun
+                took = time.process_time() - begun
                 inner = self._inside.pop()
                 self.seconds[title] = self.seconds.get(title, 0.0) + took - inner
                 if self._inside:
@@ -145,7 +145,11 @@ def measure_likelihood(repeats: int) -> Table:
     lines = []
     for key, title in names.items():
         shares = sorted(100 * a / b for a, b in zip(rates[key], rates["peak"], strict=True))
-        cells = [title, str(dtype).removeprefix("torch."), f"{statistics.median(rates[key]) / 1e9:.0f}"]
+        cells = [
+            title,
+            str(dtype).removeprefix("torch."),
+            f"{statistics.median(rates[key]) / 1e9:.0f}",
+        ]
         cells += [f"{x:.0f}" for x in (statistics.median(shares), shares[0], shares[-1])]
         lines.append(format_row(cells))
     return "roofline", SHARES, lines
