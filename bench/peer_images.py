@@ -45,8 +45,8 @@ OPEN3D_TRIED: tuple[Settings, ...] = (
     {"voxel": 0.005, "iterations": 100_000, "mutual": False, "planes": 1},
 )
 PPF_TRIED: tuple[Settings, ...] = (
-    {"step": 0.1, "share": 0.2, "best": 1, "pick": "votes"},
     {"step": 0.1, "share": 0.2, "best": 10, "pick": "support"},
+    {"step": 0.1, "share": 0.2, "best": 1, "pick": "votes"},
     {"step": 0.1, "share": 0.5, "best": 10, "pick": "support"},
     {"step": 0.08, "share": 0.2, "best": 10, "pick": "support"},
 )

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import torch
 from marked import format_row
-from tracking import run_tracked
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
@@ -24,6 +23,7 @@ from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
+from tracking import run_tracked
 
 BOXES = ("003_cracker_box", "004_sugar_box", "009_gelatin_box")
 FEATURES = {"dense depth": 8, "edges, depth": 9, "KLT, depth": 10, "edges, KLT, depth": 11}

@@ -10,9 +10,10 @@
 
 Each PATH is the interpreter of a virtual environment that has the peer alone: pydpf needs Python
 3.12, `particles` a NumPy before 2, and opencv-contrib takes the place of OpenCV. A peer whose
-option is left out is left out, and said to be. PROGRAM is what worker_visp.cpp compiles to. `cases` reads the images once, into --out; `tune`
-tries every setting on validation renders; `images` measures errors, and goes on where it was
-stopped; `times` measures seconds on few images. Tables go to docs/results/peers.md.
+option is left out is left out, and said to be. PROGRAM is what worker_visp.cpp compiles to.
+`cases` reads the images once, into --out; `tune` tries every setting on validation renders;
+`images` goes on where it was stopped; `times` does the same with one image of each object. Tables
+go to docs/results/peers.md.
 """
 
 import argparse
@@ -202,10 +203,6 @@ def main() -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         RUNS[options.what](options)
-        if options.what == "tune":  # TEMPORARY
-            options.what = "images"
-            options.minutes = 4.8
-            RUNS["images"](options)
     except PeerError as error:
         print(error, file=sys.stderr)
         return 1

@@ -226,3 +226,37 @@ def test_a_missing_peer_is_said_to_be_left_out(
         assert "pydpf: left out, give --python-pydpf" in capsys.readouterr().out
         with pytest.raises(peers.PeerError, match="cannot be run"):
             peers.start_peers(options, ("particles",), stack)
+
+
+def test_faces_of_tracked_models_look_outwards(load_script: Load, tmp_path: Path) -> None:
+    tracks = load_script("bench/peer_tracks.py")
+    from posefilter.meshes.store import MeshStore
+
+    mesh = MeshStore("builtin").load("carton")
+    for vertices, faces in (tracks.make_box(mesh), tracks.merge_vertices(mesh)):
+        assert len(faces) >= 6
+        middle = vertices.mean(0)
+        for face in faces:
+            a, b, c = (vertices[i] for i in face[:3])
+            assert np.cross(b - a, c - b) @ (a - middle) > 0
+    vertices, faces = tracks.make_box(mesh)
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), np.ptp(mesh.vertices, axis=0), rtol=0.02)
+    tracks.write_cao(tmp_path / "a.cao", vertices, faces)
+    lines = (tmp_path / "a.cao").read_text().splitlines()
+    assert lines[:2] == ["V1", "8"]
+    assert lines[10:13] == ["0", "0", "6"]
+    assert [line.split()[0] for line in lines[13:19]] == ["4"] * 6
+
+
+def test_a_failing_tracker_is_told(load_script: Load, tmp_path: Path) -> None:
+    tracks = load_script("bench/peer_tracks.py")
+    program = tmp_path / "program"
+    program.write_text("#!/bin/sh\necho cut off >&2\nexit 1\n")
+    program.chmod(0o755)
+    with pytest.raises(RuntimeError, match="cut off"):
+        tracks.run_visp(str(program), tmp_path / "m", tmp_path / "s", 8)
+    numbers = " ".join(["1"] * 16)
+    program.write_text(f"#!/bin/sh\necho reading the model\necho {numbers} 0.25 1\n")
+    poses, seconds = tracks.run_visp(str(program), tmp_path / "m", tmp_path / "s", 8)
+    assert poses.shape == (1, 4, 4)
+    assert seconds.tolist() == [0.25]
