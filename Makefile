@@ -44,8 +44,10 @@ smoke: $(STAMP) ## run every method the whole way at toy size
 	rm -rf outputs/smoke
 	for model in $(MODELS); do $(PY) train.py debug=smoke model=$$model console=json out=outputs/smoke/$$model || exit 1; done
 
-bench: $(STAMP) ## measure: does training wait for the loader?
+bench: $(STAMP) ## measure: does training wait for the loader? how fast is the filter beside peers? see bench/peers.py
 	$(PY) bench/loader.py
+	$(PY) bench/peers.py filters $(ARGS)
+	$(PY) bench/peers.py roofline
 
 methods: $(STAMP) ## run (or go on with) every run behind docs/results, and write its tables
 	$(PY) bench/methods.py $(ARGS)

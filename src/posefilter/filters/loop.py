@@ -161,11 +161,25 @@ def inherit(values: Tensor, resampled: Resampled, space: Space | None = None) ->
     those of `space` for states, arithmetic ones if it is None.
     """
     if resampled.shares is None:
-        index = resampled.ancestors[(...,) + (None,) * (values.dim() - 2)]
-        return values.gather(1, index.expand(*resampled.ancestors.shape, *values.shape[2:]))
+        return _take(values, resampled.ancestors)
     if space is not None:
         return space.mean(values[:, None], resampled.shares)
     return resampled.shares @ values
+
+
+def _take(values: Tensor, ancestors: Tensor) -> Tensor:
+    """Return the rows of ancestors.  (B, M, *V), (B, N) -> (B, N, *V)."""
+    B, N = ancestors.shape
+    if values.stride(1) == 0:  # all particles have the same
+        return values[:, :1].expand(B, N, *values.shape[2:])
+    if values.requires_grad or values.device.type != "cpu" or not values.is_contiguous():
+        index = ancestors[(...,) + (None,) * (values.dim() - 2)]
+        return values.gather(1, index.expand(B, N, *values.shape[2:]))
+    # whole rows are copied several times faster than their entries one by one
+    rows = ancestors
+    if B > 1:
+        rows = ancestors + values.shape[1] * torch.arange(B)[:, None]
+    return values.flatten(0, 1).index_select(0, rows.flatten()).view(B, N, *values.shape[2:])
 
 
 def check_finite(log_evidence: Tensor) -> None:

@@ -9,6 +9,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from posefilter.geometry import fused_moves
 from posefilter.geometry.pose import move_about, origin_of, pose_about, rotation_of
 from posefilter.geometry.rotation import angle_between, project_to_so3
 
@@ -73,6 +74,8 @@ class PoseSpace:
 
         (*, 4, 4), (*, 6) translation [m] and rotation vector [rad] -> (*, 4, 4).
         """
+        if fused_moves.applies(state, tangent):
+            return fused_moves.move(state, tangent, self.center)
         return move_about(state, tangent, state.new_tensor(self.center))
 
     def noise_scale(self, sigma: Tensor) -> Tensor:
