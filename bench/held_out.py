@@ -2,7 +2,8 @@
 
     python bench/held_out.py --root DIR --meshes DIR [--part test] [--images 48] \
         [--out ROWS.json] A.ckpt [B.ckpt ...]
-    python bench/held_out.py --table ROWS.json     # only writes rows into photographs.md
+    python bench/held_out.py --table ROWS.json [--titles third third-parts]   # only writes rows
+                                                               # into tables of photographs.md
 
 The scenes are those that training with data.split={train: 0.8, val: 0.05, test: 0.15} and seed 0
 holds out; with --part train, those that it learns from, without augmentation: the difference is
@@ -169,11 +170,15 @@ def _put(text: str, title: str, heads: Sequence[str], lines: Sequence[str]) -> s
     return put_table(text, title, heads, (rows[key] for key in sorted(rows)))
 
 
-def write_tables(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
-    """Put rows into the page's two tables."""
+def write_tables(
+    rows: Sequence[dict[str, Any]],
+    page: Path = PAGE,
+    titles: tuple[str, str] = ("held-out", "parts"),
+) -> None:
+    """Put rows into the page's two tables of these titles."""
     held_out = [make_line(row) for row in rows if row["part"] == "test"]
-    text = _put(page.read_text(), "held-out", HEAD, held_out)
-    page.write_text(_put(text, "parts", PARTS, [make_part_line(row) for row in rows]))
+    text = _put(page.read_text(), titles[0], HEAD, held_out)
+    page.write_text(_put(text, titles[1], PARTS, [make_part_line(row) for row in rows]))
 
 
 def main() -> int:
@@ -188,9 +193,10 @@ def main() -> int:
     parser.add_argument("--part", default="test", choices=list(SPLIT))
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
     parser.add_argument("--table", type=Path, help="a file of rows to write into the page")
+    parser.add_argument("--titles", nargs=2, default=["held-out", "parts"], help="of its tables")
     options = parser.parse_args()
     if options.table:
-        write_tables(json.loads(options.table.read_text()))
+        write_tables(json.loads(options.table.read_text()), titles=tuple(options.titles))
         return 0
     if not (options.root and options.meshes and options.checkpoints):
         parser.error("--root, --meshes and a checkpoint are needed")

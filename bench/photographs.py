@@ -21,7 +21,18 @@ from pathlib import Path
 from typing import Any
 
 from marked import format_row, put_table, read_rows
-from photograph_runs import CLUTTER, CRACKER, DIM, FAR, SPLIT, TARGETS, Run, plan
+from photograph_runs import (
+    CLUTTER,
+    CRACKER,
+    DIM,
+    FAR,
+    SPLIT,
+    TARGETS,
+    THIRD,
+    THIRD_SPLIT,
+    Run,
+    plan,
+)
 
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "photographs.md"
@@ -33,7 +44,9 @@ TABLES = (("renders", "renders", False), ("photographs", "photographs", False))
 TABLES += (("ycb_video renders", "photographs", True),)
 
 
-def render_commands(root: Path, frames: int = 300) -> list[list[str]]:
+def render_commands(
+    root: Path, frames: int = 300, folder: str = "data", first_seed: int = 1
+) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object.
 
     A seed decides a frame's camera, lights and layout whatever the object is. With one seed for all
@@ -48,8 +61,8 @@ def render_commands(root: Path, frames: int = 300) -> list[list[str]]:
         f"meshes={root / 'meshes'}",
     ]
     return [
-        ["generate.py", f"out={root / 'data' / name}", f"object={name}", f"seed={seed}", *common]
-        for seed, name in enumerate(TARGETS, start=1)
+        ["generate.py", f"out={root / folder / name}", f"object={name}", f"seed={seed}", *common]
+        for seed, name in enumerate(TARGETS, start=first_seed)
     ]
 
 
@@ -57,10 +70,10 @@ def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
     """Return what to run to train and test one filter on renders."""
     data = [
         "data=fat",
-        f"data.root={root / 'data'}",
+        f"data.root={root / run.scenes}",
         f"data.meshes={root / 'meshes'}",
         f"data.object={run.object}",
-        SPLIT,
+        SPLIT if run.scenes == "data" else THIRD_SPLIT,
     ]
     interval = max(500, run.steps // 4)
     budget = [
@@ -198,7 +211,9 @@ def main() -> int:
     if not options.meshes or not options.frames:
         parser.error("--meshes and --frames are needed")
     link_meshes(options.root, options.meshes)
-    commands = [(words, None) for words in render_commands(options.root)]
+    sets = [render_commands(options.root)]
+    sets.append(render_commands(options.root, 400, THIRD, first_seed=101))
+    commands = [(words, None) for each in sets for words in each]
     for run in plan():
         if options.only and run.name not in options.only:
             continue
