@@ -244,7 +244,8 @@ def summarize(rows: Sequence[dict[str, Any]], own_seconds: float) -> str:
     cells += [f"{recall(error, 0.02):.0f}" for error in errors]
     cells += [f"{auc(error):.1f}" for error in errors]
     seconds = float(np.median([row["cpu"] for row in rows]))
-    cells += [f"{seconds:.2f}", f"{seconds / own_seconds:.1f}"]
+    ratio = seconds / own_seconds  # not a number where posefilter was not asked
+    cells += [f"{seconds:.2f}", "–" if math.isnan(ratio) else f"{ratio:.1f}"]
     return format_row([rows[0]["method"], rows[0]["told"], str(len(rows)), *cells])
 
 

@@ -139,8 +139,12 @@ def run_images(options: argparse.Namespace) -> None:
             rows = peer_images.measure(ways, cases, file, title, until)
             lines = peer_images.make_lines(rows, title)
             print(title, *lines, sep="\n", flush=True)
-            name = options.what if tuning else f"{options.what} {title}"
-            put(name, peer_images.HEAD, lines)
+            if not tuning:
+                put(f"{options.what} {title}", peer_images.HEAD, lines)
+                continue
+            for method in programs:
+                own = [line for line in lines if line.startswith(f"| {method}:")]
+                put(f"tune {method}", peer_images.HEAD, own)
 
 
 def run_roofline(options: argparse.Namespace) -> None:
