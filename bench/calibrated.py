@@ -31,12 +31,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from checkpoint_frames import open_frames
 
-from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import is_right
 from posefilter.cli.checkpoints import method_of, read_checkpoint
-from posefilter.cli.command import compose_job
-from posefilter.cli.evaluate import data_settings
 from posefilter.confidence.fit import Frames, fit_calibration
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
@@ -50,7 +48,6 @@ from posefilter.metrics.diagnostics import auroc
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch
 
-HOME = Path(__file__).parents[1]
 QUARTERS = (0.0, 0.25, 0.5, 0.75)
 LEVEL = 0.95  # of the band
 SURE, LOST = 0.8, 0.2  # found from this probability, absent below this presence
@@ -132,14 +129,7 @@ def collect(file: str, options: Any, end: float) -> bool:
     if method.calibration is None or method.calibration.conformal is None:
         raise SystemExit(f"{file}: is not calibrated, or without conformal sets")
     rows = read_rows(options.rows) if options.rows.exists() else []
-    words = [f"checkpoint={file}", "data=fat", f"data.root={options.root}"]
-    words += [f"data.meshes={options.meshes}", f"data.object={name}", "data.split={val: 1.0}"]
-    words += ["data.min_visibility_test=0.1", "data.workers=0"]
-    job = compose_job("calibrate", HOME / "conf", words, Path())
-    settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
-    settings.limit_val = options.frames
-    data = build_data(settings, "json")
-    data.setup("validate")
+    data = open_frames(file, checkpoint, name, options)
     parts = ((data.val_dataset, True), (data.absent_dataset("val", options.without), False))
     for dataset, there in parts:
         done = sum(row["object"] == name and row["there"] == there for row in rows)

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from checkpoint_frames import open_frames
 
-from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
 from posefilter.cli.components import changes
-from posefilter.cli.evaluate import data_settings
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
@@ -43,14 +42,7 @@ def measure(file: str, options: Any, end: float) -> list[dict[str, Any]]:
         methods[way] = method_of(checkpoint, changes(job.cfg), lightning=False)
         methods[way].seed = 0
     name = methods["default"].model.name
-    words = [f"checkpoint={file}", "data=fat", f"data.root={options.root}"]
-    words += [f"data.meshes={options.meshes}", f"data.object={name}", "data.split={val: 1.0}"]
-    words += ["data.min_visibility_test=0.1", "data.workers=0"]
-    job = compose_job("calibrate", HOME / "conf", words, Path())
-    settings = data_settings(job, checkpoint["recipe"]["settings"], name, "val")
-    settings.limit_val = options.frames
-    data = build_data(settings, "json")
-    data.setup("validate")
+    data = open_frames(file, checkpoint, name, options)
     rows = []
     for number, batch in enumerate(make_loader(data.val_dataset, 1, 0)):
         if time.monotonic() > end:

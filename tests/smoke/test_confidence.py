@@ -24,17 +24,22 @@ QUIET = ["console=json", "threads=1"]
 TINY = ["debug=smoke", *QUIET, "logger=none", "data.progress=false", "filter.particles=16"]
 
 
+def save_untrained(words: list[str], path: Path) -> None:
+    """Write the checkpoint of a method that has not been trained."""
+    job = compose_job("train", HOME / "conf", words, path.parent)
+    data = build_data(job.cfg.data, "json")
+    method = build_method(recipe(job), data.object_model(0), lightning=False)
+    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
+    method.on_save_checkpoint(content)
+    torch.save(content, path)
+
+
 @pytest.fixture(scope="module")
 def weights(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return an untrained checkpoint of the pose-space method."""
     folder = tmp_path_factory.mktemp("untrained")
     words = [*TINY, f"data.root={tiny_scenes}", "filter.steps=3", *SMALL_POSE_PF]
-    job = compose_job("train", HOME / "conf", words, folder)
-    data = build_data(job.cfg.data, "json")
-    method = build_method(recipe(job), data.object_model(0), lightning=False)
-    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
-    method.on_save_checkpoint(content)
-    torch.save(content, folder / "untrained.ckpt")
+    save_untrained(words, folder / "untrained.ckpt")
     return folder / "untrained.ckpt"
 
 
@@ -182,12 +187,7 @@ def test_an_evaluation_reports_how_much_the_probability_tells(
 
 def test_a_detector_is_refused(tiny_scenes: Path, tmp_path: Path) -> None:
     words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch"]
-    job = compose_job("train", HOME / "conf", words, tmp_path)
-    data = build_data(job.cfg.data, "json")
-    method = build_method(recipe(job), data.object_model(0), lightning=False)
-    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
-    method.on_save_checkpoint(content)
-    torch.save(content, tmp_path / "detector.ckpt")
+    save_untrained(words, tmp_path / "detector.ckpt")
     from posefilter.cli.calibrate import calibrate
 
     typed = [f"checkpoint={tmp_path / 'detector.ckpt'}"]
@@ -200,12 +200,7 @@ def test_methods_in_image_space_are_calibrated_too(
     name: str, tiny_scenes: Path, without: Path, tmp_path: Path
 ) -> None:
     typed = [f"model={name}", *TINY, f"data.root={tiny_scenes}", "filter.steps=3"]
-    job = compose_job("train", HOME / "conf", typed, tmp_path)
-    data = build_data(job.cfg.data, "json")
-    method = build_method(recipe(job), data.object_model(0), lightning=False)
-    content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
-    method.on_save_checkpoint(content)
-    torch.save(content, tmp_path / "bare.ckpt")
+    save_untrained(typed, tmp_path / "bare.ckpt")
     out = tmp_path / "calibrated.ckpt"
     words = [f"checkpoint={tmp_path / 'bare.ckpt'}", f"data.root={tiny_scenes}"]
     words += ["data.split={train: 0, val: 1.0, test: 0}", "data.min_visibility_test=0"]
