@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
+from rrd_files import read_back
 from views import FIRST, STEPS, H, N, W, box, run, two_images
 
 from posefilter.errors import UserError
@@ -24,7 +25,6 @@ SPACE = PoseSpace((0.0, 0.0, 0.105), 0.136)
 needs_rerun = pytest.mark.skipif(
     importlib.util.find_spec("rerun") is None, reason="the optional extra [viz] is not installed"
 )
-Read = dict[str, dict[str, dict[int | None, np.ndarray]]]
 
 
 def shown(pixels: bool = False, shape: Mesh | None = None) -> ViewData:
@@ -32,25 +32,6 @@ def shown(pixels: bool = False, shape: Mesh | None = None) -> ViewData:
     return collect_view_data(
         run(pixels), two_images(), box(), space, box().hull if shape is None else shape, image=1
     )
-
-
-def read_back(path: Path) -> Read:
-    """Return a file's content: entity -> component -> step (None: at every one) -> values."""
-    from rerun.chunk import RrdReader
-
-    found: Read = {}
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        times = [None] * chunk.num_rows if chunk.is_static else batch.column("step").to_pylist()
-        for name in batch.schema.names:
-            if name not in ("rerun.controls.RowId", "step"):
-                rows = found.setdefault(chunk.entity_path, {}).setdefault(name, {})
-                rows |= {
-                    t: np.array(value)
-                    for t, value in zip(times, batch.column(name).to_pylist(), strict=True)
-                    if value
-                }
-    return found
 
 
 def placed(entity: dict[str, dict[int | None, np.ndarray]], step: int | None) -> np.ndarray:
@@ -92,7 +73,7 @@ def test_words_tell_the_hypotheses() -> None:
 def test_the_cloud_and_the_photograph_are_there_at_every_step(tmp_path: Path) -> None:
     scene = shown()
     record(scene, tmp_path / "view.rrd")
-    found = read_back(tmp_path / "view.rrd")
+    found = read_back(tmp_path / "view.rrd", "step")
     assert np.allclose(found["/cloud"]["Points3D:positions"][None], scene.points, atol=1e-6)
     assert (rgba(found["/cloud"]["Points3D:colors"][None])[:, :3] == scene.colors).all()
     assert (found["/photograph"]["Image:buffer"][None].reshape(H, W, 3) == scene.rgb).all()
@@ -109,7 +90,7 @@ def test_the_cloud_and_the_photograph_are_there_at_every_step(tmp_path: Path) ->
 def test_the_time_line_is_the_filters_steps_and_the_belief(pixels: bool, tmp_path: Path) -> None:
     scene = shown(pixels)
     record(scene, tmp_path / "view.rrd")
-    found = read_back(tmp_path / "view.rrd")
+    found = read_back(tmp_path / "view.rrd", "step")
     inside, on_image = found["/particles/centers"], found["/photograph/particles"]
     assert (
         list(inside["Points3D:positions"])
@@ -139,7 +120,7 @@ def test_the_mesh_is_where_the_estimate_puts_it_and_fainter_at_the_other_modes(
     mesh = builtin.build("carton")
     scene = shown(shape=mesh)
     record(scene, tmp_path / "view.rrd")
-    found = read_back(tmp_path / "view.rrd")
+    found = read_back(tmp_path / "view.rrd", "step")
     named = ["/estimate", *(f"/modes/{i}" for i in range(1, len(scene.others) + 1))]
     assert (
         sorted(
@@ -171,7 +152,7 @@ def test_the_texture_lies_on_the_estimate_the_right_way_up(tmp_path: Path) -> No
     mesh = builtin.build("carton")
     assert mesh.corner_uv is not None
     record(shown(shape=mesh), tmp_path / "view.rrd")
-    entity = read_back(tmp_path / "view.rrd")["/estimate"]
+    entity = read_back(tmp_path / "view.rrd", "step")["/estimate"]
     form = entity["Mesh3D:albedo_texture_format"][STEPS][0]
     texture = entity["Mesh3D:albedo_texture_buffer"][STEPS].reshape(
         form["height"], form["width"], 3

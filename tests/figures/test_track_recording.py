@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rrd_files import read_back
 
 from posefilter.errors import UserError
 from posefilter.figures.track_recording import Seen, TrackRecorder, thin_cloud
@@ -27,25 +28,6 @@ def pose_at(x: float) -> np.ndarray:
     pose[:3, :3] = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     pose[:3, 3] = x, 0.02, 0.7
     return pose
-
-
-def read_back(path: Path) -> dict[str, dict[str, dict[int | None, np.ndarray]]]:
-    """Return a file's content: entity -> component -> frame (None: at every one) -> values."""
-    from rerun.chunk import RrdReader
-
-    found: dict[str, dict[str, dict[int | None, np.ndarray]]] = {}
-    for chunk in RrdReader(path).stream():
-        batch = chunk.to_record_batch()
-        times = [None] * chunk.num_rows if chunk.is_static else batch.column("frame").to_pylist()
-        for name in batch.schema.names:
-            if name not in ("rerun.controls.RowId", "frame"):
-                rows = found.setdefault(chunk.entity_path, {}).setdefault(name, {})
-                rows |= {
-                    t: np.array(value)
-                    for t, value in zip(times, batch.column(name).to_pylist(), strict=True)
-                    if value
-                }
-    return found
 
 
 def test_points_of_the_cloud_project_onto_the_pixels_that_they_are_of() -> None:
@@ -84,7 +66,7 @@ def test_objects_are_where_the_tracks_put_them_and_gone_while_they_are_lost(tmp_
         for number, pose in enumerate(poses):
             presence = float("nan") if number == 3 else 0.9 - 0.1 * number
             recorder.add(SMOOTH, DEPTH, K, [Seen("box", pose, CENTER, presence)])
-    found = read_back(tmp_path / "view.rrd")
+    found = read_back(tmp_path / "view.rrd", "frame")
     box = found["/objects/box"]
     assert set(box["Transform3D:translation"]) == {0, 1, 4}
     for number, pose in enumerate(poses):
