@@ -1,6 +1,8 @@
 """Layers that several networks share."""
 
 import math
+import platform
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +19,22 @@ def fast_bfloat16(device: torch.device) -> bool:
         return False
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
-    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    return device.type == "cpu" and _cpu_multiplies_bfloat16()
+
+
+@cache
+def _cpu_multiplies_bfloat16() -> bool:
+    """Return whether the processor has instructions for products in bfloat16.
+
+    oneDNN's own answer is not enough: on x86 it is yes wherever there is AVX-512, whose first
+    generations (Skylake to Ice Lake) have no such instructions and take five times as long.
+    """
+    if not torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return False
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    return not x86 or bool(
+        torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    )
 
 
 def fourier(x: Tensor, octaves: int) -> Tensor:
