@@ -4,8 +4,8 @@
 
 An estimate without anything before it, image by image and 8 in one call; both in turn, in one
 process. Then what an estimate multiplies and adds in matrix products and convolutions, counted by
-torch, against the fastest bfloat16 product that this machine was seen to do in the same process:
-how much a batch could win at most. Writes the table of docs/performance.md.
+torch, against the fastest product, in the type that estimates take, that this machine was seen to
+do in the same process: how much a batch could win at most. Writes the table of docs/performance.md.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import posefilter
 from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.nets.layers import fast_bfloat16
 
 PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
 HEAD = (
@@ -58,8 +59,11 @@ def list_counts() -> dict[Any, Callable[..., int]]:
 
 
 def measure_peak() -> float:
-    """Return the operations a second of the processor of the fastest of some bfloat16 products."""
-    a = torch.randn(SIZE, SIZE).bfloat16()
+    """Return the operations a second of the processor of the fastest of some products, in the type
+    that estimates are computed in.
+    """
+    fast = fast_bfloat16(torch.device("cpu"))
+    a = torch.randn(SIZE, SIZE).to(torch.bfloat16 if fast else torch.float32)
     return 2 * SIZE**3 / min(take_time(lambda: a @ a)[1] for _ in range(8))
 
 

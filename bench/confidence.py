@@ -33,7 +33,7 @@ Spoil = Callable[[Sample, Sample], Inputs]  # of a photograph, and of one of ano
 HEAD = ("object", "with it", "right", "found", "found and right", "absent")
 HEAD += ("without it", "found", "unsure", "highest probability")
 HEAD_SPOILED = ("input", "asked for", "refused", "right", "found", "found and wrong")
-HEAD_SPOILED += ("highest probability of a wrong one",)
+HEAD_SPOILED += ("highest probability of a wrong one", "said to be of a wrong size")
 
 
 def _stretch(factor: float) -> Spoil:
@@ -62,6 +62,7 @@ SPOILED: dict[str, Spoil] = {
     "depth_x2": _stretch(2.0),
     "depth_x1.5": _stretch(1.5),
     "depth_x1.25": _stretch(1.25),
+    "depth_x0.8": _stretch(0.8),
     "depth_x0.5": _stretch(0.5),
     "depth_x0.1": _stretch(0.1),
     "focal_x1.5": _zoom(1.5),
@@ -109,6 +110,7 @@ def look(
             row = {"object": result.object, "image": records[own[0]].name, "input": spoil}
             row |= {"there": result.object in there, "verdict": result.verdict}
             row |= {"probability": result.probability, "presence": result.presence}
+            row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
             if result.object in there:
                 truth = torch.from_numpy(there[result.object].camera_from_object).double()[None]
                 pose, model = torch.from_numpy(result.pose)[None], result.model
@@ -148,6 +150,7 @@ def tabulate_spoiled(rows: list[dict[str, Any]]) -> str:
         wrong_found = sum(not row["right"] for row in found)
         cells = [name, len(own), refused, right, len(found), wrong_found]
         cells.append(f"{max((row['probability'] for row in wrong), default=0):.2f}")
+        cells.append(sum(row.get("wrong_size", False) for row in own))
         lines.append(format_row(map(str, cells)))
     return "\n".join(lines)
 

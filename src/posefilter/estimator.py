@@ -156,9 +156,10 @@ class Estimator:
                 if method.calibration is not None:
                     evidence = method.collect_evidence(trace, batch)
                     found, surface = method.calibration.assess(evidence), evidence["surface"]
+                apparent = method.measure_apparent_size(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, surface))
+            runs.append(Run(method, batch, trace, seconds, found, surface, apparent))
         return runs
 
 

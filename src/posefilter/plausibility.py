@@ -16,11 +16,12 @@ def find_warnings(
     depth: np.ndarray,
     intrinsics: np.ndarray,
     trained_depth: tuple[float, float] | None = None,
+    apparent_size: float | None = None,
 ) -> tuple[str, ...]:
     """Return what makes an estimate implausible, one sentence each.
 
     A wrong depth scale moves the answer with it, and its score does not fall: only the object's
-    size tells.
+    size tells, as a whole and between its points (`confidence.apparent_size`).
 
     Args:
         pose: The estimate (4, 4), camera_from_object [m].
@@ -28,6 +29,8 @@ def find_warnings(
         depth: Measured z-depth (H, W) [m], 0 where unknown, at the network's resolution.
         intrinsics: Its camera matrix (3, 3) [px].
         trained_depth: The nearest and farthest that training saw the object's center [m].
+        apparent_size: How large the object appears, relative to its mesh, where that contradicts
+            the inputs.
     """
     height, width = depth.shape
     x, y, z = (pose[:3, :3] @ model.center.double().numpy() + pose[:3, 3]).tolist()
@@ -35,6 +38,11 @@ def find_warnings(
     known = float((depth > 0).mean())
     if known < _FEWEST:
         found.append(f"only {100 * known:.1f} % of the pixels have depth")
+    if apparent_size is not None:
+        found.append(
+            f"the object appears {apparent_size:.2f} times as large as its mesh: are the depth's "
+            "units (depth_scale), the intrinsics and the mesh's units right?"
+        )
     if z <= 0:
         return (*found, "the object would be behind the camera")
     focal = float(np.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))

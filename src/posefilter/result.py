@@ -10,6 +10,7 @@ import torch
 
 from posefilter.belief import Belief, Mode, PoseSet
 from posefilter.belief.summaries import check_share
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.conformal import Conformal
 from posefilter.confidence.verdicts import Costs, Verdict, decide
@@ -40,6 +41,10 @@ class Result:
         presence: That the object is there, whatever the pose: at least `probability`, or None.
         belief: Every particle and its weight.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
+        apparent_size: How large the object appears, relative to its mesh: 1 where the depth and the
+            intrinsics are right.  NaN where the method cannot tell, or too few pixels show it.
+        wrong_size: Whether it appears so much larger or smaller that depth or intrinsics must be
+            wrong.  `probability` supposes that they are right, so "found" becomes "unsure".
         seconds: The filter's time for this image, its share of a batch.
         model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
@@ -65,6 +70,8 @@ class Result:
     calibration_note: str = field(default="", kw_only=True)
     conformal: Conformal | None = field(default=None, kw_only=True)
     surface: float = field(default=math.nan, kw_only=True)
+    apparent_size: float = field(default=math.nan, kw_only=True)
+    wrong_size: bool = field(default=False, kw_only=True)
     instance: int = field(default=0, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
 
@@ -80,7 +87,8 @@ class Result:
         """Return the verdict at other costs of errors; None where there is no probability."""
         if self.probability is None or self.presence is None:
             return None
-        return decide(self.presence, self.probability, costs)
+        verdict = decide(self.presence, self.probability, costs)
+        return "unsure" if verdict == "found" and self.wrong_size else verdict
 
     @property
     def covariance(self) -> np.ndarray:
@@ -142,6 +150,8 @@ class Result:
             return f"{self.object}, score {self.score:.2f}"
         if self.verdict == "absent":
             return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
+        if self.verdict == "unsure" and self.wrong_size:
+            return f"{self.object}: unsure, appears {self.apparent_size:.2f} times its size"
         if self.verdict == "unsure":
             there = f"{self.presence:.2f} that it is there"
             return f"{self.object}: unsure, probability {self.probability:.2f}, {there}"
@@ -206,6 +216,7 @@ class Run(NamedTuple):
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
     surface: torch.Tensor | None = None  # (B,) evidence; None where there is no probability
+    size: ApparentSize | None = None  # None where the method cannot tell
 
 
 def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:
@@ -226,6 +237,8 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
     weights = belief.log_weights[image].double().cpu().exp().numpy()
     center = model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
+    size = math.nan if run.size is None else float(run.size.scale[image])
+    wrong_size = run.size is not None and bool(run.size.contradicts()[image])
     return Result(
         object=model.name,
         pose=pose,
@@ -246,6 +259,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
             model,
             run.batch.depth[image, 0].cpu().numpy(),
             run.batch.intrinsics[image].double().cpu().numpy(),
+            apparent_size=size if wrong_size else None,
         ),
         seconds=run.seconds,
         model=model,
@@ -253,6 +267,8 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         calibration_note="" if found is not None else explain_missing(run.method),
         conformal=None if found is None or calibration is None else calibration.conformal,
         surface=math.nan if run.surface is None else float(run.surface[image]),
+        apparent_size=size,
+        wrong_size=wrong_size,
     )
 
 

@@ -42,10 +42,10 @@ def test_exchanged_intrinsics_have_the_focal_length_as_principal_point(bench: Mo
 def test_the_table_counts_refused_and_confidently_wrong_answers(bench: ModuleType) -> None:
     row = {"object": "box", "image": "a", "input": "depth_x2", "there": True}
     rows = [
-        row | {"verdict": "found", "right": False, "probability": 0.9},
+        row | {"verdict": "found", "right": False, "probability": 0.9, "wrong_size": True},
         row | {"verdict": "unsure", "right": True, "probability": 0.95},
         row | {"verdict": "refused", "right": False, "probability": 0.0},
         row | {"there": False, "verdict": "found", "probability": 0.99},
     ]
     lines = [line for line in bench.tabulate_spoiled(rows).splitlines() if "depth_x2" in line]
-    assert lines == ["| depth_x2 | 3 | 1 | 1 | 1 | 1 | 0.90 |"]
+    assert lines == ["| depth_x2 | 3 | 1 | 1 | 1 | 1 | 0.90 | 1 |"]

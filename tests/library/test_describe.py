@@ -19,5 +19,16 @@ from posefilter.result import Result
 def test_an_unsure_answer_says_both_whether_it_is_there_and_whether_it_is_right(
     verdict: str | None, words: str
 ) -> None:
-    one = SimpleNamespace(object="box", verdict=verdict, probability=0.9, presence=0.95, score=1.5)
+    one = answer(verdict)
     assert Result.describe(one) == words  # type: ignore[arg-type]
+
+
+def answer(verdict: str | None, **more: float) -> SimpleNamespace:
+    own = {"object": "box", "probability": 0.9, "presence": 0.95, "score": 1.5}
+    return SimpleNamespace(verdict=verdict, **{"wrong_size": False, **own, **more})
+
+
+@pytest.mark.parametrize("verdict", ["found", "unsure", "absent"])
+def test_a_wrong_size_is_told_where_it_makes_unsure(verdict: str) -> None:
+    said = Result.describe(answer(verdict, wrong_size=True, apparent_size=1.25))  # type: ignore[arg-type]
+    assert ("appears 1.25 times its size" in said) == (verdict == "unsure")

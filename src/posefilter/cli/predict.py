@@ -227,6 +227,7 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
         "score": result.score,
         "score_is": "log-likelihood up to a constant of the method; not a probability",
         "warnings": list(result.warnings),
+        "apparent_size": None if math.isnan(result.apparent_size) else result.apparent_size,
         "belief": {
             "particles": len(belief.weights),
             "effective_particles": belief.effective_samples,

@@ -17,6 +17,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.evidence import measure_belief, measure_depth
 from posefilter.confidence.verdicts import Costs, score_verdicts
@@ -217,6 +218,12 @@ class PoseEstimator(Module):
             **measure_belief(trace.belief, self.model),
             **measure_depth(trace.belief.best, batch, self.model),
         }
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+        """Return how large the object appears, relative to its mesh; None where the method cannot
+        tell.  Arguments as of `collect_evidence`.
+        """
+        return None
 
     @torch.no_grad()
     def assess(self, trace: Trace, batch: Batch) -> Assessment | None:

@@ -12,6 +12,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
+from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
 from posefilter.confidence.evidence import measure_coordinates
 from posefilter.geometry.ransac import (
     agreement,
@@ -112,6 +113,11 @@ class DenseCoordinates(Hypotheses):
         scene: DenseScene = self.encode(batch) if trace.scene is None else trace.scene
         seen = measure_coordinates(trace.belief.best, scene.coordinates, scene.cells, self.model)
         return super().collect_evidence(trace, batch) | seen
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize:
+        """Return how large the object appears by the network's object points."""
+        scene: DenseScene = self.encode(batch) if trace.scene is None else trace.scene
+        return measure_apparent_size(trace.belief.best, scene.coordinates, scene.cells, self.model)
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the network too."""

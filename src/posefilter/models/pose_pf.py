@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
+from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
 from posefilter.confidence.evidence import measure_coordinates
 from posefilter.errors import UserError
 from posefilter.models.candidate_samplers import CandidateSampler
@@ -197,6 +198,15 @@ class PosePF(PoseParticles):
         assert scene.cells is not None
         best = trace.belief.best
         return evidence | measure_coordinates(best, scene.coordinates, scene.cells, self.model)
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+        """Return how large the object appears by the proposal network; None without one."""
+        if self.proposals is None:
+            return None
+        scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
+        assert scene.coordinates is not None
+        assert scene.cells is not None
+        return measure_apparent_size(trace.belief.best, scene.coordinates, scene.cells, self.model)
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the networks too."""
