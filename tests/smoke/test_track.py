@@ -60,6 +60,21 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert run_command("track", HOME, typed) == 2  # nothing is overwritten
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.25])
+def test_a_wrong_depth_scale_is_told_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float
+) -> None:
+    scale = f"depth_scale={10000 / factor}"  # units in a meter; 10000 is right
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}", scale]
+    assert run_command("track", HOME, typed) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    warned = [line for line in lines if line["event"] == "warning"]
+    assert len(warned) == (factor != 1.0)
+    for line in warned:
+        assert line["frame"] == "000"
+        assert any("times as large as its mesh" in one for one in line["warnings"])
+
+
 def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.data.resize import network_size
 from posefilter.filters.loop import ParticleFilter, make_particles
@@ -73,6 +74,7 @@ class Sight(NamedTuple):
     relevance: float  # the mean relevance of the pixels that the estimate covers
     presence: float  # what the track is judged by
     found: Assessment | None  # the calibrated probabilities
+    size: ApparentSize | None = None  # of estimates from the whole image
 
 
 class Track:
@@ -165,7 +167,9 @@ class Track:
         if not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
-        return self._weigh(batch, self.method.predict_step(batch, 0))
+        trace = self.method.predict_step(batch, 0)
+        size = self.method.measure_apparent_size(trace, batch)
+        return self._weigh(batch, trace)._replace(size=size)
 
     def _follow(self, frame: Frame, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
@@ -253,7 +257,8 @@ class Track:
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
         belief = Belief(state.belief.state, state.belief.log_weights, state.best, score)
-        return Run(self.method, sight.batch, Trace((), (), (), belief), 0.0, sight.found)
+        trace = Trace((), (), (), belief)
+        return Run(self.method, sight.batch, trace, 0.0, sight.found, size=sight.size)
 
 
 def begin(belief: Belief) -> State:
