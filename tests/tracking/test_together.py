@@ -63,7 +63,7 @@ def test_an_error_of_one_object_is_raised(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_objects_take_turns_to_see_the_whole_image() -> None:
     toys = [make_toy() for _ in range(4)]
-    settings = TrackerSettings(look_around=4, side=64)
+    settings = TrackerSettings(whole_image_every=4, window_side=64)
     tracker = posefilter.Tracker([estimator for _, estimator in toys], settings)
     for number, pose in enumerate(walk_pose(13, shift=0.0, turn=0.0)):
         for toy, _ in toys:

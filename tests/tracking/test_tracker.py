@@ -40,7 +40,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
 
 def test_the_network_sees_a_window_and_now_and_then_the_whole_image() -> None:
     toy, estimator = make_toy()
-    tracker = posefilter.Tracker(estimator, TrackerSettings(look_around=4, side=64))
+    tracker = posefilter.Tracker(estimator, TrackerSettings(whole_image_every=4, window_side=64))
     truth = walk_pose(13, shift=0.0, turn=0.0)
     for pose in truth:
         toy.truth = pose
@@ -55,7 +55,7 @@ def test_the_network_proposes_poses_where_it_sees_the_whole_image(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     toy, estimator = make_toy()
-    tracker = posefilter.Tracker(estimator, TrackerSettings(look_around=3, side=64))
+    tracker = posefilter.Tracker(estimator, TrackerSettings(whole_image_every=3, window_side=64))
     toy.truth = walk_pose(1)[0]
     tracker.update(RGB, DEPTH, K)
     asked, propose = [], toy.propose_poses
@@ -116,7 +116,10 @@ def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object()
 
 def test_in_doubt_the_network_sees_the_whole_image() -> None:
     toy, estimator = make_toy()
-    tracker, sizes = posefilter.Tracker(estimator, TrackerSettings(side=64, look_around=0)), []
+    tracker, sizes = (
+        posefilter.Tracker(estimator, TrackerSettings(window_side=64, whole_image_every=0)),
+        [],
+    )
     toy.truth = walk_pose(1)[0]
     tracker.update(RGB, DEPTH, K)
     for depth in (DEPTH, NONE, DEPTH, DEPTH):
@@ -164,7 +167,7 @@ def test_smoothing_damps_jitter_and_follows_a_jump() -> None:
     deviations, last = [], []
     for noise in (0.0, 0.01):
         toy, estimator = make_toy()
-        tracker = posefilter.Tracker(estimator, TrackerSettings(noise=noise))
+        tracker = posefilter.Tracker(estimator, TrackerSettings(smoothing_noise=noise))
         toy.truth = truth = walk_pose(1)[0]
         still = [tracker.update(RGB, DEPTH, K).pose[:3, 3] for _ in range(20)]
         deviations.append(np.std(np.diff(still[5:], axis=0)))
@@ -193,8 +196,8 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
     [
         ({"patience": 0}, "patience=0 must be a whole number, 1 or more"),
         ({"lost_below": 0.9}, "found_above=0.5 must lie in"),
-        ({"reach": 0.5}, "reach 1 or more"),
-        ({"quantile": 1.0}, "quantile between 0 and 1"),
+        ({"window_scale": 0.5}, "window_scale 1 or more"),
+        ({"kld_quantile": 1.0}, "kld_quantile between 0 and 1"),
     ],
 )
 def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> None:
@@ -204,8 +207,8 @@ def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> 
 
 def test_impossible_efforts_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     effort = TrackerSettings().follow
-    with pytest.raises(UserError, match="most=5 particles are fewer than least=10"):
-        dataclasses.replace(effort, least=10, most=5)
+    with pytest.raises(UserError, match="max_particles=5 is below min_particles=10"):
+        dataclasses.replace(effort, min_particles=10, max_particles=5)
     with pytest.raises(UserError, match="noise levels fall"):
         Effort(10, 20, 0, 2, 0.001, 0.004, 64)
     toy, estimator = make_toy()

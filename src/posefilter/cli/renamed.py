@@ -57,6 +57,20 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.relevance_weight",
+    "tracker.walk": "tracker.move_scale",
+    "tracker.jump": "tracker.jump_penalty",
+    "tracker.epsilon": "tracker.kld_epsilon",
+    "tracker.quantile": "tracker.kld_quantile",
+    "tracker.cell": "tracker.kld_cell",
+    "tracker.look_around": "tracker.whole_image_every",
+    "tracker.side": "tracker.window_side",
+    "tracker.reach": "tracker.window_scale",
+    "tracker.noise": "tracker.smoothing_noise",
+    "tracker.full_every": "tracker.full_search_every",
+    "tracker.follow.least": "tracker.follow.min_particles",
+    "tracker.follow.most": "tracker.follow.max_particles",
+    "tracker.search.least": "tracker.search.min_particles",
+    "tracker.search.most": "tracker.search.max_particles",
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
 _CHOICES = {

@@ -41,7 +41,7 @@ _SECTIONS = {
         "data.root": "folder of the dataset, where data= is given",
         "tracker.motion.shift_mm": "how far an object may move between two frames",
         "tracker.follow.points": "image points of a pose; cost is in proportion",
-        "tracker.noise": "smoothing over time [m]",
+        "tracker.smoothing_noise": "smoothing over time [m]",
     },
     "check_data": {"data.root": "folder of the dataset"},
 }

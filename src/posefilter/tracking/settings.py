@@ -19,8 +19,8 @@ class Effort:
     """What a frame may cost.
 
     Attributes:
-        least: Particles of the belief at least.
-        most: Particles at most; KLD sampling chooses between.
+        min_particles: Particles of the belief at least.
+        max_particles: Particles at most; KLD sampling chooses between.
         proposals: Particles that the network proposes, beside them, in frames of which it sees the
             whole image.
         steps: Likelihood steps.
@@ -32,8 +32,8 @@ class Effort:
         UserError: A number is out of range.
     """
 
-    least: int
-    most: int
+    min_particles: int
+    max_particles: int
     proposals: int
     steps: int
     start: float
@@ -42,10 +42,11 @@ class Effort:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, least=1, most=1, proposals=0, steps=1, points=1)
-        if self.most < self.least:
+        check_whole(self, min_particles=1, max_particles=1, proposals=0, steps=1, points=1)
+        if self.max_particles < self.min_particles:
             raise UserError(
-                f"tracker: most={self.most} particles are fewer than least={self.least}"
+                f"tracker: max_particles={self.max_particles} is below "
+                f"min_particles={self.min_particles}"
             )
         if not 0 < self.stop <= self.start:
             raise UserError(
@@ -61,26 +62,27 @@ class TrackerSettings:
         motion: How an object may move between two frames.
         follow: What a frame costs while the object is tracked.
         search: What it costs while the object is lost.
-        walk: Standard deviation of the move between two steps, over the noise level.
+        move_scale: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
         fit_points: Image points that a pose is scored from in these fits.
-        jump: Log odds against a jump to what the network proposes, while the object is tracked
-            [nat]; so that it does not flip between faces that look alike.
-        epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
-        quantile: Probability that it stays below.
-        cell: Side of the cells that it counts [m].
-        look_around: Every so many frames the network sees the whole image, so that proposals come
-            from everywhere; 0: never.
-        side: Largest side of the window about the object that it sees otherwise [px].
-        reach: Half the window's side, in projected radii of the object.
-        noise: Standard deviation of the estimate of a single frame, for smoothing [m]; 0: none.
+        jump_penalty: Log odds against a jump to what the network proposes, while the object is
+            tracked [nat]; so that it does not flip between faces that look alike.
+        kld_epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
+        kld_quantile: Probability that it stays below.
+        kld_cell: Side of the cells that it counts [m].
+        whole_image_every: Every so many frames the network sees the whole image, so that proposals
+            come from everywhere; 0: never.
+        window_side: Largest side of the window about the object that it sees otherwise [px].
+        window_scale: Half the window's side, in projected radii of the object.
+        smoothing_noise: Standard deviation of the estimate of a single frame, for smoothing [m];
+            0: none.
         lost_below: A frame counts against the object where its presence is below, in [0, 1].
         found_above: What a search finds is taken up where its presence is above. While a track's is
             not, the network sees the whole image in the next frame.
         patience: Frames in a row that count against an object that is lost.
-        full_every: While it is lost, every so many frames the estimator's own filter searches;
-            0: never.
+        full_search_every: While it is lost, every so many frames the estimator's own filter
+            searches; 0: never.
 
     Raises:
         UserError: A number is out of range.
@@ -89,31 +91,38 @@ class TrackerSettings:
     motion: RandomWalk = field(default_factory=RandomWalk)
     follow: Effort = Effort(32, 300, 8, 1, 0.008, 0.008, 64)
     search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
-    walk: float = 0.4
+    move_scale: float = 0.4
     rounds: int = 1
     fit_points: int = 128
-    jump: float = 5.0
-    epsilon: float = 0.15
-    quantile: float = 0.95
-    cell: float = 0.03
-    look_around: int = 4
-    side: int = 320
-    reach: float = 1.25
-    noise: float = 0.0015
+    jump_penalty: float = 5.0
+    kld_epsilon: float = 0.15
+    kld_quantile: float = 0.95
+    kld_cell: float = 0.03
+    whole_image_every: int = 4
+    window_side: int = 320
+    window_scale: float = 1.25
+    smoothing_noise: float = 0.0015
     lost_below: float = 0.3
     found_above: float = 0.5
     patience: int = 2
-    full_every: int = 5
+    full_search_every: int = 5
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, fit_points=1, look_around=0, side=64, patience=1, full_every=0)
-        if not (min(self.walk, self.noise, self.jump) >= 0 and self.reach >= 1):
-            raise UserError("tracker: walk, noise and jump must be 0 or more, reach 1 or more")
+        check_whole(self, rounds=0, fit_points=1, patience=1)
+        check_whole(self, whole_image_every=0, window_side=64, full_search_every=0)
+        least = min(self.move_scale, self.smoothing_noise, self.jump_penalty)
+        if not (least >= 0 and self.window_scale >= 1):
+            raise UserError(
+                "tracker: move_scale, smoothing_noise and jump_penalty must be 0 or more, "
+                "window_scale 1 or more"
+            )
         if not 0 <= self.lost_below <= self.found_above <= 1:
             raise UserError(
                 f"tracker: lost_below={self.lost_below} and found_above={self.found_above} must "
                 f"lie in [0, 1], the second no lower"
             )
-        if not (self.epsilon > 0 and self.cell > 0 and 0 < self.quantile < 1):
-            raise UserError("tracker: epsilon and cell must be above 0, quantile between 0 and 1")
+        if not (self.kld_epsilon > 0 and self.kld_cell > 0 and 0 < self.kld_quantile < 1):
+            raise UserError(
+                "tracker: kld_epsilon and kld_cell must be above 0, kld_quantile between 0 and 1"
+            )

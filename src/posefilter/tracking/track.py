@@ -148,16 +148,21 @@ class Track:
         drift = settings.motion.momentum * state.velocity
         expected = self.space.move(state.best, drift)
         draws = draw_predicted(
-            state.belief, state.velocity, settings.motion, effort.most, self.space, self.generator
+            state.belief,
+            state.velocity,
+            settings.motion,
+            effort.max_particles,
+            self.space,
+            self.generator,
         )
         draws = take_enough(
             draws,
             expected[0],
             self.space,
-            settings.cell,
-            settings.epsilon,
-            settings.quantile,
-            effort.least,
+            settings.kld_cell,
+            settings.kld_epsilon,
+            settings.kld_quantile,
+            effort.min_particles,
         )
         return State(make_particles(draws, 0), expected, state.velocity)
 
@@ -182,7 +187,7 @@ class Track:
         # what a window shows is the predicted belief's already
         proposals = effort.proposals if window is None else 0
         scene = self.method.encode(batch)
-        against = 0.0 if self.watch.lost else settings.jump
+        against = 0.0 if self.watch.lost else settings.jump_penalty
         glance = Glance(self.method, scene, effort.points, proposals, against)
         fit = QuadraticFit(settings.rounds, pixels=settings.fit_points)
         refine = fit if settings.rounds else NoRefine()
@@ -193,7 +198,7 @@ class Track:
             schedule=Geometric(effort.start, effort.stop),
             reweight=Annealed(),
             resample=Systematic(),
-            propagate=Gaussian(settings.walk),
+            propagate=Gaussian(settings.move_scale),
             estimate=ModeMean(_MODE),
             refine=refine,
         )
@@ -206,7 +211,7 @@ class Track:
             return predicted._replace(velocity=torch.zeros_like(predicted.velocity))
         if predicted is None or self.state is None or status != TRACKED:
             return begin(belief)
-        best = smooth(predicted.best, belief.best, self.space, self.settings.noise)
+        best = smooth(predicted.best, belief.best, self.space, self.settings.smoothing_noise)
         center = best.new_tensor(self.space.center)
         return begin(belief)._replace(
             best=best, velocity=twist_between(self.state.best, best, center)
@@ -220,7 +225,7 @@ class Track:
 
     @property
     def _whole_is_due(self) -> bool:
-        every = self.settings.look_around
+        every = self.settings.whole_image_every
         # what a window leaves in doubt the whole image may tell
         return not self.watch.sure or (every > 0 and (self.frames + self.turn) % every == 0)
 
@@ -236,8 +241,8 @@ class Track:
             images.intrinsics[0],
             (height, width),
             network_size(height, width, *self.size)[1] / width,
-            settings.side,
-            settings.reach,
+            settings.window_side,
+            settings.window_scale,
         )
 
     def _take(self, batch: Batch) -> Batch:

@@ -48,5 +48,5 @@ class Watch:
     @property
     def search_is_due(self) -> bool:
         """Whether the estimator's own filter is to search in the next frame."""
-        every = self.settings.full_every
+        every = self.settings.full_search_every
         return self.lost and every > 0 and (self.lost_for + self.turn) % every == every - 1
