@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from confidence import is_right
 from held_out import read_frames
 from marked import format_row, put_table
 
@@ -21,8 +22,6 @@ import posefilter
 from posefilter.cli.machine import keep_freed_memory
 from posefilter.confidence.verdicts import decide
 from posefilter.data.frames import Sample
-from posefilter.metrics.errors import add_up_to_symmetry
-from posefilter.result import Result
 from posefilter.weights import list_shipped
 
 PAGE = Path(__file__).parents[1] / "docs" / "belief.md"
@@ -33,14 +32,6 @@ HEAD += tuple(
     for factor in FACTORS[1:]
     for word in ("size, median", "probable and wrong", "noticed")
 )
-
-
-def is_right(result: Result, sample: Sample) -> bool:
-    """Return whether a pose is within 0.1 diameters (ADD, up to symmetry)."""
-    truth = torch.from_numpy(sample.camera_from_object).double()[None]
-    model = result.model
-    pose, symmetries = torch.from_numpy(result.pose)[None], model.symmetries.double()
-    return bool(add_up_to_symmetry(pose, truth, model.points, symmetries) < 0.1 * model.diameter)
 
 
 def ask(estimator: posefilter.Estimator, sample: Sample) -> list[dict[str, Any]] | None:

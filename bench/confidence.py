@@ -27,6 +27,7 @@ from posefilter.data.frames import FrameRecord, Reader, Sample
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
 from posefilter.metrics.errors import add_up_to_symmetry
+from posefilter.result import Result
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
 Spoil = Callable[[Sample, Sample], Inputs]  # of a photograph, and of one of another scene
@@ -88,6 +89,14 @@ def list_images(reader: Reader, every: int) -> list[list[int]]:
     return [own for many in scenes.values() for own in many[::every]]
 
 
+def is_right(result: Result, sample: Sample) -> bool:
+    """Return whether a pose is within 0.1 diameters (ADD, up to symmetry)."""
+    truth = torch.from_numpy(sample.camera_from_object).double()[None]
+    model = result.model
+    pose, symmetries = torch.from_numpy(result.pose)[None], model.symmetries.double()
+    return bool(add_up_to_symmetry(pose, truth, model.points, symmetries) < 0.1 * model.diameter)
+
+
 def look(
     estimator: posefilter.Estimator, reader: Reader, images: list[list[int]], spoil: str
 ) -> list[dict[str, Any]]:
@@ -112,11 +121,7 @@ def look(
             row |= {"probability": result.probability, "presence": result.presence}
             row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
             if result.object in there:
-                truth = torch.from_numpy(there[result.object].camera_from_object).double()[None]
-                pose, model = torch.from_numpy(result.pose)[None], result.model
-                symmetries = model.symmetries.double()
-                error = add_up_to_symmetry(pose, truth, model.points, symmetries)
-                row["right"] = bool(error < 0.1 * model.diameter)
+                row["right"] = is_right(result, there[result.object])
             rows.append(row)
             print(json.dumps(row), flush=True)
     return rows

@@ -193,20 +193,21 @@ class PosePF(PoseParticles):
         evidence = super().collect_evidence(trace, batch)
         if self.proposals is None:
             return evidence
-        scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
-        assert scene.coordinates is not None
-        assert scene.cells is not None
-        best = trace.belief.best
-        return evidence | measure_coordinates(best, scene.coordinates, scene.cells, self.model)
+        seen = self._seen(trace, batch)
+        return evidence | measure_coordinates(trace.belief.best, *seen, self.model)
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears by the proposal network; None without one."""
         if self.proposals is None:
             return None
+        return measure_apparent_size(trace.belief.best, *self._seen(trace, batch), self.model)
+
+    def _seen(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
+        """Return what the proposal network sees of the images of a finished run."""
         scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
         assert scene.coordinates is not None
         assert scene.cells is not None
-        return measure_apparent_size(trace.belief.best, scene.coordinates, scene.cells, self.model)
+        return scene.coordinates, scene.cells
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the networks too."""
