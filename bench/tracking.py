@@ -13,9 +13,10 @@ frames once more, of which six are replaced by those of another scene: how many 
 object, and after how many frames it is found again. Sequences are folders of generate.py with
 moving= and covered_frames=: there the losses are in the frames. With --together so many objects of
 a scene are tracked at once by one thread, by two that torch shares an operation's work out to, and
-by two that have an object each: in one process, by the clock, on an idle machine if the figures are
-to mean anything. Objects that a scene lacks are taken where it has too few, and are searched for in
-every frame. Writes the tables of docs/results/tracking.md.
+by two processes that have an object each: in turn, by the clock, on an idle machine if the figures
+are to mean anything. Of the processor's time it is the first process' share. Objects that a scene
+lacks are taken where it has too few, and are searched for in every frame. Writes the tables of
+docs/results/tracking.md.
 """
 
 import argparse
@@ -227,6 +228,7 @@ def measure_together(
                 continue
             torch.set_num_threads(threads)
             tracker = posefilter.Tracker(estimators, threads=side)
+            tracker.wait()
             answers[way] = []
             for n, frame in enumerate(frames):
                 start = time.perf_counter(), time.process_time()
@@ -234,6 +236,7 @@ def measure_together(
                 now = time.perf_counter(), time.process_time()
                 times[way, turn, n] = np.subtract(now, start)
                 answers[way].append(found)
+            tracker.close()
     for way, (title, _, _) in enumerate(WAYS):
         if not answers[way]:
             continue

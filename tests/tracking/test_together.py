@@ -1,17 +1,25 @@
 """Several objects tracked at once: they share a frame, take turns, and do not change each other."""
 
-from collections.abc import Iterator
+import os
+import signal
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from tests.tracking.toy import DEPTH, RGB, K, Toy, make_toy, walk_pose
+from tests.tracking.toy import DEPTH, RGB, K, SeeingToy, Toy, make_toy, walk_pose
+from torch import Tensor
 
 import posefilter
 from posefilter.errors import UserError
+from posefilter.estimator import Estimator
 from posefilter.images import Images
 from posefilter.tracking.frame import Frame
+from posefilter.tracking.processes import share_out
 from posefilter.tracking.settings import TrackerSettings
+from posefilter.types import Batch
 
 
 @pytest.fixture(autouse=True)
@@ -21,44 +29,115 @@ def _keep_threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def follow(threads: int | None, frames: int = 12) -> list[list[posefilter.TrackResult]]:
-    """Track three objects, of which the second goes away for a while."""
-    toys = [make_toy() for _ in range(3)]
-    tracker = posefilter.Tracker([estimator for _, estimator in toys], seed=3, threads=threads)
-    out = []
-    for number, pose in enumerate(walk_pose(frames)):
-        for k, (toy, _) in enumerate(toys):
-            toy.truth = None if k == 1 and 4 <= number < 8 else pose
-        out.append(tracker.update_all(RGB, DEPTH, K))
-    return out
+FRAMES = 12
+
+
+class Failing(SeeingToy):
+    """It fails at a frame, or ends its process there if that is not the one that it was made in."""
+
+    def __init__(self, poses: list[Tensor | None], number: int, error: Exception | None) -> None:
+        super().__init__(poses)
+        self.number, self.error, self.home = number, error, os.getpid()
+
+    def encode(self, batch: Batch) -> Any:
+        if round(255 * float(batch.rgb.mean())) == self.number:
+            if self.error is not None:
+                raise self.error
+            if os.getpid() != self.home:
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().encode(batch)
+
+
+def make_poses(away: range = range(0)) -> list[Tensor | None]:
+    """Return the poses of an object that is not there for a while."""
+    return [None if n in away else pose for n, pose in enumerate(walk_pose(FRAMES))]
+
+
+def make_tracker(toys: Sequence[Toy], threads: int | None = None) -> posefilter.Tracker:
+    tracker = posefilter.Tracker([Estimator([t], "cpu") for t in toys], seed=3, threads=threads)
+    tracker.wait()
+    return tracker
+
+
+def follow(
+    tracker: posefilter.Tracker, frames: Iterable[int] = range(FRAMES)
+) -> list[list[posefilter.TrackResult]]:
+    """Return what comes of frames, whose gray level is their number."""
+    return [tracker.update_all(np.full_like(RGB, number), DEPTH, K) for number in frames]
+
+
+def check_same(
+    before: list[list[posefilter.TrackResult]], after: list[list[posefilter.TrackResult]]
+) -> None:
+    for frame, other in zip(before, after, strict=True):
+        assert [one.status for one in other] == [one.status for one in frame]
+        for one, two in zip(frame, other, strict=True):
+            np.testing.assert_array_equal(two.pose, one.pose)
+            np.testing.assert_array_equal(two.belief.samples, one.belief.samples)
+            assert two.presence == one.presence
+            assert two.model.name == one.model.name
 
 
 @pytest.mark.parametrize("threads", [2, 3, 4])
 def test_objects_side_by_side_are_where_they_are_one_after_the_other(threads: int) -> None:
     torch.set_num_threads(1)
-    alone, together = follow(None), follow(threads)
-    for before, after in zip(alone, together, strict=True):
-        assert [one.status for one in after] == [one.status for one in before]
-        for one, other in zip(before, after, strict=True):
-            np.testing.assert_allclose(other.pose, one.pose, atol=1e-6)
-            assert other.presence == pytest.approx(one.presence, abs=1e-6)
+    toys = [SeeingToy(make_poses()), SeeingToy(make_poses(range(4, 8))), SeeingToy(make_poses())]
+    alone = follow(make_tracker(toys))
+    tracker = make_tracker(toys, threads)
+    together = follow(tracker)
+    check_same(alone, together)
     assert "lost" in {results[1].status for results in together}
     assert together[-1][1].found
+    tracker.reset()
+    check_same(alone, follow(tracker))
+    tracker.close()
+    tracker.reset()
+    check_same(alone, follow(tracker))
 
 
-def test_an_error_of_one_object_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    toys = [make_toy() for _ in range(2)]
-    for toy, _ in toys:
-        toy.truth = walk_pose(1)[0]
-    tracker = posefilter.Tracker([estimator for _, estimator in toys], threads=2)
-    tracker.update_all(RGB, DEPTH, K)
+def test_an_error_of_one_object_is_raised_and_the_others_go_on() -> None:
+    toys = [SeeingToy(make_poses()), Failing(make_poses(), 3, ValueError("no"))]
+    tracker = make_tracker(toys, 2)
+    follow(tracker, range(3))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no"):
+            follow(tracker, [3])
+    assert all(result.found for result in follow(tracker, [4])[0])
 
-    def fail(batch: object) -> None:
-        raise ValueError("no")
 
-    monkeypatch.setattr(toys[1][0], "encode", fail)
-    with pytest.raises(ValueError, match="no"):
-        tracker.update_all(RGB, DEPTH, K)
+def test_nothing_is_lost_with_a_process_that_ends() -> None:
+    toys = [Failing(make_poses(), 5, None) for _ in range(2)]
+    alone = follow(make_tracker(toys))
+    tracker = make_tracker(toys, 2)
+    check_same(alone[:5], follow(tracker, range(5)))
+    with pytest.warns(UserWarning, match="has ended"):
+        check_same(alone[5:6], follow(tracker, [5]))
+    check_same(alone[6:], follow(tracker, range(6, FRAMES)))
+
+
+def test_a_method_that_cannot_be_sent_is_refused() -> None:
+    toys = [SeeingToy(make_poses()) for _ in range(2)]
+    toys[1].told = lambda: None  # type: ignore[assignment]
+    with pytest.raises(UserError, match="threads=: toy, toy cannot be tracked in several"):
+        make_tracker(toys, 2)
+
+
+def test_a_process_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Here(SeeingToy):
+        """It is defined in a function, where no other process finds it."""
+
+    Here.__qualname__ = "Here"
+    with monkeypatch.context() as here:
+        here.setattr(sys.modules[__name__], "Here", Here, raising=False)
+        tracker = make_tracker([Here(make_poses()) for _ in range(2)], 2)
+    with pytest.raises(UserError, match="could not start"):
+        follow(tracker, [0])
+
+
+def test_work_is_shared_out_evenly() -> None:
+    assert share_out([1, 1, 1, 1], 2) == [[0, 2], [1, 3]]
+    assert share_out([1, 1, 8, 1.5], 2) == [[2], [3, 0, 1]]
+    assert share_out([1, 1], 1) == [[0, 1]]
 
 
 def test_objects_take_turns_to_see_the_whole_image() -> None:

@@ -1,6 +1,7 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ def follow(
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
     doubted: set[str] = set()  # objects whose size was said to be wrong: once is enough
-    with writer, recorder:
+    with closing(tracker), writer, recorder:
         for frame in video:
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
             writer.add(draw_frame(frame, results, shapes))

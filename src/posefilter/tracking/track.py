@@ -66,6 +66,15 @@ class State(NamedTuple):
     velocity: Tensor  # (1, 6) its motion in the last frame [m, rad]
 
 
+class Memory(NamedTuple):
+    """All that a track remembers, so that another process can go on with it."""
+
+    random: Tensor  # state of the generator
+    state: State | None
+    watch: Watch
+    frames: int
+
+
 class Sight(NamedTuple):
     """What one frame shows."""
 
@@ -115,13 +124,21 @@ class Track:
         self.frames = 0
 
     @property
-    def burden(self) -> int:
-        """What the next frame will cost: 3 for the filter as trained, 2 for a search, 1 for the
-        whole image, 0 for a window.
-        """
+    def memory(self) -> Memory:
+        """What the next frame depends on."""
+        return Memory(self.generator.get_state(), self.state, self.watch, self.frames)
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self.generator.set_state(memory.random)
+        self.state, self.watch, self.frames = memory[1:]
+
+    @property
+    def burden(self) -> float:
+        """About what the next frame will cost, in frames that are tracked in a window."""
         if self.state is None or self.watch.search_is_due:
-            return 3
-        return 2 if self.watch.lost else int(self._whole_is_due)
+            return 8.0
+        return 3.0 if self.watch.lost else 1.5 if self._whole_is_due else 1.0
 
     @torch.no_grad()
     def update(self, frame: Frame) -> TrackResult:

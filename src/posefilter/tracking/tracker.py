@@ -1,7 +1,6 @@
 """Objects followed through a video: `posefilter.Tracker`."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ from posefilter.errors import UserError
 from posefilter.estimator import Estimator, get_trained_size
 from posefilter.images import Images, check_images, check_intrinsics
 from posefilter.tracking.frame import Frame
+from posefilter.tracking.processes import SideBySide
 from posefilter.tracking.settings import TrackerSettings
 from posefilter.tracking.track import Track, TrackResult
 
@@ -34,15 +34,15 @@ class Tracker:
         estimator: What `posefilter.load` returns, for one object or several; or a list of these.
         settings: Of the tracker; None: the defaults.
         seed: Decides every random draw: the same frames and seed give the same answers.
-        threads: Threads to track with. Several objects are then tracked side by side, since two
-            objects on a thread each take less time than one after the other on two. What of them
-            remains an operation may use: that is set for the whole process, as
-            `torch.set_num_threads` does. None: one object after the other, on the threads that
-            torch uses anyway; so it is on a GPU, too.
+        threads: Cores to track on. Several objects are then tracked side by side, by this process
+            and others that it starts, an object each at a time. What of the cores remains an
+            operation may use: that is set for the whole process, as `torch.set_num_threads` does.
+            None: one object after the other, on the threads that torch uses anyway; so it is on a
+            GPU, too. The other processes end with `close`, with the tracker, or with this process.
 
     Raises:
         UserError: A method's particles are no poses, or it cannot score or propose poses; or
-            `threads` is no whole number, 1 or more.
+            `threads` is no whole number, 1 or more; or a method cannot be sent to a process.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Tracker:
             )
             for turn, method in enumerate(methods)
         )
-        self._pool = _open_pool(self.tracks, threads)
+        self._others = _open_processes(self.tracks, threads)
         self._size: tuple[int, ...] | None = None
 
     @property
@@ -97,12 +97,19 @@ class Tracker:
     def update_all(self, rgb: Any, depth: Any, intrinsics: Any) -> list[TrackResult]:
         """Find each object in the next frame; as `update`, but always a list."""
         frame = Frame(self._check(rgb, depth, intrinsics))
-        if self._pool is None:
-            return [track.update(frame) for track in self.tracks]
-        # the longest first, so that no thread is left with one at the end
-        order = sorted(self.tracks, key=lambda track: -track.burden)
-        coming = {id(track): self._pool.submit(track.update, frame) for track in order}
-        return [coming[id(track)].result() for track in self.tracks]
+        if self._others is not None:
+            return self._others.update(frame)
+        return [track.update(frame) for track in self.tracks]
+
+    def wait(self) -> None:
+        """Wait until the other processes have started. Until then this one tracks all objects."""
+        if self._others is not None:
+            self._others.wait()
+
+    def close(self) -> None:
+        """End the other processes. The tracker can still be used, without them."""
+        if self._others is not None:
+            self._others.close()
 
     def reset(self) -> None:
         """Forget all objects: the next frame is the first of another video."""
@@ -129,14 +136,14 @@ class Tracker:
         return images
 
 
-def _open_pool(tracks: Sequence[Track], threads: int | None) -> ThreadPoolExecutor | None:
-    """Return threads for objects side by side; None where there is nothing to share out."""
+def _open_processes(tracks: Sequence[Track], threads: int | None) -> SideBySide | None:
+    """Start processes for objects side by side; None where there is nothing to share out."""
     if threads is None:
         return None
     if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
         raise UserError(f"threads={threads}: a whole number is due, 1 or more")
     if any(track.method.device.type != "cpu" for track in tracks):
         return None
-    workers = min(threads, len(tracks))
-    torch.set_num_threads(threads // workers)
-    return None if workers == 1 else ThreadPoolExecutor(workers, "track")
+    processes = min(threads, len(tracks))
+    torch.set_num_threads(threads // processes)
+    return None if processes == 1 else SideBySide(tracks, processes, threads // processes)

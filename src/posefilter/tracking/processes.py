@@ -1,0 +1,205 @@
+"""Objects tracked side by side, by processes that have a core each.
+
+Threads of one process would wait for each other: a tracked frame is some thousand small operations,
+and between them Python runs one thread at a time.
+"""
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import warnings
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from posefilter.errors import UserError
+from posefilter.tracking.frame import Frame
+from posefilter.tracking.track import Track, TrackResult
+from posefilter.tracking.worker import Answer, Start, Task, restore
+
+# glibc is to keep what is freed for the tensors to come, instead of mapping each of them anew
+_MALLOC = {
+    "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1),
+    "MALLOC_TOP_PAD_": str(2**26),
+    "MALLOC_MMAP_THRESHOLD_": str(2**30),
+}
+
+
+class WorkerProcess:
+    """One other process; it starts in the background, and can be asked once it is `ready`.
+
+    Args:
+        content: A pickled `Start`.
+        threads: That an operation may use in it.
+    """
+
+    def __init__(self, content: bytes, threads: int) -> None:
+        paths = [path or str(Path.cwd()) for path in sys.path]
+        own = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": str(threads)}
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", "from posefilter.tracking.worker import main; main()"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=_MALLOC | dict(os.environ) | own,
+        )
+        self._error: Exception | None = None
+        self.close = weakref.finalize(self, _end, self._process)
+        self._starting = threading.Thread(target=self._start, args=(content,), daemon=True)
+        self._starting.start()
+
+    def _start(self, content: bytes) -> None:
+        try:
+            self._send(content)
+            self._error = self.receive()
+        except (OSError, ValueError, EOFError) as error:  # it has ended
+            self._error = error
+
+    def wait(self) -> None:
+        """Wait until it has started."""
+        self._starting.join()
+
+    @property
+    def ready(self) -> bool:
+        """Whether it can be asked.
+
+        Raises:
+            UserError: It could not start.
+        """
+        if self._starting.is_alive():
+            return False
+        if self._error is not None:
+            raise UserError(
+                f"threads=: a second process to track in could not start ({self._error!r}); "
+                "leave threads out to track in one"
+            )
+        return self._process.poll() is None
+
+    def ask(self, task: Task) -> bool:
+        """Give it something to do; tell whether it is still there."""
+        try:
+            self._send(pickle.dumps(task, pickle.HIGHEST_PROTOCOL))
+        except OSError:
+            return False
+        return True
+
+    def receive(self) -> Any:
+        """Return its next answer.
+
+        Raises:
+            EOFError: It has ended.
+        """
+        assert self._process.stdout is not None
+        try:
+            return pickle.load(self._process.stdout)
+        except pickle.UnpicklingError as error:  # it was ended while it wrote
+            raise EOFError from error
+
+    def _send(self, content: bytes) -> None:
+        assert self._process.stdin is not None
+        self._process.stdin.write(content)
+        self._process.stdin.flush()
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()  # it holds nothing that could be lost
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        assert pipe is not None
+        with contextlib.suppress(OSError):  # what was not sent is not needed any more
+            pipe.close()
+
+
+class SideBySide:
+    """Tracks that this process and others update, a share of them each.
+
+    What a track remembers goes to the process that updates it and comes back with the answer, so
+    that a frame's work can be shared out anew, and nothing is lost with a process. Until another
+    process has started, this one does all by itself.
+
+    Args:
+        tracks: What to update.
+        processes: How many there are, this one included; 2 or more.
+        threads: That an operation may use in each.
+
+    Raises:
+        UserError: A method cannot be sent to another process.
+    """
+
+    def __init__(self, tracks: Sequence[Track], processes: int, threads: int) -> None:
+        self.tracks = tuple(tracks)
+        try:
+            content = pickle.dumps(Start(self.tracks, threads), pickle.HIGHEST_PROTOCOL)
+        except Exception as error:  # what a method of one's own holds may be anything
+            names = ", ".join(track.method.model.name for track in tracks)
+            raise UserError(
+                f"threads=: {names} cannot be tracked in several processes, since a method cannot "
+                f"be pickled ({error}); leave threads out to track in one"
+            ) from error
+        self.workers = [WorkerProcess(content, threads) for _ in range(processes - 1)]
+
+    def update(self, frame: Frame) -> list[TrackResult]:
+        """Update all tracks with a frame."""
+        ready = [worker for worker in self.workers if worker.ready]
+        shares = share_out([track.burden for track in self.tracks], len(ready) + 1)
+        out: dict[int, TrackResult] = {}
+        asked = []
+        for worker, share in zip(ready, shares[1:], strict=True):
+            memories = {i: self.tracks[i].memory for i in share}
+            if worker.ask(Task(frame.images, memories)):
+                asked.append((worker, share))
+        left = set(range(len(self.tracks))) - {i for _, share in asked for i in share}
+        error: Exception | None = None
+        try:
+            out |= {i: self.tracks[i].update(frame) for i in sorted(left)}
+        finally:  # an answer that is left unread would be taken for the next frame's
+            for worker, share in asked:
+                try:
+                    answers = worker.receive()
+                except EOFError:
+                    continue
+                if isinstance(answers, Exception):
+                    error = answers
+                    continue
+                out |= self._restore(share, answers)
+        if error is not None:
+            raise error
+        missing = set(range(len(self.tracks))) - set(out)
+        if missing:
+            warnings.warn(
+                "a process that tracked objects has ended, perhaps for want of memory; "
+                "the others go on with its share",
+                stacklevel=2,
+            )
+            out |= {i: self.tracks[i].update(frame) for i in sorted(missing)}
+        return [out[i] for i in range(len(self.tracks))]
+
+    def _restore(self, share: Sequence[int], answers: list[Answer]) -> dict[int, TrackResult]:
+        return {i: restore(self.tracks[i], x) for i, x in zip(share, answers, strict=True)}
+
+    def wait(self) -> None:
+        """Wait until all processes have started."""
+        for worker in self.workers:
+            worker.wait()
+
+    def close(self) -> None:
+        """End the other processes."""
+        for worker in self.workers:
+            worker.close()
+        self.workers = []
+
+
+def share_out(burdens: Sequence[float], processes: int) -> list[list[int]]:
+    """Return which of the tracks each process updates: the longest first, each to the process
+    that has the least to do (Graham 1969).
+    """
+    loads = [0.0] * processes
+    shares: list[list[int]] = [[] for _ in range(processes)]
+    for i in sorted(range(len(burdens)), key=lambda i: -burdens[i]):
+        least = loads.index(min(loads))
+        loads[least] += burdens[i]
+        shares[least].append(i)
+    return shares

@@ -1,0 +1,83 @@
+"""A process that tracks objects for another one.
+
+`main` reads pickles from its standard input and answers on its standard output, both pipes of the
+process that started it (`posefilter.tracking.processes`). First comes a `Start`, which it answers
+with None; then a `Task` for each frame, which it answers with a list of `Answer`. In place of an
+answer it sends the exception that came instead. It ends when its input does.
+"""
+
+import os
+import pickle
+import signal
+import sys
+from typing import Any, NamedTuple
+
+import torch
+
+from posefilter.images import Images
+from posefilter.tracking.frame import Frame
+from posefilter.tracking.track import Memory, Track, TrackResult
+
+
+class Start(NamedTuple):
+    """What a process needs once."""
+
+    tracks: tuple[Track, ...]
+    threads: int  # that an operation may use
+
+
+class Task(NamedTuple):
+    """What it is to do in one frame."""
+
+    images: Images
+    memories: dict[int, Memory]  # of the tracks that it is to update, by their number
+
+
+class Answer(NamedTuple):
+    """What became of one track."""
+
+    memory: Memory
+    result: dict[str, Any]  # the attributes of a `TrackResult`, without its model
+
+
+def update(track: Track, memory: Memory, frame: Frame) -> Answer:
+    """Update a track that was elsewhere in the last frame."""
+    track.memory = memory
+    content = vars(track.update(frame))
+    return Answer(track.memory, {key: x for key, x in content.items() if key != "model"})
+
+
+def restore(track: Track, answer: Answer) -> TrackResult:
+    """Take over what another process made of a track."""
+    track.memory = answer.memory
+    return TrackResult(**answer.result, model=track.method.model)
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides what Ctrl-C ends
+    # what is printed here must not end up between the answers
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    tracks: tuple[Track, ...] = ()
+    while True:
+        answer: Any
+        try:
+            given = pickle.load(sys.stdin.buffer)
+            if isinstance(given, Start):
+                torch.set_num_threads(given.threads)
+                tracks, answer = given.tracks, None
+            else:
+                frame = Frame(given.images)
+                memories = given.memories.items()
+                answer = [update(tracks[i], memory, frame) for i, memory in memories]
+        except EOFError:
+            return
+        except Exception as error:
+            answer = error
+        try:
+            content = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
+        except Exception:  # an exception may hold anything
+            content = pickle.dumps(RuntimeError(f"{type(answer).__name__}: {answer}"))
+        answers.write(content)
+        answers.flush()
