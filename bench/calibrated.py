@@ -92,25 +92,25 @@ def look(
     seen = Batch(*hide_annotation(batch))
     with torch.no_grad():
         trace = method.predict_step(seen, number)
-        evidence = method.collect_evidence(trace, seen)
-    found = calibration.assess(evidence)
+        values = method.collect_features(trace, seen)
+    found = calibration.assess(values)
     right = is_right(method, trace.belief.best, batch.camera_from_object)
     truths = score_truth(trace.belief, batch.camera_from_object, model) if there else None
     shown = measure_shown(batch, model.points[:: max(1, len(model.points) // 500)])
     for i in range(len(batch.rgb)):
         row: Row = {"object": model.name, "there": there, "right": there and bool(right[i])}
         row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
-        row |= {"scene": scenes[i], "evidence": {k: float(v[i]) for k, v in evidence.items()}}
+        row |= {"scene": scenes[i], "features": {k: float(v[i]) for k, v in values.items()}}
         if truths is not None:
             row |= {"visibility": float(batch.visibility[i]), "shown": float(shown[i])}
             row |= {"rank": float(truths.rank[i]), "log_density": float(truths.log_density[i])}
             sets = calibration.conformal
             assert sets is not None
             by_surface = sets.by == "surface"
-            value = float(evidence["surface"][i]) if by_surface else row["probability"]
-            surprise = float(truths.surprise[i])
-            row["surprise"] = surprise
-            row["held"] = [surprise <= sets.find_limit(level / 100, value) for level in SHOWN]
+            value = float(values["surface"][i]) if by_surface else row["probability"]
+            nonconformity = float(truths.nonconformity[i])
+            row["nonconformity"] = nonconformity
+            row["held"] = [nonconformity <= sets.find_limit(level / 100, value) for level in SHOWN]
             weights = trace.belief.log_weights[i].double().softmax(0).numpy()
             one = Batch(*(part[i : i + 1] for part in batch))
             belief, truth = trace.belief.poses[i].double().numpy(), batch.camera_from_object[i]
@@ -181,24 +181,24 @@ def judge_across(
             both = [learned[frames.there[learned] == there][:most] for there in (True, False)]
             made = fit_calibration(frames.select(np.concatenate(both)), "fat")
             held = np.flatnonzero(part == k)
-            found = made.assess_features(torch.from_numpy(frames.evidence[held]))
+            found = made.assess_features(torch.from_numpy(frames.values[held]))
             assert made.conformal is not None
             for i, presence, probability in zip(held, *(x.tolist() for x in found), strict=True):
                 row = own[i] | {"presence": presence, "probability": probability}
                 if row["there"]:
                     limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
-                    row["held"] = [row["surprise"] <= limit for limit in limits]
+                    row["held"] = [row["nonconformity"] <= limit for limit in limits]
                 out.append(row)
     return out
 
 
 def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     """Return rows of one object as calibration frames, without some witnesses."""
-    names = tuple(name for name in rows[0]["evidence"] if name not in leave_out)
-    evidence = np.array([[row["evidence"][name] for name in names] for row in rows])
+    names = tuple(name for name in rows[0]["features"] if name not in leave_out)
+    values = np.array([[row["features"][name] for name in names] for row in rows])
     there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
-    surprise = np.array([row.get("surprise", np.nan) for row in rows])
-    return Frames(names, evidence, there, right, surprise)
+    nonconformity = np.array([row.get("nonconformity", np.nan) for row in rows])
+    return Frames(names, values, there, right, nonconformity)
 
 
 def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -154,8 +154,8 @@ class Estimator:
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
                 if method.calibration is not None:
-                    evidence = method.collect_evidence(trace, batch)
-                    found, surface = method.calibration.assess(evidence), evidence["surface"]
+                    features = method.collect_features(trace, batch)
+                    found, surface = method.calibration.assess(features), features["surface"]
                 apparent = method.measure_apparent_size(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)

@@ -215,7 +215,7 @@ class Run(NamedTuple):
     trace: Trace
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
-    surface: torch.Tensor | None = None  # (B,) evidence; None where there is no probability
+    surface: torch.Tensor | None = None  # (B,) the feature; None where there is no probability
     size: ApparentSize | None = None  # None where the method cannot tell
 
 

@@ -87,9 +87,11 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
     for i in range(300):
         there, scene = i % 2 == 0, f"scene{i // 6}"
         seen = {"coordinates": float(rng.normal(2.0 * there)), "score": float(rng.normal())}
-        own = row(there, 0.5, there and seen["coordinates"] > 1.5, scene=scene, evidence=seen)
-        # of one scene every truth surprises: its own calibration would hold it
-        own |= {"surprise": 100.0 if scene == "scene3" else float(rng.normal())} if there else {}
+        own = row(there, 0.5, there and seen["coordinates"] > 1.5, scene=scene, features=seen)
+        # of one scene no truth conforms: its own calibration would hold it
+        own |= (
+            {"nonconformity": 100.0 if scene == "scene3" else float(rng.normal())} if there else {}
+        )
         rows.append(own)
     judged = bench.judge_across(rows)
     assert len(judged) == len(rows)

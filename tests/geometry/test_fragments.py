@@ -67,6 +67,6 @@ def test_errors_of_a_prediction_by_hand() -> None:
     position = truth[:, :, None] + torch.tensor(
         [[0.01, 0.02, -0.03], [0.0, -0.2, 0.1], [1.0, 1.0, 1.0]]
     )
-    surprise, error = fragment_errors(share.log()[None], position, CENTERS, 0.5, truth)
-    assert surprise[0].tolist() == pytest.approx([-math.log(p) for p in (0.5, 0.7, 0.2, 0.5)])
+    nll, error = fragment_errors(share.log()[None], position, CENTERS, 0.5, truth)
+    assert nll[0].tolist() == pytest.approx([-math.log(p) for p in (0.5, 0.7, 0.2, 0.5)])
     assert error[0].tolist() == pytest.approx([0.12, 0.6, 0.12, 0.6])

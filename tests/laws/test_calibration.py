@@ -1,4 +1,4 @@
-"""A calibration recovers the model that made the labels, and rises with the evidence."""
+"""A calibration recovers the model that made the labels, and rises with each feature."""
 
 import numpy as np
 import pytest
@@ -49,8 +49,8 @@ def test_what_speaks_against_its_own_meaning_is_not_used() -> None:
 
 def test_both_probabilities_are_those_that_made_the_labels() -> None:
     frames = draw(20_000)
-    found = fit_calibration(frames, "scenes").assess_features(torch.from_numpy(frames.evidence))
-    x = frames.evidence
+    found = fit_calibration(frames, "scenes").assess_features(torch.from_numpy(frames.values))
+    x = frames.values
     presence = sigmoid(2 * x[:, 1])
     inside = (np.abs(x) < LIMIT).all(1)
     gap = np.abs(found.presence.numpy() - presence)[inside]
@@ -65,7 +65,7 @@ def test_both_probabilities_are_those_that_made_the_labels() -> None:
     assert float(calibration_error(held.probability, right)) < 0.025
 
 
-def test_more_evidence_never_lowers_a_probability() -> None:
+def test_more_of_a_feature_never_lowers_a_probability() -> None:
     calibration = fit_calibration(draw(300), "scenes")
     base = torch.randn(50, 3, dtype=torch.float64)
     before = calibration.assess_features(base)
@@ -78,7 +78,7 @@ def test_more_evidence_never_lowers_a_probability() -> None:
         assert bool((after.probability >= before.probability).all())
 
 
-def test_evidence_beyond_the_calibration_counts_as_its_edge_and_none_as_the_worst() -> None:
+def test_features_beyond_the_calibration_counts_as_its_edge_and_none_as_the_worst() -> None:
     calibration = fit_calibration(draw(300), "scenes")
     edge = torch.tensor(calibration.center) + LIMIT * torch.tensor(calibration.scale)
     rows = torch.stack([edge, 100 * edge.abs() + 100, torch.full((3,), torch.nan)]).double()
@@ -127,7 +127,7 @@ def test_a_verdict_costs_least(
 def test_verdicts_lower_the_cost_that_is_paid() -> None:
     frames = draw(4000, seed=5)
     found = fit_calibration(draw(4000, seed=6), "scenes").assess_features(
-        torch.from_numpy(frames.evidence)
+        torch.from_numpy(frames.values)
     )
     costs = Costs(10, 5, 1)
     right, there = torch.from_numpy(frames.right), torch.from_numpy(frames.there)

@@ -28,10 +28,10 @@ def test_coverage_on_exchangeable_frames_is_at_least_the_level_and_hardly_more(
     for _ in range(3000):
         surface = rng.random(2 * count + 1)
         # of the second group a belief is far too sure, of the first too wide
-        surprise = rng.standard_t(3, size=2 * count + 1) * np.where(surface < 0.25, 1, 50)
-        found = fit_conformal(surprise[1:], surface[1:])
+        nonconformity = rng.standard_t(3, size=2 * count + 1) * np.where(surface < 0.25, 1, 50)
+        found = fit_conformal(nonconformity[1:], surface[1:])
         limit = found.find_limit(level, surface[0])
-        covered[found.find_group(surface[0])].append(bool(surprise[0] <= limit))
+        covered[found.find_group(surface[0])].append(bool(nonconformity[0] <= limit))
     for own in covered:
         error = math.sqrt(0.25 / len(own))
         assert level - 3 * error < np.mean(own)
@@ -73,8 +73,8 @@ def test_ranks_are_uniform_where_beliefs_are_right_and_high_where_they_are_vain(
     assert float(right.rank.mean()) == pytest.approx(0.5, abs=0.14)
     assert float((right.rank < 0.8).double().mean()) == pytest.approx(0.8, abs=0.15)
     assert float(vain.rank.mean()) > 0.9
-    assert float(right.surprise.mean()) == pytest.approx(0, abs=0.8)
-    assert float(vain.surprise.mean()) > 5
+    assert float(right.nonconformity.mean()) == pytest.approx(0, abs=0.8)
+    assert float(vain.nonconformity.mean()) > 5
     assert float(right.log_density.mean()) > float(vain.log_density.mean())
     turn = torch.diag(torch.tensor([-1.0, -1, 1, 1]))
     belief, truth = draw_beliefs(1.0, 3)
@@ -109,23 +109,23 @@ def test_coverage_is_counted_by_quarter_of_visibility() -> None:
 def frames(count: int = 60) -> Frames:
     rng = np.random.default_rng(3)
     there = np.arange(count) < count // 2
-    surprise = np.where(there, rng.normal(size=count), np.nan)
+    nonconformity = np.where(there, rng.normal(size=count), np.nan)
     return Frames(
         ("surface", "score"),
         rng.random((count, 2)),
         there,
         there & (rng.random(count) < 0.5),
-        surprise,
+        nonconformity,
     )
 
 
-def test_a_calibration_carries_the_surprises_of_the_frames_with_the_object() -> None:
+def test_a_calibration_carries_the_scores_of_the_frames_with_the_object() -> None:
     made = fit_calibration(frames(), "scenes")
     assert made.conformal is not None
     own = frames()
-    assert sum(made.conformal.surprises, ()) != ()
-    together = sorted(x for group in made.conformal.surprises for x in group)
-    assert together == sorted(own.surprise[own.there].tolist())  # type: ignore[index]
+    assert sum(made.conformal.scores, ()) != ()
+    together = sorted(x for group in made.conformal.scores for x in group)
+    assert together == sorted(own.nonconformity[own.there].tolist())  # type: ignore[index]
     assert read_calibration(made.to_plain(), "x") == made
     earlier = made.to_plain()
     del earlier["conformal"]
@@ -140,14 +140,14 @@ def test_what_an_earlier_version_stored_is_grouped_by_surface() -> None:
 
 
 def draw_hard_and_easy(count: int, rng: np.random.Generator) -> tuple[Frames, np.ndarray]:
-    """Draw frames whose truths surprise the more the less is seen, which is a hidden number."""
+    """Draw frames whose truths conform the less the less is seen, which is a hidden number."""
     seen = rng.random(count)
     there = rng.random(count) < 0.6
-    evidence = np.stack([seen + 0.1 * rng.normal(size=count), rng.normal(size=count)], 1)
+    values = np.stack([seen + 0.1 * rng.normal(size=count), rng.normal(size=count)], 1)
     right = there & (rng.random(count) < 1 / (1 + np.exp(-12 * (seen - 0.4))))
     scale = np.where(seen < 0.4, 8.0, 1.0)
-    surprise = np.where(there, scale * rng.standard_t(4, size=count), np.nan)
-    return Frames(("coordinates", "score"), evidence, there, right, surprise), seen
+    nonconformity = np.where(there, scale * rng.standard_t(4, size=count), np.nan)
+    return Frames(("coordinates", "score"), values, there, right, nonconformity), seen
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
@@ -160,14 +160,14 @@ def test_groups_by_probability_cover_the_hard_frames_as_often_as_the_easy_ones(
         made = fit_calibration(draw_hard_and_easy(650, rng)[0], "scenes")
         assert made.conformal is not None
         assert made.conformal.by == "probability"
-        assert len(made.conformal.surprises) == 5
-        assert all(30 < len(own) < 150 for own in made.conformal.surprises)
+        assert len(made.conformal.scores) == 5
+        assert all(30 < len(own) < 150 for own in made.conformal.scores)
         new, seen = draw_hard_and_easy(2000, rng)
         own = new.there
-        assert new.surprise is not None
-        probability = made.assess_features(torch.from_numpy(new.evidence[own])).probability
+        assert new.nonconformity is not None
+        probability = made.assess_features(torch.from_numpy(new.values[own])).probability
         limit = [made.conformal.find_limit(level, float(p)) for p in probability]
-        inside = new.surprise[own] <= np.array(limit)
+        inside = new.nonconformity[own] <= np.array(limit)
         held["hard"].append(inside[seen[own] < 0.3])
         held["easy"].append(inside[seen[own] > 0.6])
     share = {name: float(np.concatenate(rows).mean()) for name, rows in held.items()}
@@ -188,18 +188,18 @@ def test_few_frames_are_one_group() -> None:
     [
         [],
         {"edges": [0.25]},
-        {"edges": [], "surprises": [[1.0], [2.0]]},
-        {"edges": [0.25], "surprises": [[2.0, 1.0], []]},
-        {"edges": [0.25], "surprises": [[float("nan")], []]},
-        {"edges": [0.25], "surprises": [["1"], []]},
-        {"edges": [0.25, 0.2], "surprises": [[], [], []]},
-        {"edges": [0.1] * 40, "surprises": [[]] * 41},
-        {"edges": [], "surprises": [[1.0]], "by": "score"},
-        {"edges": [], "surprises": [[1.0]], "by": []},
-        {"edges": [], "surprises": [[1.0]], "more": 1},
+        {"edges": [], "scores": [[1.0], [2.0]]},
+        {"edges": [0.25], "scores": [[2.0, 1.0], []]},
+        {"edges": [0.25], "scores": [[float("nan")], []]},
+        {"edges": [0.25], "scores": [["1"], []]},
+        {"edges": [0.25, 0.2], "scores": [[], [], []]},
+        {"edges": [0.1] * 40, "scores": [[]] * 41},
+        {"edges": [], "scores": [[1.0]], "by": "score"},
+        {"edges": [], "scores": [[1.0]], "by": []},
+        {"edges": [], "scores": [[1.0]], "more": 1},
     ],
 )
-def test_surprises_that_are_none_are_refused(wrong: object) -> None:
+def test_scores_that_are_none_are_refused(wrong: object) -> None:
     content = fit_calibration(frames(), "scenes").to_plain() | {"conformal": wrong}
     with pytest.raises(UserError, match="checkpoint=x: its calibration"):
         read_calibration(content, "checkpoint=x")

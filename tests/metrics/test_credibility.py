@@ -88,9 +88,9 @@ def test_scores_by_the_density_itself() -> None:
     )
     torch.testing.assert_close(scores.log_density, log_density(density, truth.double()))
     # the mean log density of the belief is the same, whatever the truth is
-    means = scores.surprise + scores.log_density
+    means = scores.nonconformity + scores.log_density
     assert float(means[0]) == pytest.approx(float(means[1]))
-    assert float(scores.surprise[0]) < 0 < float(scores.surprise[1])
+    assert float(scores.nonconformity[0]) < 0 < float(scores.nonconformity[1])
     assert all(x.dtype == torch.float64 and x.shape == (2,) for x in scores)
     none = score_truth(Belief(*(x[:0] for x in belief)), truth[:0], square())
     assert [x.shape for x in none] == [(0,)] * 3

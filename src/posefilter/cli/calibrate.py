@@ -105,7 +105,7 @@ def collect_frames(
         absent: Frames without.
         shown: Draw a bar.
     """
-    evidence, there, right, surprise = [], [], [], []
+    values, there, right, scores = [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     batches = [
         (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
@@ -115,12 +115,14 @@ def collect_frames(
         seen = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
         with torch.no_grad():
             trace = method.predict_step(seen, number)
-            evidence.append(method.collect_evidence(trace, seen))
+            values.append(method.collect_features(trace, seen))
         there.append(np.full(len(truth), is_there))
         right.append(is_there & is_right(method, trace.belief.best.cpu(), truth).numpy())
-        own = score_truth(trace.belief, truth, method.model).surprise.numpy() if is_there else None
-        surprise.append(np.full(len(truth), np.nan) if own is None else own)
-    return make_frames(evidence, there, right, surprise)
+        own = np.full(len(truth), np.nan)
+        if is_there:
+            own = score_truth(trace.belief, truth, method.model).nonconformity.numpy()
+        scores.append(own)
+    return make_frames(values, there, right, scores)
 
 
 def is_right(method: PoseEstimator, best: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -156,7 +158,7 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
         ("frames without", str(counts["absent"])),
     ]
     if calibration.conformal is not None:
-        shown = " and ".join(str(len(own)) for own in calibration.conformal.surprises)
+        shown = " and ".join(str(len(own)) for own in calibration.conformal.scores)
         rows.append(("groups of those with it, by rising probability", shown))
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]

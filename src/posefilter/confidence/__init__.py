@@ -1,1 +1,1 @@
-"""Whether the object is there and its pose right: evidence, a calibrated probability, a verdict."""
+"""Whether the object is there and its pose right: features, a calibrated probability, a verdict."""

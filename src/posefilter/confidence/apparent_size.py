@@ -24,7 +24,7 @@ _OUTLIER = -6.0  # log-likelihood of a cell, below which it is another thing's
 _CELLS = 64  # at most, spread over the object
 _FEWEST = 8  # cells, below which nothing is said
 _TOLERANCE = math.log(1.12)  # of the scale, which the network's own errors reach
-_EVIDENCE = 8.0  # of the gain: it counts cells as independent, which neighbors are not
+_LEAST_GAIN = 8.0  # of the gain: it counts cells as independent, which neighbors are not
 _EXPLAINED = 0.5  # share, below which the network and the estimate do not tell of one object
 
 
@@ -38,7 +38,7 @@ class ApparentSize(NamedTuple):
     def contradicts(self) -> Tensor:
         """Return of which images the inputs cannot be right, (B,) bool."""
         off = self.scale.log().abs() > _TOLERANCE  # not of nan
-        return off & (self.gain > _EVIDENCE) & (self.explained > _EXPLAINED)
+        return off & (self.gain > _LEAST_GAIN) & (self.explained > _EXPLAINED)
 
 
 def measure_apparent_size(

@@ -1,10 +1,10 @@
-"""The calibrated probability: two logistic regressions on the evidence of a finished filter.
+"""The calibrated probability: two logistic regressions on features of a finished filter.
 
 presence    = sigmoid(a . x + b)                that the object is in the image
 probability = presence * sigmoid(c . x + d)     that it is, and the pose within 0.1 diameters
 
-x is the evidence, standardized by the calibration frames and limited to `LIMIT` standard deviations
-on either side: what lies beyond what calibration saw counts as its edge. Each kind of evidence is
+x are the features, standardized by the calibration frames and limited to `LIMIT` standard deviations
+on either side: what lies beyond what calibration saw counts as its edge. Each feature is
 such that more of it speaks for the estimate, and a, c >= 0: so both probabilities rise with each.
 """
 
@@ -22,12 +22,12 @@ from posefilter.errors import UserError
 LIMIT = 3.0  # standard deviations
 COUNTS = ("right", "wrong", "absent")
 _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
-_MOST_GROUPS, _MOST_SURPRISES = 16, 100_000
+_MOST_GROUPS, _MOST_SCORES = 16, 100_000
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
 class Logistic(NamedTuple):
-    """A logistic regression on standardized evidence."""
+    """A logistic regression on standardized features."""
 
     weights: tuple[float, ...]  # >= 0
     bias: float
@@ -42,10 +42,10 @@ class Assessment(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What turns evidence into probabilities; plain data, carried in a checkpoint.
+    """What turns features into probabilities; plain data, carried in a checkpoint.
 
     Attributes:
-        features: The names of the evidence.
+        features: Their names.
         center: Its mean over the calibration frames.
         scale: Its standard deviation there, above 0.
         presence: Whether the object is there.
@@ -66,28 +66,28 @@ class Calibration:
     quality: Mapping[str, float]
     conformal: Conformal | None = None
 
-    def assess(self, evidence: Mapping[str, Tensor]) -> Assessment:
+    def assess(self, values: Mapping[str, Tensor]) -> Assessment:
         """Return the probabilities of estimates.
 
         Args:
-            evidence: (B,) by name; more than the calibration uses does no harm.
+            values: Features (B,) by name; more than the calibration uses does no harm.
 
         Raises:
-            UserError: The method gives no evidence of a name that the calibration uses.
+            UserError: The method has no feature of a name that the calibration uses.
         """
-        missing = [name for name in self.features if name not in evidence]
+        missing = [name for name in self.features if name not in values]
         if missing:
             raise UserError(
-                f"calibration: is of another method, whose evidence has {missing[0]}; calibrate "
+                f"calibration: is of another method, whose features have {missing[0]}; calibrate "
                 "the checkpoint again"
             )
-        x = torch.stack([evidence[name].detach().double().cpu() for name in self.features], dim=-1)
+        x = torch.stack([values[name].detach().double().cpu() for name in self.features], dim=-1)
         return self.assess_features(x)
 
     def assess_features(self, x: Tensor) -> Assessment:
-        """Return the probabilities of evidence (B, F), in the order of `features`.
+        """Return the probabilities of features (B, F), in the order of `features`.
 
-        Evidence that is not a number speaks against the estimate as far as any can.
+        A feature that is not a number speaks against the estimate as far as any can.
         """
         x = (x - x.new_tensor(self.center)) / x.new_tensor(self.scale)
         x = x.nan_to_num(-LIMIT).clamp(-LIMIT, LIMIT)
@@ -104,9 +104,9 @@ class Calibration:
             one: Logistic = getattr(self, name)
             plain[name] = {"weights": list(one.weights), "bias": one.bias}
         if self.conformal is not None:
-            surprises = [list(own) for own in self.conformal.surprises]
+            scores = [list(own) for own in self.conformal.scores]
             edges, by = list(self.conformal.edges), self.conformal.by
-            plain["conformal"] = {"by": by, "edges": edges, "surprises": surprises}
+            plain["conformal"] = {"by": by, "edges": edges, "scores": scores}
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
@@ -177,20 +177,22 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
 def _conformal(content: Any) -> Conformal | None:
     if content is None:
         return None
-    if not isinstance(content, dict) or set(content) - {"by"} != {"edges", "surprises"}:
-        raise ValueError("should have edges and surprises in conformal")
+    if isinstance(content, dict) and "surprises" in content:  # the name in earlier versions
+        content = {"scores" if key == "surprises" else key: x for key, x in content.items()}
+    if not isinstance(content, dict) or set(content) - {"by"} != {"edges", "scores"}:
+        raise ValueError("should have edges and scores in conformal")
     by = content.get("by", "surface")  # earlier versions name none
     if by not in GROUPED_BY:
         raise ValueError(f"should group conformal by {' or '.join(GROUPED_BY)}")
-    groups = content["surprises"]
+    groups = content["scores"]
     if not isinstance(groups, list) or not 1 <= len(groups) <= _MOST_GROUPS:
         raise ValueError(f"should have 1 to {_MOST_GROUPS} groups in conformal")
     edges = _numbers(content["edges"], len(groups) - 1, "conformal's edges")
     read = []
     for one in groups:
-        if not isinstance(one, list) or len(one) > _MOST_SURPRISES:
+        if not isinstance(one, list) or len(one) > _MOST_SCORES:
             raise ValueError("has a group of conformal that is none")
-        read.append(_numbers(one, len(one), "conformal's surprises"))
+        read.append(_numbers(one, len(one), "conformal's scores"))
     if any(list(one) != sorted(one) for one in [edges, *read]):
         raise ValueError("has numbers of conformal that do not rise")
     return Conformal(edges, tuple(read), by)

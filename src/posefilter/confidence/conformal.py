@@ -1,19 +1,19 @@
 """Sets of poses with a guaranteed coverage: split conformal prediction, by group.
 
-The surprise of a pose is the mean log density of the belief's own particles, less the log density
-at that pose.  Of n calibration frames of a group, with their truths' surprises in rising order, the
-set of level p of a new frame holds every pose whose surprise is at most the ceil(p (n + 1))-th; if
+The nonconformity score of a pose is the mean log density of the belief's own particles, less the
+log density at that pose.  Of n calibration frames of a group, with their truths' scores in rising order, the
+set of level p of a new frame holds every pose whose score is at most the ceil(p (n + 1))-th; if
 there are fewer, it holds every pose.  Where the new frame and the calibration frames of its group
 are exchangeable, the set holds the truth with a probability of at least p, whatever the belief is
 worth (Vovk et al. 2005; by group: Mondrian conformal prediction).
 
 The groups are told apart by the calibrated probability, at the quantiles of the calibration frames.
-A belief that is likely to be wrong is far more surprised by the truth than one that is likely to be
+A belief that is likely to be wrong gives the truth a far higher score than one that is likely to be
 right, so that one limit for all would cover too much of the sure ones and too little of the others.
 The probability of a calibration frame is that of a regression that has not seen it, as new frames
 are not seen either (cross-conformal prediction, Vovk 2015).  It is still not of quite the same
 regression, so that the guarantee holds nearly, not exactly: see docs/belief.md for what was
-measured.  Calibrations of before have two groups, by the evidence `surface` at a fixed limit.
+measured.  Calibrations of before have two groups, by the feature `surface` at a fixed limit.
 
 References:
     Vovk, Gammerman, Shafer: Algorithmic Learning in a Random World. Springer (2005).
@@ -34,40 +34,40 @@ _FEWEST = 20  # frames of a group: with as many, a set of 95 % is not that of al
 # of the frames, below each limit between groups: the surest are much alike, the others are not
 _SHARES = (0.1, 0.25, 0.45, 0.7)
 _EVEN = 4  # groups at most where frames are too few for these
-# of the evidence `surface`: about half of an object's surface faces the camera, so that below a
+# of the feature `surface`: about half of an object's surface faces the camera, so that below a
 # quarter the depth shows less than half of what could be seen
 EDGES = (0.25,)
 
 
 @dataclass(frozen=True)
 class Conformal:
-    """The surprises of calibration frames, by group; plain data, carried in a calibration.
+    """The nonconformity scores of calibration frames, by group; plain data, carried in a calibration.
 
     Attributes:
-        edges: Limits between groups, of the evidence `surface` or of the probability, rising.
-        surprises: Of each group, in rising order [nat]; one group more than there are edges.
+        edges: Limits between groups, of the feature `surface` or of the probability, rising.
+        scores: Of each group, in rising order [nat]; one group more than there are edges.
         by: What the groups are told apart by.
     """
 
     edges: tuple[float, ...]
-    surprises: tuple[tuple[float, ...], ...]
+    scores: tuple[tuple[float, ...], ...]
     by: By = "surface"
 
     def find_group(self, value: float) -> int:
-        """Return the group of a frame by its evidence or probability; NaN is in the first."""
+        """Return the group of a frame by its feature or probability; NaN is in the first."""
         return 0 if math.isnan(value) else bisect.bisect_right(self.edges, value)
 
     def find_limit(self, level: float, value: float) -> float:
-        """Return the largest surprise of a pose that is in a set.
+        """Return the largest score of a pose that is in a set.
 
         Args:
             level: Least probability that the set holds the truth.
-            value: Of the frame: its probability, or its evidence `surface`; see `by`.
+            value: Of the frame: its probability, or its feature `surface`; see `by`.
 
         Returns:
             The limit [nat]; infinite where the group's frames are too few for the level.
         """
-        own = self.surprises[self.find_group(value)]
+        own = self.scores[self.find_group(value)]
         rank = math.ceil(round(level * (len(own) + 1), 9))
         return math.inf if rank > len(own) else own[max(rank, 1) - 1]
 
@@ -87,20 +87,20 @@ def choose_edges(probability: np.ndarray) -> tuple[float, ...]:
 
 
 def fit_conformal(
-    surprises: np.ndarray,
+    scores: np.ndarray,
     values: np.ndarray,
     edges: Sequence[float] = EDGES,
     by: By = "surface",
 ) -> Conformal:
-    """Sort the surprises of calibration frames into groups.
+    """Sort the nonconformity scores of calibration frames into groups.
 
     Args:
-        surprises: (n,) of the truths [nat].
-        values: (n,) evidence of the frames, or probabilities.
-        edges: Limits between groups, chosen without looking at the surprises.
+        scores: (n,) of the truths [nat].
+        values: (n,) that feature of the frames, or probabilities.
+        edges: Limits between groups, chosen without looking at the scores.
         by: What the values are.
     """
     empty = Conformal(tuple(edges), ((),) * (len(edges) + 1))
     group = np.array([empty.find_group(float(one)) for one in values], dtype=int)
-    own = [np.sort(surprises[group == k]).tolist() for k in range(len(edges) + 1)]
+    own = [np.sort(scores[group == k]).tolist() for k in range(len(edges) + 1)]
     return Conformal(empty.edges, tuple(tuple(one) for one in own), by)

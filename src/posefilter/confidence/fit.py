@@ -28,29 +28,29 @@ class Frames(NamedTuple):
     """Calibration frames."""
 
     features: tuple[str, ...]
-    evidence: np.ndarray  # (n, F)
+    values: np.ndarray  # (n, F)
     there: np.ndarray  # (n,) bool: the object is in the image
     right: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
     # (n,) of the true pose, NaN where the object is not in the image [nat]; None: not measured
-    surprise: np.ndarray | None = None
+    nonconformity: np.ndarray | None = None
 
     def select(self, index: np.ndarray) -> "Frames":
         """Return some of the frames."""
-        surprise = None if self.surprise is None else self.surprise[index]
-        own = (self.evidence[index], self.there[index], self.right[index])
-        return Frames(self.features, *own, surprise)
+        nonconformity = None if self.nonconformity is None else self.nonconformity[index]
+        own = (self.values[index], self.there[index], self.right[index])
+        return Frames(self.features, *own, nonconformity)
 
 
 def make_frames(
-    evidence: Sequence[Mapping[str, torch.Tensor]],
+    values: Sequence[Mapping[str, torch.Tensor]],
     there: Sequence[np.ndarray],
     right: Sequence[np.ndarray],
-    surprise: Sequence[np.ndarray],
+    nonconformity: Sequence[np.ndarray],
 ) -> Frames:
-    """Return the frames of batches of evidence, each (B,) by name."""
-    names = tuple(evidence[0])
-    rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in evidence]
-    parts = (np.concatenate(one) for one in (rows, there, right, surprise))
+    """Return the frames of batches of features, each (B,) by name."""
+    names = tuple(values[0])
+    rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
+    parts = (np.concatenate(one) for one in (rows, there, right, nonconformity))
     return Frames(names, *parts)
 
 
@@ -79,11 +79,11 @@ def fit_calibration(
                 f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
             )
     fitted = _fit(frames, source, quality or {})
-    if frames.surprise is None:
+    if frames.nonconformity is None:
         return fitted
     own = frames.there
     held = cross_validate(frames).probability.numpy()[own]
-    sets = fit_conformal(frames.surprise[own], held, choose_edges(held), by="probability")
+    sets = fit_conformal(frames.nonconformity[own], held, choose_edges(held), by="probability")
     return replace(fitted, conformal=sets)
 
 
@@ -94,9 +94,9 @@ def _fit(frames: Frames, source: str, quality: Mapping[str, float]) -> Calibrati
         "wrong": int((there & ~right).sum()),
         "absent": int((~there).sum()),
     }
-    center = np.nanmean(frames.evidence, 0)
-    scale = np.nanstd(frames.evidence, 0).clip(1e-6)
-    x = np.nan_to_num((frames.evidence - center) / scale, nan=-LIMIT).clip(-LIMIT, LIMIT)
+    center = np.nanmean(frames.values, 0)
+    scale = np.nanstd(frames.values, 0).clip(1e-6)
+    x = np.nan_to_num((frames.values - center) / scale, nan=-LIMIT).clip(-LIMIT, LIMIT)
     share = there.mean()
     balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
     return Calibration(
@@ -162,6 +162,6 @@ def cross_validate(frames: Frames, folds: int = 5, seed: int = 0) -> Assessment:
         if not len(held):
             continue
         part = _fit(frames.select(np.flatnonzero(fold != k)), "held_out", {})
-        found = part.assess_features(torch.from_numpy(frames.evidence[held]))
+        found = part.assess_features(torch.from_numpy(frames.values[held]))
         presence[held], probability[held] = found
     return Assessment(presence, probability)

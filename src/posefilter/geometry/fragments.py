@@ -87,5 +87,5 @@ def fragment_errors(
         Cross-entropies (B, *) [nat] and errors (B, *).
     """
     fragment = nearest_fragment(truth, centers)
-    surprise = -log_share.gather(-1, fragment[..., None])[..., 0]
-    return surprise, (gather_fragment(position, fragment) - truth).abs().sum(-1) / reach
+    nll = -log_share.gather(-1, fragment[..., None])[..., 0]
+    return nll, (gather_fragment(position, fragment) - truth).abs().sum(-1) / reach

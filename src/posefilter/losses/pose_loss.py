@@ -127,10 +127,10 @@ class SurfacePointLoss:
         """Return the loss of fragments.  True points (B, N, 3) from the center, in radii -> (B,
         N).
         """
-        surprise, error = fragment_errors(
+        nll, error = fragment_errors(
             fragments.log_share, fragments.position, fragments.centers, fragments.reach, true
         )
-        return self.fragment_weight * (surprise + self.offset_weight * error)
+        return self.fragment_weight * (nll + self.offset_weight * error)
 
 
 def measured_points(

@@ -20,7 +20,7 @@ class TruthScores(NamedTuple):
 
     log_density: Tensor  # (B,) [nat]; the measure is that of geometry.pose_density
     rank: Tensor  # (B,) share of the belief that is denser than the truth
-    surprise: Tensor  # (B,) mean log density of the belief, less that at the truth [nat]
+    nonconformity: Tensor  # (B,) mean log density of the belief, less that at the truth [nat]
 
 
 def score_truth(belief: Belief, truth: Tensor, model: ObjectModel) -> TruthScores:

@@ -19,7 +19,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
-from posefilter.confidence.evidence import measure_belief, measure_depth
+from posefilter.confidence.features import measure_belief, measure_depth
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
@@ -61,7 +61,7 @@ class PoseEstimator(Module):
     provides: ClassVar[Capabilities] = ("rollout",)
     requires: ClassVar[Capabilities] = ()
     _trainer: Any = None  # of the LightningModule
-    # what makes probabilities of its evidence, and why there is none
+    # what makes probabilities of its features, and why there is none
     calibration: Calibration | None = None
     calibration_note: str = "the checkpoint is not calibrated (run calibrate)"
     costs = Costs()  # of errors, by which verdicts are chosen
@@ -204,7 +204,7 @@ class PoseEstimator(Module):
 
     # -- confidence -------------------------------------------------------------------------------
 
-    def collect_evidence(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name.
 
         Args:
@@ -221,18 +221,18 @@ class PoseEstimator(Module):
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears, relative to its mesh; None where the method cannot
-        tell.  Arguments as of `collect_evidence`.
+        tell.  Arguments as of `collect_features`.
         """
         return None
 
     @torch.no_grad()
     def assess(self, trace: Trace, batch: Batch) -> Assessment | None:
         """Return the probabilities that the object is there and its pose right, None where the
-        method is not calibrated; arguments as of `collect_evidence`.
+        method is not calibrated; arguments as of `collect_features`.
         """
         if self.calibration is None:
             return None
-        return self.calibration.assess(self.collect_evidence(trace, batch))
+        return self.calibration.assess(self.collect_features(trace, batch))
 
     # -- training ---------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
-from posefilter.confidence.evidence import measure_coordinates
+from posefilter.confidence.features import measure_coordinates
 from posefilter.geometry.ransac import (
     agreement,
     draw_minimal_fits,
@@ -108,11 +108,11 @@ class DenseCoordinates(Hypotheses):
         """The distance of an inlier [m]."""
         return self.inlier * self.model.diameter
 
-    def collect_evidence(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, with what the network sees of it."""
         scene: DenseScene = self.encode(batch) if trace.scene is None else trace.scene
         seen = measure_coordinates(trace.belief.best, scene.coordinates, scene.cells, self.model)
-        return super().collect_evidence(trace, batch) | seen
+        return super().collect_features(trace, batch) | seen
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize:
         """Return how large the object appears by the network's object points."""

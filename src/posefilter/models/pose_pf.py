@@ -8,7 +8,7 @@ from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
 from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
-from posefilter.confidence.evidence import measure_coordinates
+from posefilter.confidence.features import measure_coordinates
 from posefilter.errors import UserError
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
@@ -188,21 +188,23 @@ class PosePF(PoseParticles):
             self.log_scalar("coordinate_error_mm", 1000 * error.mean())
         return losses
 
-    def collect_evidence(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, with what the proposal network sees of it."""
-        evidence = super().collect_evidence(trace, batch)
+        features = super().collect_features(trace, batch)
         if self.proposals is None:
-            return evidence
-        seen = self._seen(trace, batch)
-        return evidence | measure_coordinates(trace.belief.best, *seen, self.model)
+            return features
+        seen = self._predict_coordinates(trace, batch)
+        return features | measure_coordinates(trace.belief.best, *seen, self.model)
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears by the proposal network; None without one."""
         if self.proposals is None:
             return None
-        return measure_apparent_size(trace.belief.best, *self._seen(trace, batch), self.model)
+        return measure_apparent_size(
+            trace.belief.best, *self._predict_coordinates(trace, batch), self.model
+        )
 
-    def _seen(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
+    def _predict_coordinates(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
         """Return what the proposal network sees of the images of a finished run."""
         scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
         assert scene.coordinates is not None

@@ -123,11 +123,11 @@ def coordinate_loss(
     bce = F.binary_cross_entropy_with_logits(coordinates.logit, on.float(), reduction="none").mean(
         (1, 2)
     )
-    surprise, error = fragment_errors(
+    nll, error = fragment_errors(
         coordinates.log_share, coordinates.position, coordinates.centers, reach, truth
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
-    return 5 * bce + mean(surprise + 0.3 * error), mean(distance)
+    return 5 * bce + mean(nll + 0.3 * error), mean(distance)
 
 
 class HasCoordinates(Protocol):

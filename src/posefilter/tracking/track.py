@@ -45,7 +45,7 @@ class TrackResult(Result):
         relevance: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
 
-    `presence` and `probability` are those of an estimate on a single image with the same evidence;
+    `presence` and `probability` are those of an estimate on a single image with the same features;
     a track is judged lost or found by the presence.
     """
 

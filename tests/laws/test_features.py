@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from posefilter.confidence.evidence import measure_coordinates
+from posefilter.confidence.features import measure_coordinates
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import Cells, Coordinates

@@ -1,7 +1,7 @@
-"""Evidence for an estimate: cheap numbers of a finished filter, of which more speaks for it.
+"""Features of an estimate: cheap numbers of a finished filter, of which more speaks for it.
 
-A learned likelihood compares poses of one image; between images its level is arbitrary.  So the
-evidence asks what the likelihood does not: do the particles agree, does the measured depth show a
+A learned likelihood compares poses of one image; between images its level is arbitrary.  So they
+ask what the likelihood does not: do the particles agree, does the measured depth show a
 surface where the pose says, and does the proposal network, which has seen the image as a whole,
 take the same pixels for the same points of the object?
 """
