@@ -3,8 +3,8 @@
 presence    = sigmoid(a . x + b)                that the object is in the image
 probability = presence * sigmoid(c . x + d)     that it is, and the pose within 0.1 diameters
 
-x are the features, standardized by the calibration frames and limited to `LIMIT` standard deviations
-on either side: what lies beyond what calibration saw counts as its edge. Each feature is
+x are the features, standardized by the calibration frames and limited to `LIMIT` standard
+deviations on either side: what lies beyond what calibration saw counts as its edge. Each feature is
 such that more of it speaks for the estimate, and a, c >= 0: so both probabilities rise with each.
 """
 

@@ -1,11 +1,11 @@
 """Sets of poses with a guaranteed coverage: split conformal prediction, by group.
 
 The nonconformity score of a pose is the mean log density of the belief's own particles, less the
-log density at that pose.  Of n calibration frames of a group, with their truths' scores in rising order, the
-set of level p of a new frame holds every pose whose score is at most the ceil(p (n + 1))-th; if
-there are fewer, it holds every pose.  Where the new frame and the calibration frames of its group
-are exchangeable, the set holds the truth with a probability of at least p, whatever the belief is
-worth (Vovk et al. 2005; by group: Mondrian conformal prediction).
+log density at that pose. Of n calibration frames of a group, with their truths' scores in rising
+order, the set of level p of a new frame holds every pose whose score is at most the ceil(p (n +
+1))-th; if there are fewer, it holds every pose. Where the new frame and the calibration frames of
+its group are exchangeable, the set holds the truth with a probability of at least p, whatever the
+belief is worth (Vovk et al. 2005; by group: Mondrian conformal prediction).
 
 The groups are told apart by the calibrated probability, at the quantiles of the calibration frames.
 A belief that is likely to be wrong gives the truth a far higher score than one that is likely to be
@@ -41,7 +41,7 @@ EDGES = (0.25,)
 
 @dataclass(frozen=True)
 class Conformal:
-    """The nonconformity scores of calibration frames, by group; plain data, carried in a calibration.
+    """Nonconformity scores of calibration frames, by group; plain data, part of a calibration.
 
     Attributes:
         edges: Limits between groups, of the feature `surface` or of the probability, rising.

@@ -52,9 +52,9 @@ def measure_presence(
     """Return how probable it is that the object is where an estimate puts it.
 
     Of a calibrated method it is its calibrated presence. That is fitted to estimates on single
-    images; a track's features are of the same kind, but its particles are fewer, and the network may
-    have seen a window only. Of another method it is the relevance, as a share of 0.6, lowered where
-    the depth sees through more of the surface than it finds there; that is no probability.
+    images; a track's features are of the same kind, but its particles are fewer, and the network
+    may have seen a window only. Of another method it is the relevance, as a share of 0.6, lowered
+    where the depth sees through more of the surface than it finds there; that is no probability.
 
     Args:
         method: The object's filter.
