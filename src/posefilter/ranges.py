@@ -135,8 +135,8 @@ RANGES: dict[str, Range] = {
     "onboard.test_frames": COUNT,
     "onboard.workers": _whole(1, 256),
     # tracker
-    "motion.shift_mm": Range(0, 10_000, many=True),  # or by axis
-    "motion.turn_deg": Range(0, 180, many=True),
+    "motion.translation_mm": Range(0, 10_000, many=True),  # or by axis
+    "motion.rotation_deg": Range(0, 180, many=True),
     "motion.momentum": SHARE,
     **{
         f"tracker.{effort}.{name}": allowed

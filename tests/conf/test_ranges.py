@@ -184,7 +184,9 @@ def test_lists_are_of_the_settings_that_are_said_to_have_them() -> None:
     assert refused == []
     many = {"data": {"generate": {"size": [640, 480]}}, "optimizer": {"betas": [0.9, 0.99]}}
     check_ranges(many, "train")
-    check_ranges({"tracker": {"motion": {"shift_mm": [5.0, 5.0, 9.0], "turn_deg": 2.0}}}, "track")
+    check_ranges(
+        {"tracker": {"motion": {"translation_mm": [5.0, 5.0, 9.0], "rotation_deg": 2.0}}}, "track"
+    )
     with pytest.raises(UserError, match=r"^optimizer\.betas=1\.5: must be a number"):
         check_ranges({"optimizer": {"betas": [0.9, 1.5]}}, "train")
     with pytest.raises(UserError, match=r"^data\.generate\.size\[0\]=\[640\]: must be one number"):

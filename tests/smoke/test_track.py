@@ -117,7 +117,10 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
         (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0: must be a whole number"),
-        (["frames=FOLDER", CAMERA, "tracker.motion.shift_mm=fast"], "motion.shift_mm=fast"),
+        (
+            ["frames=FOLDER", CAMERA, "tracker.motion.translation_mm=fast"],
+            "motion.translation_mm=fast",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(

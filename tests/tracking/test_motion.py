@@ -36,7 +36,7 @@ def test_the_covariance_of_a_walk_grows_with_the_frames(frames: int) -> None:
     """Shifts along the camera's axes, turns about the object's own, neither leaks into the other:
     the start is turned, and the object's center lies off its origin.
     """
-    motion = RandomWalk(shift_mm=(2, 4, 8), turn_deg=(0.5, 1.0, 2.0))
+    motion = RandomWalk(translation_mm=(2, 4, 8), rotation_deg=(0.5, 1.0, 2.0))
     start, state = walk(motion, frames, torch.zeros(1, 6))
     found = covariance_about(
         start, state, torch.full((COUNT,), 1 / COUNT).double(), torch.tensor(CENTER).double()
@@ -57,7 +57,13 @@ def test_momentum_is_the_share_of_the_last_motion_that_goes_on(momentum: float) 
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"shift_mm": -1}, {"turn_deg": (1, 2)}, {"momentum": 1.5}, {"shift_mm": math.nan}]
+    "wrong",
+    [
+        {"translation_mm": -1},
+        {"rotation_deg": (1, 2)},
+        {"momentum": 1.5},
+        {"translation_mm": math.nan},
+    ],
 )
 def test_what_is_no_motion_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match=rf"motion\.{next(iter(wrong))}="):

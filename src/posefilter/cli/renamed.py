@@ -67,6 +67,8 @@ KEYS = {
     "tracker.reach": "tracker.window_scale",
     "tracker.noise": "tracker.smoothing_noise",
     "tracker.full_every": "tracker.full_search_every",
+    "tracker.motion.shift_mm": "tracker.motion.translation_mm",
+    "tracker.motion.turn_deg": "tracker.motion.rotation_deg",
     "tracker.follow.least": "tracker.follow.min_particles",
     "tracker.follow.most": "tracker.follow.max_particles",
     "tracker.search.least": "tracker.search.min_particles",

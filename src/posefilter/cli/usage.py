@@ -39,7 +39,7 @@ _SECTIONS = {
     "predict": {"filter.particles": "number of particles; filter.steps: of iterations"},
     "track": {
         "data.root": "folder of the dataset, where data= is given",
-        "tracker.motion.shift_mm": "how far an object may move between two frames",
+        "tracker.motion.translation_mm": "how far an object may move between two frames",
         "tracker.follow.points": "image points of a pose; cost is in proportion",
         "tracker.smoothing_noise": "smoothing over time [m]",
     },

@@ -227,8 +227,8 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "absent_share": job.scenes.absent_share,
         "instances": job.scenes.instances,
         "mesh_scale": job.mesh_scale,
-        "moving_mm": job.motion.shift_mm,
-        "moving_deg": job.motion.turn_deg,
+        "moving_mm": job.motion.translation_mm,
+        "moving_deg": job.motion.rotation_deg,
         "covered_frames": job.motion.covered_frames,
     }
     check_ranges(numbers, "generate")

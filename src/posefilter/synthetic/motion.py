@@ -29,8 +29,8 @@ class MotionSettings:
 
     Attributes:
         moves: "none": each frame is arranged anew; "camera", "object" or "both".
-        shift_mm: Root mean square shift from one frame to the next of what moves [mm].
-        turn_deg: The same of its turn [degrees].
+        translation_mm: Root mean square, from one frame to the next, of what moves [mm].
+        rotation_deg: The same [degrees].
         covered_frames: Frames in a row, in the middle of each scene, in which the object is hidden.
 
     Raises:
@@ -38,8 +38,8 @@ class MotionSettings:
     """
 
     moves: str = "none"
-    shift_mm: float = 5.0
-    turn_deg: float = 1.0
+    translation_mm: float = 5.0
+    rotation_deg: float = 1.0
     covered_frames: int = 0
 
     def __post_init__(self) -> None:
@@ -127,7 +127,8 @@ def draw_scenario(
         rng: Source of randomness.
     """
     still = np.zeros((frames, 6))
-    paths = [draw_path(frames, settings.shift_mm, settings.turn_deg, rng) for _ in range(2)]
+    steps = settings.translation_mm, settings.rotation_deg
+    paths = [draw_path(frames, *steps, rng) for _ in range(2)]
     camera = paths[0] if settings.moves in ("camera", "both") else still
     target = paths[1] if settings.moves in ("object", "both") else still
     if layout.tabletop:
@@ -146,17 +147,17 @@ def draw_scenario(
 
 
 def draw_path(
-    frames: int, shift_mm: float, turn_deg: float, rng: np.random.Generator
+    frames: int, translation_mm: float, rotation_deg: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw a smooth path that starts at 0: a sine of its own along each axis.
 
-    The expected square of a step is `shift_mm` squared for the shift, and `turn_deg` squared for
+    The expected square of a step is `translation_mm` squared, and `rotation_deg` squared for
     the rotation vector.
 
     Args:
         frames: T.
-        shift_mm: Shift from one frame to the next, root mean square [mm].
-        turn_deg: Turn likewise [degrees].
+        translation_mm: From one frame to the next, root mean square [mm].
+        rotation_deg: Likewise [degrees].
         rng: Source of randomness.
 
     Returns:
@@ -164,7 +165,7 @@ def draw_path(
     """
     period = rng.uniform(*_PERIODS, 6)
     phase = rng.uniform(0, 2 * math.pi, 6)
-    step = np.repeat([shift_mm / 1000, math.radians(turn_deg)], 3) / math.sqrt(3)
+    step = np.repeat([translation_mm / 1000, math.radians(rotation_deg)], 3) / math.sqrt(3)
     # a sine of amplitude a moves by 2 a sin(pi / period) |cos| a frame: root mean square sqrt(2) a
     # sin(pi / period)
     amplitude = step / (math.sqrt(2) * np.sin(math.pi / period))

@@ -20,9 +20,9 @@ class RandomWalk:
     is that of constant velocity (Bar-Shalom, Li and Kirubarajan 2001, section 6.3).
 
     Args:
-        shift_mm: Standard deviation a frame along the camera's x, y and z, one for all or three
+        translation_mm: Standard deviation a frame along the camera's x, y, z, one for all or three
             [mm].
-        turn_deg: Standard deviation a frame about the object's x, y and z, one for all or three
+        rotation_deg: Standard deviation a frame about the object's x, y, z, one for all or three
             [degrees].
         momentum: Share of the last frame's motion that is expected again, in [0, 1].
 
@@ -32,12 +32,12 @@ class RandomWalk:
 
     def __init__(
         self,
-        shift_mm: float | Sequence[float] = 5.0,
-        turn_deg: float | Sequence[float] = 2.0,
+        translation_mm: float | Sequence[float] = 5.0,
+        rotation_deg: float | Sequence[float] = 2.0,
         momentum: float = 0.0,
     ) -> None:
-        shift = _three(shift_mm, "shift_mm")
-        turn = _three(turn_deg, "turn_deg")
+        shift = _three(translation_mm, "translation_mm")
+        turn = _three(rotation_deg, "rotation_deg")
         if not 0 <= momentum <= 1:
             raise UserError(f"motion.momentum={momentum}: must lie between 0 and 1")
         self.scale = (*(x / 1000 for x in shift), *(math.radians(x) for x in turn))
