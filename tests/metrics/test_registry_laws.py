@@ -16,7 +16,8 @@ WITHIN_ONE = r"iou$|auroc"  # from 0 to 1
 WITHIN_SIGNED_ONE = r"cosine$|_r2$|heading$"  # from -1 to 1
 COUNTS = (
     "instances", "missed", "confidence/frames", "confidence/frames_without",
-    "confidence/false_alarms", "training/steps", "training/tested_step", "not_finite",
+    "confidence/false_alarms", "apparent_size/images", "apparent_size/contradicting",
+    "training/steps", "training/tested_step", "not_finite",
 )  # fmt: skip
 
 
@@ -64,7 +65,10 @@ def test_the_digits_are_those_that_mean_something(info: MetricInfo) -> None:
         assert info.format(0.0123456) == "0.0123"
     elif info.limits and info.limits[1] < 2:
         assert info.format(0.5) in ("0.50", "0.500")
-    elif info.key in ("belief/rank", "belief/entropy") or "log_density" in info.key:
+    elif (
+        info.key in ("belief/rank", "belief/entropy", "apparent_size/ratio")
+        or "log_density" in info.key
+    ):
         assert info.format(0.5) == "0.50"
     elif re.search(r"coverage|filter/ess", info.key):
         assert info.format(50 / info.factor) == "50"
@@ -80,7 +84,7 @@ def test_which_way_is_better(info: MetricInfo) -> None:
     should be large; how wide a belief is, and how many there are, is neither good nor bad.
     """
     worse = (
-        r"median|seconds|missed|off_frame|near_|pairwise|outscored|ece|brier|wrong|absent|alarms"
+        r"median|seconds|missed|off_frame|near_|pairwise|outscored|ece|brier|wrong|absent|alarms|contradicting"
         r"|loss|drop|not_finite"
     )
     better = (

@@ -15,7 +15,7 @@ from posefilter.cli.bop_scores import assign_estimates, score_targets
 from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
-from posefilter.cli.console import typed
+from posefilter.cli.console import say, typed
 from posefilter.cli.folders import holds_evaluation
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
@@ -40,6 +40,7 @@ from posefilter.types import Batch, ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
 _BATCH = 8  # images without the object
+_FEWEST = 3  # images that tell a dataset's scale
 _SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
 
 
@@ -59,6 +60,7 @@ def evaluate(job: Job) -> float:
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
     files = {"metrics": job.folder / "metrics.json", **files}
+    _warn_of_size(metrics, job)
     following = (
         [typed("report", run=job.folder)]
         if (job.folder / ".hydra").is_dir() and not job.swept
@@ -107,6 +109,19 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return record(
         method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
     ), files
+
+
+def _warn_of_size(metrics: dict[str, Any], job: Job) -> None:
+    """Say so where most images show the object in a size that cannot be."""
+    size = metrics.get("apparent_size")
+    if size is None or size["images"] < _FEWEST or 2 * size["contradicting"] <= size["images"]:
+        return
+    said = (
+        f"warning: the object appears {size['ratio']:.2f} times its size (median of "
+        f"{size['images']} images): the depth, the intrinsics or the mesh's unit are not those of "
+        f"data.root={job.cfg.data.root}"
+    )
+    say(job.cfg.console, "warning", said, **size)
 
 
 def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:

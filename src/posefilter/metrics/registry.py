@@ -355,6 +355,20 @@ _METRICS = (
         direction=LOWER,
         meaning="frames without the object in which one is found",
     ),
+    MetricInfo("apparent_size/images", "images that tell the object's size", form=".0f"),
+    MetricInfo(
+        "apparent_size/ratio",
+        "apparent size",
+        form=".2f",
+        meaning="median, relative to the mesh: 1 where depth and intrinsics are right",
+    ),
+    MetricInfo(
+        "apparent_size/contradicting",
+        "images of a wrong size",
+        form=".0f",
+        direction=LOWER,
+        meaning="where depth or intrinsics cannot be right",
+    ),
     # where particles that are pixels are; lists over the iterations
     MetricInfo("diagnostics/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
     MetricInfo(

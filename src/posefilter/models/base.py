@@ -160,7 +160,9 @@ class PoseEstimator(Module):
 
     def make_metrics(self) -> dict[str, nn.Module]:
         """Create the metrics of the object, by name."""
-        from posefilter.metrics.bop import BopErrors  # torchmetrics: prediction needs none
+        # torchmetrics: prediction needs none
+        from posefilter.metrics.apparent_size import ApparentSizes
+        from posefilter.metrics.bop import BopErrors
         from posefilter.metrics.collect import BeliefQuality, BoxIoU, ParticlesOnObject, PoseErrors
         from posefilter.metrics.confidence import Confidence
         from posefilter.metrics.credibility import Credibility
@@ -178,6 +180,7 @@ class PoseEstimator(Module):
             metrics["belief"] = BeliefQuality([self.model])
             metrics["credibility"] = Credibility()
             metrics["confidence"] = Confidence()
+            metrics["apparent_size"] = ApparentSizes()
             if self.model.parts:
                 metrics["parts"] = PartIoU(self.model)
         return metrics
@@ -372,7 +375,8 @@ class PoseEstimator(Module):
         return Assessment(*self.scores["confidence"].rows[-1][:, :2].T)
 
     def judge_confidence(self, trace: Trace, batch: Batch, there: bool) -> None:
-        """Add a batch's probabilities to the metrics, where the method is calibrated.
+        """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it
+        can tell them, to the metrics.
 
         Args:
             trace: A finished run of the filter.
@@ -381,6 +385,9 @@ class PoseEstimator(Module):
         """
         from posefilter.metrics.errors import add_up_to_symmetry  # trees of scipy
 
+        size = self.measure_apparent_size(trace, batch)
+        if size is not None and there:
+            self.scores["apparent_size"].update(size.scale, size.contradicts())
         found = self.assess(trace, batch)
         if found is None:
             return
@@ -388,6 +395,10 @@ class PoseEstimator(Module):
         error = add_up_to_symmetry(best, batch.camera_from_object, model.points, model.symmetries)
         right = (error < 0.1 * model.diameter) & there
         verdict = score_verdicts(found, self.costs)
+        if size is not None:  # of a wrong size none is found
+            verdict = torch.where(
+                size.contradicts().to(verdict.device), verdict.clamp_max(0), verdict
+            )
         self.scores["confidence"].update(*found, torch.full_like(right, there), right, verdict)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
@@ -422,9 +433,8 @@ class PoseEstimator(Module):
         out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
         known = self.calibration is not None and "confidence" in self.scores
         out["confidence"] = self.scores["confidence"].compute() if known else None
-        blocks = ("credibility", "poses"), ("by_visibility", "poses"), ("parts", "parts")
-        for name, needed in blocks:
-            out[name] = self.scores[name].compute() if needed in self.scores else None
+        for name in ("credibility", "by_visibility", "apparent_size", "parts"):
+            out[name] = self.scores[name].compute() if name in self.scores else None
         return out
 
     def _reset(self) -> None:

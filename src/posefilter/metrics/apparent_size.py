@@ -1,0 +1,32 @@
+"""How large an object appears over a dataset: whether the depth and the intrinsics are right."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from posefilter.metrics.collect import Rows, concat_state
+
+
+class ApparentSizes(Rows):
+    """The apparent sizes of images that show the object; 1 where the inputs are right.
+
+    images: in how many it could be told. ratio: the median of these. contradicting: in how many of
+    them the inputs cannot be right.
+    """
+
+    def update(self, scale: Tensor, contradicts: Tensor) -> None:
+        """Accumulate images; (B,) with NaN where nothing can be told, and (B,) bool."""
+        rows = torch.stack([x.double().cpu() for x in (scale, contradicts)], dim=1)
+        self.rows.append(rows[~rows[:, 0].isnan()])
+
+    def compute(self) -> dict[str, Any] | None:
+        """Return the numbers; None where no image tells."""
+        scale, contradicts = concat_state(self.rows).reshape(-1, 2).T
+        if not len(scale):
+            return None
+        return {
+            "images": len(scale),
+            "ratio": float(scale.quantile(0.5)),
+            "contradicting": int(contradicts.sum()),
+        }
