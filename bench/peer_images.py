@@ -30,7 +30,7 @@ from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc, recall
 
 MODEL_POINTS = 20_000  # of the mesh, that the peers are given
-HEAD = ("method", "told", "frames", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "ADD < 2 cm %")
+HEAD = ("method", "given", "frames", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "ADD < 2 cm %")
 HEAD += ("ADD-S < 2 cm %", "ADD AUC", "ADD-S AUC", "median s", "ratio")
 OWN = "pose_pf"
 Settings = dict[str, Any]
@@ -202,7 +202,7 @@ def measure(
         until: Stop before this time (`time.monotonic`), to be started again.
     """
     rows = read_rows(file)
-    done = {(row["title"], row["method"], row["told"], row["key"]) for row in rows}
+    done = {(row["title"], row["method"], row["given"], row["key"]) for row in rows}
     models: dict[str, Any] = {}
     for case in cases:
         for way in ways:
@@ -214,7 +214,7 @@ def measure(
             if case.object not in models:
                 models[case.object] = posefilter.load(case.object, device="cpu").models[0]
             pose, seconds, cpu = way.estimate(case)
-            row = {"title": title, "method": way.method, "told": told, "key": case.key}
+            row = {"title": title, "method": way.method, "given": told, "key": case.key}
             row |= {"object": case.object, "scene": case.scene, "seconds": seconds, "cpu": cpu}
             row |= judge(pose, case.image.truth, models[case.object])
             rows.append(row)
@@ -246,7 +246,7 @@ def summarize(rows: Sequence[dict[str, Any]], own_seconds: float) -> str:
     seconds = float(np.median([row["cpu"] for row in rows]))
     ratio = seconds / own_seconds  # not a number where posefilter was not asked
     cells += [f"{seconds:.2f}", "–" if math.isnan(ratio) else f"{ratio:.1f}"]
-    return format_row([rows[0]["method"], rows[0]["told"], str(len(rows)), *cells])
+    return format_row([rows[0]["method"], rows[0]["given"], str(len(rows)), *cells])
 
 
 def make_lines(rows: Sequence[dict[str, Any]], title: str) -> list[str]:
@@ -254,7 +254,7 @@ def make_lines(rows: Sequence[dict[str, Any]], title: str) -> list[str]:
     groups: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for row in rows:
         if row["title"] == title:
-            groups.setdefault((row["method"], row["told"]), {})[row["key"]] = row
+            groups.setdefault((row["method"], row["given"]), {})[row["key"]] = row
     if not groups:
         return []
     common = set.intersection(*(set(group) for group in groups.values()))
@@ -282,7 +282,7 @@ def choose(rows: Sequence[dict[str, Any]], method: str, masked: bool) -> Setting
         own = [
             row["add_s"]
             for row in rows
-            if row["told"] == told and row["method"] == f"{method}: {describe(settings)}"
+            if row["given"] == told and row["method"] == f"{method}: {describe(settings)}"
         ]
         if own:
             gain = (1 - torch.tensor(own).double() / 0.1).clamp_min(0).mean()
