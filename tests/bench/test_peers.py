@@ -91,7 +91,7 @@ def test_a_voxel_keeps_the_mean_of_its_points(clouds: ModuleType) -> None:
 
 def row(method: str, told: str, key: str, error: float, seconds: float) -> dict[str, Any]:
     errors = {"add": error, "add_s": error / 2, "diameter": 0.2}
-    return {"title": "t", "method": method, "told": told, "key": key, "cpu": seconds} | errors
+    return {"title": "t", "method": method, "given": told, "key": key, "cpu": seconds} | errors
 
 
 def test_ways_are_compared_on_the_images_that_all_have(images: ModuleType) -> None:
