@@ -199,6 +199,8 @@ def plan() -> list[Run]:
         ("hammer", "048_hammer", 2000),
         ("mug", mug, 2000),
         ("banana", "011_banana", 1600),
+        ("tuna", "007_tuna_fish_can", 2000),
+        ("sugar", sugar, 2000),
     ]
     judged += [shipped(f"{name}_u", *rest)._replace(scenes=THIRD) for name, *rest in third]
     return [*map(_without_surface, earlier), *judged]
