@@ -201,6 +201,7 @@ def plan() -> list[Run]:
         ("banana", "011_banana", 1600),
         ("tuna", "007_tuna_fish_can", 2000),
         ("sugar", sugar, 2000),
+        ("mustard", mustard, 2000),
     ]
     judged += [shipped(f"{name}_u", *rest)._replace(scenes=THIRD) for name, *rest in third]
     return [*map(_without_surface, earlier), *judged]
