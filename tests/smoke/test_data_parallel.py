@@ -2,11 +2,13 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 from tests.smoke.conftest import TINY
 
 HOME = Path(__file__).parents[2]
@@ -32,3 +34,50 @@ def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path) -> No
     assert metrics["training"]["steps"] == 2
     # each has tested all images, and counts none twice
     assert metrics["instances"] == metrics["data"]["splits"]["test"]["frames"]
+
+
+@pytest.mark.slow
+def test_two_processes_agree_on_when_to_write_what_a_run_goes_on_from(
+    tmp_path: Path, tiny_scenes: Path
+) -> None:
+    """Their clocks differ: one that wrote alone would wait for the other for ever."""
+    out = tmp_path / "run"
+    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
+    words += ["trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=40"]
+    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
+    words += ["trainer.val_check_interval=40", "data.batch_size=2", "console=json"]
+    words += ["callbacks.last.minutes=0.012"]
+    command = [sys.executable, str(HOME / "train.py"), *words]
+    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=clean
+    )
+    assert done.returncode == 0, done.stderr
+    # several were written on the way, and the last is whole
+    assert (out / "checkpoints" / "last.previous.ckpt").is_file()
+    assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] == 40
+
+
+@pytest.mark.slow
+def test_two_processes_stop_together(tmp_path: Path, tiny_scenes: Path) -> None:
+    """A signal reaches them at different steps; the run is left where it can be gone on with."""
+    out = tmp_path / "run"
+    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
+    words += ["trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=4000"]
+    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
+    words += ["trainer.val_check_interval=4000", "data.batch_size=2", "console=json"]
+    command = [sys.executable, str(HOME / "train.py"), *words]
+    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        env=clean, start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        for line in process.stdout:
+            if '"training"' in line:
+                break
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal's Ctrl-C does
+        _, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    assert torch.load(out / "checkpoints" / "last.ckpt", weights_only=True)["global_step"] > 0

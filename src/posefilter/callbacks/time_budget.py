@@ -49,6 +49,8 @@ class TimeBudget(Callback):
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Advance the schedule to where the clock is; stop if the time is up."""
         share = min(1.0, self.elapsed / self.seconds)
+        if trainer.world_size > 1:  # their clocks differ, and their weights must not
+            share = trainer.strategy.broadcast(share)
         for config in trainer.lr_scheduler_configs:
             scheduler: Any = config.scheduler
             while scheduler.last_epoch < int(share * trainer.max_steps):

@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 from torch import Tensor
 
 from posefilter.cli.resume import BEFORE, LAST
-from posefilter.cli.stopping import asked_to_stop
+from posefilter.cli.stopping import any_process, asked_to_stop
 from posefilter.errors import UserError
 
 _KEPT = {"filename": "best", "save_top_k": 1}  # as the test and later commands expect them
@@ -129,7 +129,9 @@ class Last(Checkpoint):
             self._validation_due = False
 
     def _due(self, trainer: Trainer) -> bool:
-        return asked_to_stop(trainer) or time.monotonic() - self._saved_at >= self._pause
+        # the processes of one training write it together, but their clocks differ
+        late = any_process(trainer, time.monotonic() - self._saved_at >= self._pause)
+        return late or asked_to_stop(trainer)
 
     def _save(self, trainer: Trainer) -> None:
         new = self.path.with_name(f"new_{LAST}")

@@ -11,13 +11,17 @@ from posefilter.errors import Stopped
 
 
 class Stop(Callback):
-    """Take note of a signal, and stop before the next batch; at a second signal, stop at once.
+    """Take note of a signal, and stop after a batch; at a second signal, stop at once.
 
-    Between the two, `Last` writes its checkpoint.
+    A signal is acted on at the end of a batch, where `Last`, which comes after this, writes its
+    checkpoint; the next batch is not begun. There the processes of one training agree on it, since
+    a signal reaches them at different steps, and one that stopped alone would leave the others
+    waiting for it.
     """
 
     def __init__(self) -> None:
         self.asked: int | None = None  # the signal that came
+        self.agreed: int | None = None  # the one that all processes stop for
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take the signals over from Lightning, whose own handlers save nothing.
@@ -32,15 +36,33 @@ class Stop(Callback):
 
     def on_train_batch_start(self, *_: Any) -> None:
         """Stop here."""
-        self._stop()
+        self._stop(self.agreed)
 
     def on_validation_batch_start(self, *_: Any) -> None:
         """Stop here."""
-        self._stop()
+        self._stop(self.agreed)
 
     def on_test_batch_start(self, *_: Any) -> None:
-        """Stop here."""
-        self._stop()
+        """Stop here: a test has no checkpoint to write, and no other process waits for it."""
+        self._stop(self.asked)
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
+        """Agree on whether to stop."""
+        self._agree(trainer)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Agree on whether to stop."""
+        self._agree(trainer)
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, *_: Any
+    ) -> None:
+        """Agree on whether to stop."""
+        self._agree(trainer)
+
+    def _agree(self, trainer: Trainer) -> None:
+        if any_process(trainer, self.asked is not None):
+            self.agreed = self.asked or signal.SIGTERM
 
     def _listen(self) -> None:
         if threading.current_thread() is threading.main_thread():
@@ -52,12 +74,19 @@ class Stop(Callback):
             raise Stopped(number)
         self.asked = number
 
-    def _stop(self) -> None:
-        if self.asked is not None:
-            raise Stopped(self.asked)
+    def _stop(self, number: int | None) -> None:
+        if number is not None:
+            raise Stopped(number)
 
 
 def asked_to_stop(trainer: Trainer) -> bool:
-    """Tell whether a trainer's run was told to stop."""
+    """Tell whether all processes of a trainer's run are about to stop."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    return any(isinstance(one, Stop) and one.asked is not None for one in callbacks)
+    return any(isinstance(one, Stop) and one.agreed is not None for one in callbacks)
+
+
+def any_process(trainer: Trainer, decision: bool) -> bool:
+    """Tell whether any process of a training decides so; each has to ask, at the same place."""
+    if trainer.world_size == 1:
+        return decision
+    return bool(trainer.strategy.reduce_boolean_decision(decision, all=False))
