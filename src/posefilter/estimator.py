@@ -48,7 +48,11 @@ class Estimator:
             if "pose" not in method.capabilities:
                 raise UserError(f"{type(method).__name__} detects, and estimates no pose")
         device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-        self.methods = tuple(method.to(device).eval() for method in methods)
+        try:
+            self.methods = tuple(method.to(device).eval() for method in methods)
+        except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there
+            why = str(error).splitlines()[0]
+            raise UserError(f"device={device}: cannot be used ({why})") from error
         self.costs = costs or Costs()
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
 

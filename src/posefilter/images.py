@@ -6,7 +6,11 @@ import cv2
 import numpy as np
 import torch
 
-from posefilter.data.readers.plausible import find_focal_flaw, find_matrix_flaw
+from posefilter.data.readers.plausible import (
+    find_center_flaw,
+    find_focal_flaw,
+    find_matrix_flaw,
+)
 from posefilter.data.resize import network_size, resize_depth
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
@@ -49,10 +53,12 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
     if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
         z = z[:, 0]
     if z.shape != color.shape[:3]:
-        raise UserError(f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[:3]}")
+        raise UserError(
+            f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[1 - batched : 3]}"
+        )
     if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
         raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
-    K = check_intrinsics(K, len(z), z.shape[2])
+    K = check_intrinsics(K, len(z), (z.shape[1], z.shape[2]))
     return Images(_check_color(color), _check_depth(z, empty), K), batched
 
 
@@ -89,7 +95,13 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
 
 
 def _as_array(value: Any) -> np.ndarray:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    if isinstance(value, torch.Tensor):
+        plain = value.detach().cpu()
+        return np.asarray((plain.float() if plain.dtype == torch.bfloat16 else plain).numpy())
+    try:
+        return np.asarray(value)
+    except ValueError as error:  # a list of arrays of unequal shape
+        raise UserError(f"images: arrays of one size are due ({error})") from error
 
 
 def _check_color(color: np.ndarray) -> np.ndarray:
@@ -104,6 +116,18 @@ def _check_color(color: np.ndarray) -> np.ndarray:
             f"rgb: floats should lie in [0, 1], not in [{color.min():.3g}, {color.max():.3g}]"
         )
     return np.ascontiguousarray(color, dtype=np.float32)
+
+
+def check_depth_unit(depth: np.ndarray) -> None:
+    """Refuse depth (H, W) that cannot be in meters, by a few of its pixels.
+
+    Raises:
+        UserError: The median is no distance that a depth camera measures.
+    """
+    some = depth[::16, ::16]
+    some = some[np.isfinite(some) & (some > 0)]
+    if len(some) and not _NEAREST < (median := float(np.median(some))) < _FARTHEST:
+        raise UserError(f"depth: the median would be {median:.3g} m; is it in meters?")
 
 
 def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
@@ -125,13 +149,14 @@ def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
     return z
 
 
-def check_intrinsics(K: np.ndarray, count: int, width: int | None = None) -> np.ndarray:
+def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = None) -> np.ndarray:
     """Return camera matrices as float64 (count, 3, 3) [px].
 
     Args:
         K: Camera matrix (3, 3), or one each (count, 3, 3) [px].
         count: How many are due.
-        width: Of the images [px], for which focal lengths must be plausible; None: not checked.
+        size: Height and width of the images [px], for which focal lengths and principal points
+            must be plausible; None: not checked.
 
     Raises:
         UserError: They are none.
@@ -145,7 +170,10 @@ def check_intrinsics(K: np.ndarray, count: int, width: int | None = None) -> np.
         flaw = find_matrix_flaw(one)
         if flaw:
             raise UserError(f"intrinsics: are no camera matrix ({flaw})")
-        flaw = "" if width is None else find_focal_flaw(one, width)
+        flaw = "" if size is None else find_focal_flaw(one, size[1])
         if flaw:
             raise UserError(f"intrinsics: focal lengths are not plausible ({flaw})")
+        flaw = "" if size is None else find_center_flaw(one, size[1], size[0])
+        if flaw:
+            raise UserError(f"intrinsics: the principal point is not plausible ({flaw})")
     return K

@@ -8,6 +8,7 @@ _SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be t
 _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
 _BEYOND = 1.5  # times the depths of training
+_OFF = 0.3  # of the image's size: principal points farther from its middle are those of a part
 
 
 def find_warnings(
@@ -38,6 +39,12 @@ def find_warnings(
     known = float((depth > 0).mean())
     if known < _FEWEST:
         found.append(f"only {100 * known:.1f} % of the pixels have depth")
+    off = np.abs(intrinsics[:2, 2] / (width, height) - 0.5)
+    if off.max() > _OFF:
+        found.append(
+            f"the intrinsics' principal point is far from the middle of the image ({off.max():.0%} "
+            "of its size): that is right for a part of an image alone"
+        )
     if apparent_size is not None:
         found.append(
             f"the object appears {apparent_size:.2f} times as large as its mesh: are the depth's "

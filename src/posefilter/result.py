@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from posefilter.figures.overlay import Shape
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """Where one object is in one image, and how sure that is.
 
@@ -75,6 +75,10 @@ class Result:
     instance: int = field(default=0, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
 
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.3f}" for x in self.pose[:3, 3])
+        return f"{type(self).__name__}({self.describe()}; at ({place}) m)"
+
     @property
     def verdict(self) -> Verdict | None:
         """What to go by: "found", "unsure" or "absent", whichever costs least on average.
@@ -114,7 +118,11 @@ class Result:
             UserError: The checkpoint was not calibrated for sets.
         """
         if self.conformal is None:
-            why = self.calibration_note or "it was calibrated by an earlier version, without sets"
+            why = self.calibration_note or (
+                "it was calibrated by an earlier version, without sets"
+                if self.mask is None
+                else "their guarantee is of one search of the whole image, not of instances"
+            )
             raise UserError(f"{self.object}: has no conformal sets ({why})")
         check_share(level)
         value = self.surface if self.conformal.by == "surface" else self.probability

@@ -1,17 +1,20 @@
 """Which of a run's validations is tested."""
 
 import logging
+import signal
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
-from lightning import LightningModule, Trainer
+from lightning import Callback, LightningModule, Trainer
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from posefilter.cli.best import Best, Last, check_kept
-from posefilter.errors import UserError
+from posefilter.cli.stopping import Stop
+from posefilter.errors import Stopped, UserError
 
 
 class Scored(LightningModule):
@@ -101,3 +104,50 @@ def test_saving_says_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
         assert "weights_only" not in caplog.text
         trainer.save_checkpoint(tmp_path / "other.ckpt")  # what Lightning says by itself
     assert "weights_only" in caplog.text
+
+
+class TwoProcesses:
+    """A trainer of two processes, of which the other decides."""
+
+    world_size = 2
+    callbacks: ClassVar[list[Callback]] = []
+
+    def __init__(self, other: bool) -> None:
+        self.other, self.asked = other, list[bool]()
+        self.strategy = self
+
+    def reduce_boolean_decision(self, decision: bool, all: bool) -> bool:
+        assert not all
+        self.asked.append(decision)
+        return decision or self.other
+
+
+@pytest.mark.parametrize(("mine", "other"), [(True, False), (False, True), (False, False)])
+def test_processes_write_where_the_clock_of_any_says_so(
+    tmp_path: Path, mine: bool, other: bool
+) -> None:
+    """Each asks, whatever its own clock says: else the others would wait for its answer."""
+    last = Last(str(tmp_path), minutes=0 if mine else 60)
+    last._saved_at = time.monotonic()
+    trainer = TwoProcesses(other)
+    assert last._due(trainer) == (mine or other)  # type: ignore[arg-type]
+    assert trainer.asked == [mine]
+
+
+def test_processes_stop_together() -> None:
+    """One that got no signal stops with the one that did, after a checkpoint."""
+    stop = Stop()
+    stop.on_train_batch_start()
+    stop.on_train_batch_end(TwoProcesses(True), None)  # type: ignore[arg-type]
+    with pytest.raises(Stopped):
+        stop.on_train_batch_start()
+
+
+def test_a_signal_between_two_batches_waits_for_the_checkpoint() -> None:
+    stop, alone = Stop(), TwoProcesses(False)
+    alone.world_size = 1
+    stop._note(signal.SIGINT, None)
+    stop.on_train_batch_start()  # nothing was written since the last batch: one more is done
+    stop.on_train_batch_end(alone, None)  # type: ignore[arg-type]
+    with pytest.raises(Stopped):
+        stop.on_train_batch_start()

@@ -174,3 +174,20 @@ def test_symmetries_are_saved_and_files_without_them_are_read(tmp_path: Path) ->
         with pytest.raises(UserError, match=f"{name}.npz: belief: .*symmetries") as caught:
             Belief.load(tmp_path / f"{name}.npz")
         assert "\n" not in str(caught.value)
+
+
+def test_poses_of_three_rows_are_taken_and_what_is_no_pose_is_refused() -> None:
+    samples = np.tile(np.eye(4), (50, 1, 1))
+    samples[:, :3, 3] = np.random.default_rng(0).normal((0, 0, 1), 0.01, (50, 3))
+    belief = Belief(samples, np.full(50, 0.02), np.zeros(3), 0.1, 0.2)
+    pose = samples[0]
+    assert belief.log_density(pose[:3]) == belief.log_density(pose)
+    assert belief.contains(samples[:2, :3]).shape == (2,)
+    for wrong in (2 * pose, np.full((4, 4), np.nan), pose[:3, :3]):
+        with pytest.raises(UserError, match=r"^poses: "):
+            belief.contains(wrong)
+    one, many = (belief.project(K, np.array(x)) for x in ([0.01, 0.02, 0.03], [[0.01, 0.02, 0.03]]))
+    np.testing.assert_array_equal(one.mean, many.mean)
+    assert one.mean.shape == (1, 2)
+    with pytest.raises(UserError, match="points: have shape"):
+        belief.project(K, np.zeros((2, 4)))

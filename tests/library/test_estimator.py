@@ -244,6 +244,9 @@ def test_pictures(small: posefilter.Estimator) -> None:
         ({"intrinsics": np.ones(4)}, "camera matrix"),
         ({"intrinsics": np.array([[300.0, 0, 0], [0, 300, 0], [160, 120, 1]])}, "transposed"),
         ({"intrinsics": np.diag([300.0, 0, 1])}, "fy 0"),
+        ({"intrinsics": np.diag([300.0, 300, 1])}, "principal point .* left out"),
+        ({"intrinsics": np.array([[300.0, 0, 0.5], [0, 300, 0.5], [0, 0, 1]])}, "units of the"),
+        ({"intrinsics": np.array([[300.0, 0, 160], [0, 300, -500], [0, 0, 1]])}, "swapped"),
     ],
 )
 def test_wrong_images_are_refused_in_one_line(change: dict[str, np.ndarray], told: str) -> None:
@@ -251,6 +254,17 @@ def test_wrong_images_are_refused_in_one_line(change: dict[str, np.ndarray], tol
     with pytest.raises(posefilter.UserError, match=told) as caught:
         check_images(**(right | change))
     assert "\n" not in str(caught.value)
+
+
+def test_a_principal_point_far_from_the_middle_is_told(estimator: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene(0, ONE_MODE)
+    result = estimator.predict(rgb, depth, K)
+    assert not any("principal point" in warning for warning in result.warnings)
+    K[:2, 2] = 4.0
+    off = estimator.predict(rgb, depth, K)
+    assert any("principal point is far from the middle" in warning for warning in off.warnings)
+    assert len(repr(result)) < 160
+    assert result.describe() in repr(result)
 
 
 def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:

@@ -110,9 +110,48 @@ def test_nothing_is_lost_with_a_process_that_ends() -> None:
     alone = follow(make_tracker(toys))
     tracker = make_tracker(toys, 2)
     check_same(alone[:5], follow(tracker, range(5)))
-    with pytest.warns(UserWarning, match="has ended"):
-        check_same(alone[5:6], follow(tracker, [5]))
-    check_same(alone[6:], follow(tracker, range(6, FRAMES)))
+    check_same(alone[5:6], follow(tracker, [5]))
+    before = tracker._others.workers[0]  # type: ignore[union-attr]
+    assert before._process.wait(10) == -signal.SIGKILL
+    check_same(alone[6:8], follow(tracker, [6, 7]))
+    tracker.wait()
+    assert tracker._others.workers[0] is not before  # type: ignore[union-attr]
+    check_same(alone[8:], follow(tracker, range(8, FRAMES)))
+
+
+def test_an_interrupted_frame_leaves_no_answer_for_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in a notebook: the cell is interrupted while it waits, and run again."""
+    here, away = SeeingToy(make_poses()), SeeingToy(make_poses(range(FRAMES)))
+    with make_tracker([here, away], 2) as tracker:
+        follow(tracker, range(3))
+        worker = tracker._others.workers[0]  # type: ignore[union-attr]
+
+        def interrupt(self: object) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(type(worker), "receive", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                follow(tracker, [3])
+        assert worker._process.poll() is not None
+        for number in (3, 4):
+            assert [one.found for one in follow(tracker, [number])[0]] == [True, False]
+        tracker.wait()
+        for number in (5, 6, 7):
+            assert [one.found for one in follow(tracker, [number])[0]] == [True, False]
+
+
+def test_a_process_that_ends_again_and_again_is_told() -> None:
+    tracker = make_tracker([SeeingToy(make_poses()) for _ in range(2)], 2)
+    others = tracker._others
+    assert others is not None
+    others._restarts = 0
+    others.workers[0]._process.kill()
+    others.workers[0]._process.wait()
+    with pytest.raises(UserError, match="ended 11 times"):
+        follow(tracker, [0])
 
 
 def test_a_method_that_cannot_be_sent_is_refused() -> None:

@@ -148,12 +148,15 @@ class Belief:
         1 and is never 0.
 
         Args:
-            poses: (*, 4, 4) camera_from_object [m].
+            poses: (*, 4, 4) camera_from_object [m], or (*, 3, 4).
 
         Returns:
             (*) float64 [nat].
+
+        Raises:
+            UserError: They are no rigid transforms.
         """
-        given = torch.from_numpy(np.asarray(poses, dtype=np.float64))
+        given = torch.from_numpy(_as_poses(poses))
         found = log_density(self._density, given.reshape(-1, 4, 4))
         return found.reshape(given.shape[:-2]).numpy()
 
@@ -228,10 +231,16 @@ class Belief:
 
         Args:
             intrinsics: Camera matrix (3, 3) [px].
-            points: (P, 3) in the object's frame [m]; None: its center.
+            points: (P, 3), or one (3,), in the object's frame [m]; None: its center.
             level: Share of the weight within the radius.
+
+        Raises:
+            UserError: The points have another shape.
         """
-        at = self.center[None] if points is None else np.asarray(points, dtype=np.float64)
+        at = self.center if points is None else np.asarray(points, dtype=np.float64)
+        if at.ndim > 2 or at.shape[-1] != 3:
+            raise UserError(f"points: have shape {at.shape}; (P, 3) is due")
+        at = np.atleast_2d(at)
         K = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
 
@@ -290,3 +299,16 @@ class Belief:
 
     def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
         return self._space.mean(samples, weights)
+
+
+def _as_poses(poses: np.ndarray) -> np.ndarray:
+    """Return poses (*, 4, 4) or (*, 3, 4) as float64 (*, 4, 4)."""
+    given = np.asarray(poses, dtype=np.float64)
+    if given.shape[-2:] == (3, 4):
+        last = np.broadcast_to([[0.0, 0, 0, 1]], (*given.shape[:-2], 1, 4))
+        given = np.concatenate([given, last], axis=-2)
+    if given.shape[-2:] != (4, 4):
+        raise UserError(f"poses: have shape {given.shape}; (*, 4, 4) is due")
+    if not np.isfinite(given).all() or not is_rigid(torch.from_numpy(given)):
+        raise UserError("poses: should be rigid transforms")
+    return given

@@ -10,7 +10,6 @@ import pickle
 import subprocess
 import sys
 import threading
-import warnings
 import weakref
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,6 +27,8 @@ _MALLOC = {
     "MALLOC_MMAP_THRESHOLD_": str(2**30),
 }
 
+_MOST_RESTARTS = 10  # of processes that ended
+
 
 class WorkerProcess:
     """One other process; it starts in the background, and can be asked once it is `ready`.
@@ -44,6 +45,7 @@ class WorkerProcess:
             [sys.executable, "-P", "-c", "from posefilter.tracking.worker import main; main()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=None if _has_stderr() else subprocess.DEVNULL,
             env=_MALLOC | dict(os.environ) | own,
         )
         self._error: Exception | None = None
@@ -76,7 +78,13 @@ class WorkerProcess:
                 f"threads=: a second process to track in could not start ({self._error!r}); "
                 "leave threads out to track in one"
             )
-        return self._process.poll() is None
+        return True
+
+    @property
+    def ended(self) -> bool:
+        """Whether it had started, and is no more."""
+        started = not self._starting.is_alive() and self._error is None
+        return started and self._process.poll() is not None
 
     def ask(self, task: Task) -> bool:
         """Give it something to do; tell whether it is still there."""
@@ -104,6 +112,14 @@ class WorkerProcess:
         self._process.stdin.flush()
 
 
+def _has_stderr() -> bool:
+    try:
+        os.fstat(2)
+    except OSError:  # it was closed: its number would be given to something else
+        return False
+    return True
+
+
 def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()  # it holds nothing that could be lost
     process.wait()
@@ -118,7 +134,7 @@ class SideBySide:
 
     What a track remembers goes to the process that updates it and comes back with the answer, so
     that a frame's work can be shared out anew, and nothing is lost with a process. Until another
-    process has started, this one does all by itself.
+    process has started, this one does all by itself. One that ended is replaced.
 
     Args:
         tracks: What to update.
@@ -139,43 +155,59 @@ class SideBySide:
                 f"threads=: {names} cannot be tracked in several processes, since a method cannot "
                 f"be pickled ({error}); leave threads out to track in one"
             ) from error
-        self.workers = [WorkerProcess(content, threads) for _ in range(processes - 1)]
+        self._content, self._threads, self._restarts = content, threads, _MOST_RESTARTS
+        self.workers = [self._start() for _ in range(processes - 1)]
 
     def update(self, frame: Frame) -> list[TrackResult]:
         """Update all tracks with a frame."""
+        self._replace_ended()
         ready = [worker for worker in self.workers if worker.ready]
         shares = share_out([track.burden for track in self.tracks], len(ready) + 1)
         out: dict[int, TrackResult] = {}
-        asked = []
-        for worker, share in zip(ready, shares[1:], strict=True):
-            memories = {i: self.tracks[i].memory for i in share}
-            if worker.ask(Task(frame.images, memories)):
-                asked.append((worker, share))
-        left = set(range(len(self.tracks))) - {i for _, share in asked for i in share}
+        asked: list[tuple[WorkerProcess, list[int]]] = []
+        left = set(range(len(self.tracks)))
         error: Exception | None = None
         try:
+            for worker, share in zip(ready, shares[1:], strict=True):
+                asked.append((worker, share))
+                if worker.ask(Task(frame.images, {i: self.tracks[i].memory for i in share})):
+                    left -= set(share)
+                else:
+                    asked.pop()
             out |= {i: self.tracks[i].update(frame) for i in sorted(left)}
-        finally:  # an answer that is left unread would be taken for the next frame's
-            for worker, share in asked:
+            while asked:
+                worker, share = asked[0]
                 try:
                     answers = worker.receive()
-                except EOFError:
-                    continue
+                except EOFError:  # it has ended; its share is done below
+                    answers = []
+                asked.pop(0)
                 if isinstance(answers, Exception):
                     error = answers
-                    continue
-                out |= self._restore(share, answers)
+                elif answers:
+                    out |= self._restore(share, answers)
+        finally:  # an answer that was not read would be taken for that of the next frame
+            for worker, _ in asked:
+                worker.close()
         if error is not None:
             raise error
-        missing = set(range(len(self.tracks))) - set(out)
-        if missing:
-            warnings.warn(
-                "a process that tracked objects has ended, perhaps for want of memory; "
-                "the others go on with its share",
-                stacklevel=2,
-            )
-            out |= {i: self.tracks[i].update(frame) for i in sorted(missing)}
+        out |= {i: self.tracks[i].update(frame) for i in range(len(self.tracks)) if i not in out}
         return [out[i] for i in range(len(self.tracks))]
+
+    def _replace_ended(self) -> None:
+        """Start a process anew in the place of one that has ended."""
+        for number, worker in enumerate(self.workers):
+            if worker.ended:
+                if self._restarts == 0:
+                    raise UserError(
+                        f"threads=: processes that track objects ended {_MOST_RESTARTS + 1} times, "
+                        "perhaps for want of memory; leave threads out to track in one"
+                    )
+                self._restarts -= 1
+                self.workers[number] = self._start()
+
+    def _start(self) -> WorkerProcess:
+        return WorkerProcess(self._content, self._threads)
 
     def _restore(self, share: Sequence[int], answers: list[Answer]) -> dict[int, TrackResult]:
         return {i: restore(self.tracks[i], x) for i, x in zip(share, answers, strict=True)}

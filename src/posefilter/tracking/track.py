@@ -35,7 +35,7 @@ from posefilter.types import Batch, Belief, Particles, Trace
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TrackResult(Result):
     """Where a tracked object is in a frame.
 

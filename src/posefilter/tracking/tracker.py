@@ -8,7 +8,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator, get_trained_size
-from posefilter.images import Images, check_images, check_intrinsics
+from posefilter.images import Images, check_depth_unit, check_images, check_intrinsics
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import SideBySide
 from posefilter.tracking.settings import TrackerSettings
@@ -52,7 +52,11 @@ class Tracker:
         seed: int = 0,
         threads: int | None = None,
     ) -> None:
-        estimators = [estimator] if isinstance(estimator, Estimator) else [*estimator]
+        estimators = [estimator] if isinstance(estimator, Estimator) else estimator
+        if not isinstance(estimators, (list, tuple)) or not all(
+            isinstance(one, Estimator) for one in estimators
+        ):
+            raise UserError("a tracker needs what posefilter.load returns, or a list of such")
         methods = [method for one in estimators for method in one.methods]
         if not methods:
             raise UserError("a tracker needs an estimator of one object at least")
@@ -111,6 +115,12 @@ class Tracker:
         if self._others is not None:
             self._others.close()
 
+    def __enter__(self) -> "Tracker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def reset(self) -> None:
         """Forget all objects: the next frame is the first of another video."""
         self._size = None
@@ -128,7 +138,9 @@ class Tracker:
             and depth.shape == self._size
         )
         if fast:
-            return Images(rgb[None], depth[None], check_intrinsics(np.asarray(intrinsics), 1))
+            check_depth_unit(depth)
+            K = check_intrinsics(np.asarray(intrinsics), 1, depth.shape)
+            return Images(rgb[None], depth[None], K)
         images, batched = check_images(rgb, depth, intrinsics, empty=self._size is not None)
         if batched:
             raise UserError("rgb: a tracker takes one frame after the other, not a batch")

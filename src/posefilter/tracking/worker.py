@@ -79,5 +79,8 @@ def main() -> None:
             content = pickle.dumps(answer, pickle.HIGHEST_PROTOCOL)
         except Exception:  # an exception may hold anything
             content = pickle.dumps(RuntimeError(f"{type(answer).__name__}: {answer}"))
-        answers.write(content)
-        answers.flush()
+        try:
+            answers.write(content)
+            answers.flush()
+        except BrokenPipeError:  # the other process has ended
+            os._exit(0)

@@ -55,6 +55,20 @@ def find_focal_flaw(K: np.ndarray, width: int) -> str:
     return f"fx {fx:g}, fy {fy:g} px for an image {width} px wide"
 
 
+def find_center_flaw(K: np.ndarray, width: int, height: int) -> str:
+    """Return why a principal point cannot be right for images of a size [px], "" where it may be.
+
+    That of a part of an image may lie outside of it.
+    """
+    cx, cy = float(K[0, 2]), float(K[1, 2])
+    at = f"({cx:g}, {cy:g}) of {width}x{height}"
+    if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
+        return f"{at}; another resolution's, or swapped with fx?"
+    if 0 <= cx <= 1 and 0 <= cy <= 1:
+        return f"{at}; left out, or in units of the image's size?"
+    return ""
+
+
 def check_units(units: float, path: Path, key: str) -> None:
     """Refuse a depth scale that no camera has.  units: of the depth image, a meter.
 
@@ -97,10 +111,9 @@ def check_sample(sample: Sample, camera_from_native: np.ndarray, files: tuple[Pa
     flaw = find_focal_flaw(K, width)
     if flaw:
         raise Implausible(camera, "focal lengths are not plausible", flaw, sample)
-    cx, cy = float(K[0, 2]), float(K[1, 2])
-    if not (-width / 2 <= cx <= 1.5 * width and -height / 2 <= cy <= 1.5 * height):
-        detail = f"({cx:g}, {cy:g}) of {width}x{height}; another resolution's, or swapped with fx?"
-        raise Implausible(camera, "principal point is far outside of the image", detail, sample)
+    flaw = find_center_flaw(K, width, height)
+    if flaw:
+        raise Implausible(camera, "principal point is not plausible", flaw, sample)
     z = float(camera_from_native[2, 3])
     if not (z > 0 and math.hypot(*camera_from_native[:3, 3]) <= FARTHEST):
         where = "behind the camera" if z <= 0 else f"{z:.3g} m away; wrong unit?"
