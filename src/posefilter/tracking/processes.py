@@ -189,6 +189,7 @@ class SideBySide:
         finally:  # an answer that was not read would be taken for that of the next frame
             for worker, _ in asked:
                 worker.close()
+                self._restarts += 1  # it did not end by itself
         if error is not None:
             raise error
         out |= {i: self.tracks[i].update(frame) for i in range(len(self.tracks)) if i not in out}
