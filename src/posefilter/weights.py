@@ -1,5 +1,6 @@
 """Find trained weights by path or by name, and fetch those that are elsewhere."""
 
+import difflib
 import os
 from collections.abc import Sequence
 from fnmatch import fnmatch
@@ -50,7 +51,12 @@ def find_weights(weights: str | Path | None) -> Path:
     if path.suffix == ".ckpt" and path.stem in shipped:  # as in a clone, typed elsewhere
         raise UserError(f"checkpoint={weights}: no such file; did you mean checkpoint={path.stem}?")
     known = ", ".join(sorted(shipped)) or "none"
-    raise UserError(f"checkpoint={weights}: no such file, and no weights of that name ({known})")
+    near = [one for one in shipped if name.lower() and name.lower() in one.lower()]
+    near = near or difflib.get_close_matches(name.lower(), shipped, 1)
+    meant = f"; did you mean {near[0]}?" if len(near) == 1 else ""
+    raise UserError(
+        f"checkpoint={weights}: no such file, and no weights of that name ({known}){meant}"
+    )
 
 
 def list_shipped() -> dict[str, Path]:

@@ -270,7 +270,8 @@ def test_a_principal_point_far_from_the_middle_is_told(estimator: posefilter.Est
 def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:
     for what, told in (
         (tmp_path / "none.ckpt", "no such file, and no weights of that name"),
-        ("004_suger_box", "003_cracker_box"),
+        ("004_suger_box", "did you mean 004_sugar_box"),
+        ("Cracker_box", "did you mean 003_cracker_box"),
         ([], "one object at least"),
     ):
         with pytest.raises(posefilter.UserError, match=told):

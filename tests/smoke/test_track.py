@@ -60,6 +60,17 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert run_command("track", HOME, typed) == 2  # nothing is overwritten
 
 
+def test_what_is_lost_in_every_frame_is_told_with_a_cause(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}", "depth_scale=600"]
+    assert run_command("track", HOME, typed) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (warned,) = (line for line in lines if line["event"] == "warning")
+    assert warned["object"] == "003_cracker_box"
+    assert "depth_scale" in warned["reason"]
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.25])
 def test_a_wrong_depth_scale_is_told_once(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float

@@ -1,5 +1,6 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -71,6 +72,8 @@ def track(job: Job) -> None:
             files[view.stem] = view
         if cfg.video != "none":
             files[name] = writer.path
+    for name in estimator.objects:
+        _say_all_lost(name, [row.result for row in rows if row.result.object == name], cfg)
     write_rows(folder, [finite(describe_row(row)) for row in rows])
     write_poses_csv(folder / POSES, [to_pose_row(row, native) for row in rows if row.result.found])
     metrics = {
@@ -119,6 +122,20 @@ def follow(
                     said = f"warning: frame {frame.name}: {'; '.join(result.warnings)}"
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
                 yield make_row(video.name, frame.name, ids, result, truth)
+
+
+def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) -> None:
+    """Say why, where an object is lost in every frame and its guesses are implausible."""
+    if not results or any(one.found for one in results):
+        return
+    kinds: dict[str, list[str]] = {}  # numbers differ from frame to frame
+    for warning in (warning for one in results for warning in one.warnings):
+        kinds.setdefault(re.sub(r"[\d.]+", "", warning), []).append(warning)
+    if kinds:
+        most = max(kinds.values(), key=len)
+        reason, frames = most[0], len(most)
+        said = f"warning: {name} is found in no frame; in {frames} of {len(results)} {reason}"
+        say(cfg.console, "warning", said, object=name, frames=frames, reason=reason)
 
 
 def draw_frame(
