@@ -191,3 +191,13 @@ def test_poses_of_three_rows_are_taken_and_what_is_no_pose_is_refused() -> None:
     assert one.mean.shape == (1, 2)
     with pytest.raises(UserError, match="points: have shape"):
         belief.project(K, np.zeros((2, 4)))
+
+
+def test_a_file_is_found_by_the_name_that_it_was_saved_by(tmp_path: Path) -> None:
+    samples = np.tile(np.eye(4), (5, 1, 1))
+    Belief(samples, np.full(5, 0.2), np.zeros(3), 0.1, 0.2, "duck").save(tmp_path / "belief")
+    assert (tmp_path / "belief.npz").is_file()
+    for name in ("belief", "belief.npz"):
+        assert Belief.load(tmp_path / name).object == "duck"
+    with pytest.raises(UserError, match="no such file"):
+        Belief.load(tmp_path / "other")

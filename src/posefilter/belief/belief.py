@@ -245,7 +245,7 @@ class Belief:
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
 
     def save(self, path: str | Path) -> None:
-        """Write the belief as an .npz file; `Belief.load` reads it.
+        """Write the belief as an .npz file; `Belief.load` reads it. The ending is added if missing.
 
         Its arrays are `poses` (N, 4, 4) and `weights` (N,) in float32, and `center`, `radius`,
         `diameter`, `object` and `symmetries`.

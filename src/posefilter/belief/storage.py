@@ -17,11 +17,15 @@ def write_arrays(path: str | Path, poses: np.ndarray, weights: np.ndarray, **oth
     Raises:
         UserError: The file cannot be written.
     """
-    file = Path(path)
-    file = file if file.suffix == ".npz" else file.with_name(f"{file.name}.npz")
+    file = _with_suffix(path)
     poses, weights = poses.astype(np.float32), weights.astype(np.float32)
     with open_whole(file, sync=False) as stream:
         np.savez_compressed(stream, poses=poses, weights=weights, **others)
+
+
+def _with_suffix(path: str | Path) -> Path:
+    file = Path(path)
+    return file if file.suffix == ".npz" else file.with_name(f"{file.name}.npz")
 
 
 def read_arrays(path: str | Path) -> dict[str, Any]:
@@ -30,7 +34,7 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
     Raises:
         UserError: The file is missing, or holds no belief.
     """
-    file = Path(path)
+    file = Path(path) if Path(path).is_file() else _with_suffix(path)
     if not file.is_file():
         raise UserError(f"{path}: no such file")
     try:
