@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 import torch
@@ -122,6 +123,7 @@ class Estimator:
 
     def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
         """Find several instances: a list of results an image, the most probable first."""
+        check_seed(seed)
         for method in self.methods:
             method.seed = seed
         size = (images.depth.shape[1], images.depth.shape[2])
@@ -150,6 +152,7 @@ class Estimator:
 
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did."""
+        check_seed(seed)
         runs = []
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
@@ -165,6 +168,16 @@ class Estimator:
             seconds = (time.perf_counter() - start) / len(images.depth)
             runs.append(Run(method, batch, trace, seconds, found, surface, apparent))
         return runs
+
+
+def check_seed(seed: Any) -> None:
+    """Refuse what is no seed.
+
+    Raises:
+        UserError: It is no whole number, 0 or more.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
+        raise UserError(f"seed={seed!r}: a whole number, 0 or more, is due")
 
 
 def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) -> list[int]:
@@ -184,8 +197,9 @@ def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) 
     rest = 1 if isinstance(instances, Mapping) else instances
     counts = [wanted.get(name, rest) for name in objects]
     for count in counts:
-        if not isinstance(count, int) or isinstance(count, bool) or not 1 <= count <= _MOST:
-            raise UserError(f"instances={count}: a whole number from 1 to {_MOST} is due")
+        whole = isinstance(count, Integral) and not isinstance(count, bool)
+        if not whole or not 1 <= count <= _MOST:
+            raise UserError(f"instances={count!r}: a whole number from 1 to {_MOST} is due")
     return counts
 
 

@@ -328,3 +328,11 @@ def test_every_public_name_is_documented() -> None:
         assert isinstance(thing, str) or len(thing.__doc__ or "") > 40, name
     for name in ("load", "compose", "build"):
         assert "Raises:" in getattr(posefilter, name).__doc__
+
+
+@pytest.mark.parametrize("seed", ["a", None, 1.5, -1, True])
+def test_what_is_no_seed_is_refused_in_one_line(small: posefilter.Estimator, seed: object) -> None:
+    with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):
+        small.predict(*read_scene(), seed=seed)  # type: ignore[arg-type]
+    with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):
+        posefilter.Tracker(small, seed=seed)  # type: ignore[arg-type]

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from posefilter.errors import UserError
-from posefilter.estimator import Estimator, get_trained_size
+from posefilter.estimator import Estimator, check_seed, get_trained_size
 from posefilter.images import Images, check_depth_unit, check_images, check_intrinsics
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.processes import SideBySide
@@ -60,6 +60,7 @@ class Tracker:
         methods = [method for one in estimators for method in one.methods]
         if not methods:
             raise UserError("a tracker needs an estimator of one object at least")
+        check_seed(seed)
         self.settings = settings or TrackerSettings()
         self.tracks = tuple(
             Track(
