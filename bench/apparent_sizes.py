@@ -19,9 +19,9 @@ from held_out import read_frames
 from marked import format_row, put_table
 
 import posefilter
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.confidence.verdicts import decide
 from posefilter.data.frames import Sample
+from posefilter.memory import keep_freed_memory
 from posefilter.weights import list_shipped
 
 PAGE = Path(__file__).parents[1] / "docs" / "belief.md"

@@ -21,9 +21,9 @@ from marked import format_row, put_table
 from torch.utils.flop_counter import FlopCounterMode
 
 import posefilter
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.memory import keep_freed_memory
 from posefilter.nets.layers import fast_bfloat16
 
 PAGE = Path(__file__).parents[1] / "docs" / "performance.md"

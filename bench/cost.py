@@ -24,8 +24,8 @@ from marked import put_table
 import posefilter
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.images import check_images, make_batch
+from posefilter.memory import keep_freed_memory
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch
 

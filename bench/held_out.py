@@ -28,10 +28,10 @@ import torch
 from marked import format_row, put_table, read_rows
 
 import posefilter
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import split_records
+from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 

@@ -31,8 +31,8 @@ import torch
 from marked import put_table
 from peer_process import Peer, PeerError
 
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.readers.registry import open_meshes
+from posefilter.memory import keep_freed_memory
 
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "peers.md"

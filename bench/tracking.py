@@ -30,9 +30,9 @@ import numpy as np
 import torch
 
 import posefilter
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import SceneVideo, VideoFrame, list_groups
+from posefilter.memory import keep_freed_memory
 from posefilter.meshes import ycb
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc

@@ -10,7 +10,6 @@ import torch
 from peer_process import serve
 from torch import Generator, Tensor
 
-from posefilter.cli.machine import keep_freed_memory
 from posefilter.filters.estimate import Argmax
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
@@ -19,6 +18,7 @@ from posefilter.filters.resample import Systematic
 from posefilter.filters.reweight import Sequential
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.memory import keep_freed_memory
 from posefilter.types import Batch, ParticleOutput, Particles, Step
 
 

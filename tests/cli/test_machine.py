@@ -13,7 +13,7 @@ from posefilter.cli.machine import settle_processes
 
 TEN_LARGE = """
 import resource, torch
-from posefilter.cli.machine import keep_freed_memory
+from posefilter.memory import keep_freed_memory
 
 def faults():
     torch.ones(16_000_000)

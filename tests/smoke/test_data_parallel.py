@@ -14,17 +14,22 @@ from tests.smoke.conftest import TINY
 HOME = Path(__file__).parents[2]
 
 
+def command(scenes: Path, out: Path, steps: int, *more: str) -> tuple[list[str], dict[str, str]]:
+    """Return what starts a training in two processes, and its environment."""
+    words = [*TINY, f"data.root={scenes}", "model=cnn_patch", "callbacks=checkpoints"]
+    words += ["trainer.accelerator=cpu", "trainer.devices=2", f"trainer.max_steps={steps}"]
+    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
+    words += [f"trainer.val_check_interval={steps}", "data.batch_size=2", "console=json", *more]
+    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    return [sys.executable, str(HOME / "train.py"), *words], clean
+
+
 @pytest.mark.slow
 def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path) -> None:
     out = tmp_path / "run"
-    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
-    words += ["trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=2"]
-    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
-    words += ["trainer.val_check_interval=2", "data.batch_size=2", "console=json"]
-    command = [sys.executable, str(HOME / "train.py"), *words]
-    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    words, clean = command(tiny_scenes, out, 2)
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=600, cwd=tmp_path, env=clean
+        words, capture_output=True, text=True, timeout=600, cwd=tmp_path, env=clean
     )
     assert done.returncode == 0, done.stderr
     events = [json.loads(line) for line in done.stdout.splitlines() if line[:1] == "{"]
@@ -42,15 +47,9 @@ def test_two_processes_agree_on_when_to_write_what_a_run_goes_on_from(
 ) -> None:
     """Their clocks differ: one that wrote alone would wait for the other for ever."""
     out = tmp_path / "run"
-    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
-    words += ["trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=40"]
-    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
-    words += ["trainer.val_check_interval=40", "data.batch_size=2", "console=json"]
-    words += ["callbacks.last.minutes=0.012"]
-    command = [sys.executable, str(HOME / "train.py"), *words]
-    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    words, clean = command(tiny_scenes, out, 40, "callbacks.last.minutes=0.012")
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=clean
+        words, capture_output=True, text=True, timeout=300, cwd=tmp_path, env=clean
     )
     assert done.returncode == 0, done.stderr
     # several were written on the way, and the last is whole
@@ -62,14 +61,9 @@ def test_two_processes_agree_on_when_to_write_what_a_run_goes_on_from(
 def test_two_processes_stop_together(tmp_path: Path, tiny_scenes: Path) -> None:
     """A signal reaches them at different steps; the run is left where it can be gone on with."""
     out = tmp_path / "run"
-    words = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
-    words += ["trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=4000"]
-    words += ["trainer.strategy=ddp_find_unused_parameters_true", "threads=1", f"out={out}"]
-    words += ["trainer.val_check_interval=4000", "data.batch_size=2", "console=json"]
-    command = [sys.executable, str(HOME / "train.py"), *words]
-    clean = {k: v for k, v in os.environ.items() if "RANK" not in k and "WORLD" not in k}
+    words, clean = command(tiny_scenes, out, 4000)
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
         env=clean, start_new_session=True,
     ) as process:  # fmt: skip
         assert process.stdout is not None

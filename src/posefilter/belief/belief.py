@@ -22,7 +22,7 @@ from posefilter.belief.summaries import (
 )
 from posefilter.errors import UserError
 from posefilter.filters.modes import APART, Modes, find_pose_modes
-from posefilter.geometry.pose import is_rigid, origin_of
+from posefilter.geometry.pose import is_rigid, make_pose, origin_of
 from posefilter.geometry.pose_density import (
     PoseDensity,
     fit_density,
@@ -305,8 +305,8 @@ def _as_poses(poses: np.ndarray) -> np.ndarray:
     """Return poses (*, 4, 4) or (*, 3, 4) as float64 (*, 4, 4)."""
     given = np.asarray(poses, dtype=np.float64)
     if given.shape[-2:] == (3, 4):
-        last = np.broadcast_to([[0.0, 0, 0, 1]], (*given.shape[:-2], 1, 4))
-        given = np.concatenate([given, last], axis=-2)
+        top = torch.from_numpy(given)
+        given = make_pose(top[..., :3], top[..., 3]).numpy()
     if given.shape[-2:] != (4, 4):
         raise UserError(f"poses: have shape {given.shape}; (*, 4, 4) is due")
     if not np.isfinite(given).all() or not is_rigid(torch.from_numpy(given)):

@@ -28,6 +28,7 @@ from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
+from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
 from posefilter.metrics.collect import BoxIoU, PoseErrors
@@ -40,7 +41,6 @@ from posefilter.types import Batch, ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
 _BATCH = 8  # images without the object
-_FEWEST = 3  # images that tell a dataset's scale
 _SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
 
 
@@ -60,7 +60,10 @@ def evaluate(job: Job) -> float:
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
     files = {"metrics": job.folder / "metrics.json", **files}
-    _warn_of_size(metrics, job)
+    size = metrics.get("apparent_size") or {}
+    mismatch = describe_mismatch(size, metrics["data"]["root"])
+    if mismatch:
+        say(job.cfg.console, "warning", f"warning: {mismatch}", **size)
     following = (
         [typed("report", run=job.folder)]
         if (job.folder / ".hydra").is_dir() and not job.swept
@@ -109,19 +112,6 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return record(
         method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
     ), files
-
-
-def _warn_of_size(metrics: dict[str, Any], job: Job) -> None:
-    """Say so where most images show the object in a size that cannot be."""
-    size = metrics.get("apparent_size")
-    if size is None or size["images"] < _FEWEST or 2 * size["contradicting"] <= size["images"]:
-        return
-    said = (
-        f"warning: the object appears {size['ratio']:.2f} times its size (median of "
-        f"{size['images']} images): the depth, the intrinsics or the mesh's unit are not those of "
-        f"data.root={job.cfg.data.root}"
-    )
-    say(job.cfg.console, "warning", said, **size)
 
 
 def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:

@@ -1,6 +1,5 @@
 """Threads, seeds, and what to remember of the machine and the code that made a result."""
 
-import ctypes
 import multiprocessing
 import platform
 import subprocess
@@ -10,6 +9,8 @@ from pathlib import Path
 import cv2
 import lightning
 import torch
+
+from posefilter.memory import keep_freed_memory
 
 _PACKAGES = (
     "posefilter",
@@ -21,10 +22,6 @@ _PACKAGES = (
     "scipy",
     "opencv-python-headless",
 )
-
-
-# glibc's M_TRIM_THRESHOLD, M_TOP_PAD and M_MMAP_THRESHOLD [bytes]
-_MALLOC = {-1: 2**31 - 1, -2: 2**26, -3: 2**30}
 
 
 def settle(threads: int | None, seed: int) -> None:
@@ -46,19 +43,6 @@ def settle_processes() -> None:
     usual = multiprocessing.get_all_start_methods()
     if multiprocessing.get_start_method(allow_none=True) not in (None, *usual):
         multiprocessing.set_start_method(usual[0], force=True)
-
-
-def keep_freed_memory() -> bool:
-    """Have the C library keep what is freed for the tensors to come; tell whether it can (glibc).
-
-    By default each large tensor is mapped anew and given back, and the system fills its pages with
-    zeros every time: more than half of a filter's time on a processor.
-    """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt = ctypes.CDLL(None).mallopt
-    taken = [mallopt(option, value) == 1 for option, value in _MALLOC.items()]
-    return all(taken)
 
 
 def versions() -> dict[str, str]:

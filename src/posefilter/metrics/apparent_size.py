@@ -1,11 +1,14 @@
 """How large an object appears over a dataset: whether the depth and the intrinsics are right."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from posefilter.metrics.collect import Rows, concat_state
+
+_FEWEST = 3  # images that tell a dataset's scale
 
 
 class ApparentSizes(Rows):
@@ -30,3 +33,18 @@ class ApparentSizes(Rows):
             "ratio": float(scale.quantile(0.5)),
             "contradicting": int(contradicts.sum()),
         }
+
+
+def describe_mismatch(size: Mapping[str, Any], root: str) -> str:
+    """Return in words that most images show the object in a size that cannot be; "" if not so.
+
+    Args:
+        size: What `ApparentSizes` computed, or nothing.
+        root: The dataset's folder.
+    """
+    if not size or size["images"] < _FEWEST or 2 * size["contradicting"] <= size["images"]:
+        return ""
+    return (
+        f"the object appears {size['ratio']:.2f} times its size (median of {size['images']} "
+        f"images): the depth, the intrinsics or the mesh's unit are not those of data.root={root}"
+    )

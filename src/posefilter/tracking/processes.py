@@ -20,13 +20,6 @@ from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult
 from posefilter.tracking.worker import Answer, Start, Task, restore
 
-# glibc is to keep what is freed for the tensors to come, instead of mapping each of them anew
-_MALLOC = {
-    "MALLOC_TRIM_THRESHOLD_": str(2**31 - 1),
-    "MALLOC_TOP_PAD_": str(2**26),
-    "MALLOC_MMAP_THRESHOLD_": str(2**30),
-}
-
 _MOST_RESTARTS = 10  # of processes that ended
 
 
@@ -46,7 +39,7 @@ class WorkerProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=None if _has_stderr() else subprocess.DEVNULL,
-            env=_MALLOC | dict(os.environ) | own,
+            env=dict(os.environ) | own,
         )
         self._error: Exception | None = None
         self.close = weakref.finalize(self, _end, self._process)
@@ -165,21 +158,18 @@ class SideBySide:
         shares = share_out([track.burden for track in self.tracks], len(ready) + 1)
         out: dict[int, TrackResult] = {}
         asked: list[tuple[WorkerProcess, list[int]]] = []
-        left = set(range(len(self.tracks)))
         error: Exception | None = None
         try:
             for worker, share in zip(ready, shares[1:], strict=True):
                 asked.append((worker, share))
-                if worker.ask(Task(frame.images, {i: self.tracks[i].memory for i in share})):
-                    left -= set(share)
-                else:
-                    asked.pop()
-            out |= {i: self.tracks[i].update(frame) for i in sorted(left)}
+                if not worker.ask(Task(frame.images, {i: self.tracks[i].memory for i in share})):
+                    asked.pop()  # it has ended; its share is done below
+            out |= {i: self.tracks[i].update(frame) for i in shares[0]}
             while asked:
                 worker, share = asked[0]
                 try:
                     answers = worker.receive()
-                except EOFError:  # it has ended; its share is done below
+                except EOFError:  # it has ended, likewise
                     answers = []
                 asked.pop(0)
                 if isinstance(answers, Exception):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 
 from posefilter.images import Images
+from posefilter.memory import keep_freed_memory
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Memory, Track, TrackResult
 
@@ -59,6 +60,7 @@ def main() -> None:
     # what is printed here must not end up between the answers
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    keep_freed_memory()
     tracks: tuple[Track, ...] = ()
     while True:
         answer: Any
