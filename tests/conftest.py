@@ -1,6 +1,7 @@
 """Fixtures shared by every test."""
 
 import importlib.util
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +18,19 @@ import yaml
 def seeded() -> None:
     """Let every test draw the same numbers each time, and whatever ran before it."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def leave_no_log_handlers() -> Iterator[None]:
+    """Take out of the log what a command put there: its handlers write to the streams of the test
+    that ran it, which are closed when the next one logs.
+    """
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    yield
+    for handler in [one for one in root.handlers if one not in handlers]:
+        root.removeHandler(handler)
+    root.setLevel(level)
 
 
 @pytest.fixture(scope="session", autouse=True)
