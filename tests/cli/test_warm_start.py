@@ -9,11 +9,12 @@ import torch
 
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
-from posefilter.cli.warm_start import warm_start
+from posefilter.cli.warm_start import read_starts, warm_start
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore, object_model
 from posefilter.models.base import PoseEstimator
 from posefilter.models.quantization import pack
+from posefilter.weights import list_shipped
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -45,7 +46,7 @@ def test_weights_are_copied_and_the_object_stays(model: str, tmp_path: Path) -> 
         for name, value in old.named_buffers():
             if name.endswith("running_mean"):
                 value.fill_(0.25)
-    copied, left = warm_start(new, {"state_dict": old.state_dict()})
+    copied, left = warm_start(new, [{"state_dict": old.state_dict()}])
     assert (copied > 20, left) == (True, 0)
     theirs = dict(old.named_parameters())
     for name, value in new.named_parameters():
@@ -63,7 +64,7 @@ def test_exported_weights_are_read_too(tmp_path: Path) -> None:
         build(tmp_path, "carton", 0, "model=pose_pf"),
         build(tmp_path, "carton", 1, "model=pose_pf"),
     )
-    warm_start(new, {"state_dict": pack(old.state_dict())})
+    warm_start(new, [{"state_dict": pack(old.state_dict())}])
     there = old.state_dict()
     for name, value in new.named_parameters():
         off = (value.detach() - there[name]).abs().max()
@@ -76,4 +77,30 @@ def test_weights_of_another_method_are_refused(tmp_path: Path) -> None:
         build(tmp_path, "carton", 1, "model=patch_pf"),
     )
     with pytest.raises(UserError, match="warm_start: only"):
-        warm_start(new, {"state_dict": old.state_dict()})
+        warm_start(new, [{"state_dict": old.state_dict()}])
+
+
+def test_several_start_as_their_mean_and_what_one_lacks_is_of_the_others(tmp_path: Path) -> None:
+    one, two, new = (build(tmp_path, "carton", seed, "model=pose_pf") for seed in (0, 1, 2))
+    there = {name: value.clone() for name, value in two.state_dict().items()}
+    lacking = next(name for name, _ in one.named_parameters() if "likelihood" in name)
+    del there[lacking]
+    copied, left = warm_start(new, [{"state_dict": one.state_dict()}, {"state_dict": there}])
+    assert (copied > 20, left) == (True, 0)
+    for name, value in new.named_parameters():
+        first = dict(one.named_parameters())[name]
+        mean = first if name == lacking else (first + there[name]) / 2
+        torch.testing.assert_close(value, mean, msg=name)
+
+
+def test_of_several_the_one_of_the_same_object_is_left_out() -> None:
+    def names(weights: object, own: str) -> list[str]:
+        return [one["object_model"]["name"] for one in read_starts(weights, own)]
+
+    pair = ["003_cracker_box", "011_banana"]
+    assert names(pair, "025_mug") == pair
+    assert names(pair, "011_banana") == ["003_cracker_box"]
+    assert names("011_banana", "011_banana") == ["011_banana"]
+    assert len(names("all", "025_mug")) == len(list_shipped()) - 1
+    with pytest.raises(UserError, match="no_such_weights"):
+        read_starts(["003_cracker_box", "no_such_weights"], "025_mug")

@@ -137,8 +137,11 @@ class Onboarding:
             f"threads={'null' if self.cfg.threads is None else self.cfg.threads}",
             f"console={self.cfg.console}",
         ]
-        if self.cfg.warm_start is not None:
-            words.append(f"warm_start='{self.cfg.warm_start}'")
+        start = _plain(self.cfg.warm_start)
+        if isinstance(start, list):
+            words.append("warm_start=[" + ",".join(f"'{one}'" for one in start) + "]")
+        elif start is not None:
+            words.append(f"warm_start='{start}'")
         words += [*map(str, self.cfg.settings), *more]
         composed = compose_job("train", find_conf(), words, folder)
         return Job(composed.cfg, composed.choices, words, folder, "train", True)

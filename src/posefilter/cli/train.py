@@ -21,7 +21,7 @@ from posefilter.cli.ranks import is_follower
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import finished, learned_from, start_from, take_over
-from posefilter.cli.warm_start import warm_start
+from posefilter.cli.warm_start import read_starts, warm_start
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError
 from posefilter.metrics.results import compute_checkpoint_score
@@ -74,10 +74,12 @@ def build(job: Job) -> Run:
     data.setup("fit")
     method.set_object(data.object_model(0))
     if job.cfg.warm_start:
-        copied, left = warm_start(method, read_checkpoint(job.cfg.warm_start))
+        starts = read_starts(job.cfg.warm_start, data.object_model(0).name)
+        copied, left = warm_start(method, starts)
         log.info(
-            "warm start from %s: %d tensors copied, %d left as drawn",
+            "warm start from %s (%d files): %d tensors copied, %d left as drawn",
             job.cfg.warm_start,
+            len(starts),
             copied,
             left,
         )

@@ -1,50 +1,86 @@
-"""Begin a run with the weights of a finished one, of another object or other data: most of what is
+"""Begin a run with the weights of finished ones, of other objects or other data: most of what is
 learned is shared.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.models.quantization import unpack
+from posefilter.weights import expand_weights
 
 _STATISTICS = ("running_mean", "running_var", "num_batches_tracked")  # of batch normalization
 
 
-def warm_start(method: PoseEstimator, checkpoint: dict[str, Any]) -> tuple[int, int]:
-    """Copy a checkpoint's weights into a method, wherever name and shape agree.
+def read_starts(weights: Any, own: str) -> list[dict[str, Any]]:
+    """Return the checkpoints that a training begins with.
+
+    Args:
+        weights: What `warm_start=` says: a checkpoint, `all` for those that ship, a pattern or a
+            list of such (see `expand_weights`).
+        own: Name of the object to be learned. Of several checkpoints, one that was trained on it
+            is left out: a start from `all` is that of an object which is new.
+
+    Raises:
+        UserError: There is no such checkpoint, or it is unreadable.
+    """
+    found = [read_checkpoint(one) for one in expand_weights(weights)]
+    others = [one for one in found if _object_of(one) != own]
+    return found if len(found) == 1 or not others else others
+
+
+def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> tuple[int, int]:
+    """Copy the mean of checkpoints' weights into a method, wherever name and shape agree.
+
+    Networks that were trained from a common ancestor lie in one basin of the loss, so that their
+    mean is a network that keeps what they share (Wortsman et al. 2022, *Model soups*).
 
     Buffers that describe the object (such as the fragments of its surface) stay the method's own;
     the statistics of batch normalization are copied.
 
     Args:
         method: to be trained; it knows its own object already.
-        checkpoint: of the same method, whole or as `export.py` writes it.
+        checkpoints: of the same method, whole or as `export.py` writes them. A tensor that only
+            some of them have is the mean of those.
 
     Returns:
         How many tensors were copied, and how many of the method's were not found.
 
     Raises:
-        UserError: if fewer than half of the method's tensors fit.
+        UserError: if fewer than half of the method's tensors fit one of the checkpoints.
     """
-    there = unpack(checkpoint["state_dict"])
+    states = [unpack(one["state_dict"]) for one in checkpoints]
     wanted = {name: value.data for name, value in method.named_parameters()}
     wanted |= {
         name: value
         for name, value in method.named_buffers()
         if name.rsplit(".", 1)[-1] in _STATISTICS
     }
-    fitting = [
-        name for name, value in wanted.items() if name in there and there[name].shape == value.shape
-    ]
-    if len(fitting) < len(wanted) / 2:
-        raise UserError(
-            f"warm_start: only {len(fitting)} of {len(wanted)} tensors fit; "
-            "the checkpoint is of another model, or of other widths"
-        )
+    for state in states:
+        count = sum(_fits(state, name, value) for name, value in wanted.items())
+        if count < len(wanted) / 2:
+            raise UserError(
+                f"warm_start: only {count} of {len(wanted)} tensors fit; "
+                "the checkpoint is of another model, or of other widths"
+            )
+    copied = 0
     with torch.no_grad():
-        for name in fitting:
-            wanted[name].copy_(there[name])
-    return len(fitting), len(wanted) - len(fitting)
+        for name, value in wanted.items():
+            found = [state[name].to(value) for state in states if _fits(state, name, value)]
+            if found:
+                value.copy_(found[0] if len(found) == 1 else torch.stack(found).double().mean(0))
+                copied += 1
+    return copied, len(wanted) - copied
+
+
+def _fits(state: dict[str, Tensor], name: str, value: Tensor) -> bool:
+    return name in state and state[name].shape == value.shape
+
+
+def _object_of(checkpoint: dict[str, Any]) -> str | None:
+    return (checkpoint.get("object_model") or {}).get("name")
