@@ -26,11 +26,11 @@ from posefilter.weights import list_shipped
 
 PAGE = Path(__file__).parents[1] / "docs" / "belief.md"
 FACTORS = (1.0, 1.25, 0.8)
-HEAD = ("object", "images right", "size, median", "said to be wrong")
+HEAD = ("object", "images right", "size, median", "flagged")
 HEAD += tuple(
     f"depth x {factor:g}: {word}"
     for factor in FACTORS[1:]
-    for word in ("size, median", "probable and wrong", "noticed")
+    for word in ("size, median", "probable and wrong", "of these flagged")
 )
 
 

@@ -34,7 +34,7 @@ Spoil = Callable[[Sample, Sample], Inputs]  # of a photograph, and of one of ano
 HEAD = ("object", "with it", "right", "found", "found and right", "absent")
 HEAD += ("without it", "found", "unsure", "highest probability")
 HEAD_SPOILED = ("input", "asked for", "refused", "right", "found", "found and wrong")
-HEAD_SPOILED += ("highest probability of a wrong one", "said to be of a wrong size")
+HEAD_SPOILED += ("highest probability of a wrong one", "flagged as of a wrong size")
 
 
 def _stretch(factor: float) -> Spoil:

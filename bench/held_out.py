@@ -43,8 +43,8 @@ HEAD = ("object", "weights", "images", "scenes", "ADD AUC", "ADD-S AUC", "ADD < 
 HEAD += ("ADD-S < 0.1 d %", "median mm")
 SMALL = 1500  # pixels of the object, of an image of 320 x 240
 KINDS = ("whole", "cut", "small")  # the last: whole and of fewer pixels than SMALL
-PARTS = ("object", "weights", "scenes of", "images", "whole: images", "ADD AUC", "ADD-S AUC")
-PARTS += ("cut off: images", "ADD AUC", "ADD-S AUC", "small: images", "ADD AUC", "ADD-S AUC")
+PARTS = ("object", "weights", "scenes of", "images", "in frame: images", "ADD AUC", "ADD-S AUC")
+PARTS += ("truncated: images", "ADD AUC", "ADD-S AUC", "small: images", "ADD AUC", "ADD-S AUC")
 
 
 def read_frames(
