@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -280,6 +281,25 @@ def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:
         posefilter.load(NAME, overrides=["filter.particle=3"])
     with pytest.raises(posefilter.UserError, match="there is no such choice"):
         posefilter.load(NAME, overrides=["filter/refine=nothing"])
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("seed=3", "'seed=3' changes nothing of a trained filter: give predict seed="),
+        ("++cost_miss=2", "give load costs="),
+        ("data.image_width=64", "begins with filter or model"),
+        ("filters.particles=3", "begins with filter or model"),
+    ],
+)
+def test_an_override_without_an_effect_is_refused(override: str, told: str) -> None:
+    with pytest.raises(posefilter.UserError, match=re.escape(told)):
+        posefilter.load(NAME, overrides=[override])
+
+
+def test_overrides_are_a_list() -> None:
+    with pytest.raises(posefilter.UserError, match="a list is due"):
+        posefilter.load(NAME, overrides="filter.particles=3")
 
 
 def test_a_configuration_is_composed_and_built() -> None:
