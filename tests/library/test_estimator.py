@@ -72,6 +72,11 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
     assert np.allclose(told["belief"]["covariance"], result.covariance)
     assert told["warnings"] == [] == list(result.warnings)
+    sure = told["belief"]["uncertainty"]
+    assert sure["translation_mm"] == 1000 * result.belief.uncertainty().translation
+    assert sure["rotation_deg"] == np.rad2deg(result.belief.uncertainty().rotation)
+    assert sure["shift_mm"] == sure["translation_mm"]  # earlier names stay
+    assert sure["turn_degrees"] == sure["rotation_deg"]
     again = posefilter.Belief.load(tmp_path / "belief.npz")
     assert np.allclose(again.samples, result.belief.samples, atol=1e-6)
     assert sum(mode["mass"] for mode in told["belief"]["modes"]) == pytest.approx(1)

@@ -2,7 +2,7 @@
 marginals of each axis.
 
 The map follows Murphy et al. 2021 (Implicit-PDF, figure 3): a rotation is a point where one of the
-object's axes points, and a color for the turn about that axis. Ours looks along the camera: the
+object's axes points, and a color for the rotation about that axis. Ours looks along the camera: the
 center is towards it, right and up are the image's.
 """
 
@@ -79,9 +79,9 @@ def draw_belief(
     words = [
         f"{len(weights)} particles, {ess:.0f} effective.",
         f"±: root mean square in the estimate's mode, {summary.share:.0%} of the belief.",
-        f"Map, above: where the object's {axis_name} axis points, colored by the turn about it.",
+        f"Map: where the object's {axis_name} axis points; color: the rotation about that axis.",
         "Photograph: where the particles put the object's center, colored by weight.",
-        "Below: shares of the belief. Shifts are from its mean, turns from the estimate.",
+        "Below: shares of the belief. Translations are from its mean, rotations from the estimate.",
     ]
     notes = np.concatenate(
         [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
@@ -123,8 +123,8 @@ def find_longest_axis(model: ObjectModel) -> int:
 def draw_rotations(
     poses: torch.Tensor, weights: torch.Tensor, marks: Sequence[Mark], axis: int, width: int
 ) -> np.ndarray:
-    """Draw rotations on a Mollweide map: place = where the axis points, color = turn about it, area
-    = weight.
+    """Draw rotations on a Mollweide map: place = where the axis points, color = rotation about it,
+    area = weight.
     """
     fine = 2 * width  # drawn at twice the size and shrunk: OpenCV's smallest discs are no discs
     picture = draw_blank_map(fine)
