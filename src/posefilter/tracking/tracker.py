@@ -101,7 +101,7 @@ class Tracker:
 
     def update_all(self, rgb: Any, depth: Any, intrinsics: Any) -> list[TrackResult]:
         """Find each object in the next frame; as `update`, but always a list."""
-        frame = Frame(self._check(rgb, depth, intrinsics))
+        frame = Frame(self.check(rgb, depth, intrinsics))
         if self._others is not None:
             return self._others.update(frame)
         return [track.update(frame) for track in self.tracks]
@@ -128,8 +128,12 @@ class Tracker:
         for track in self.tracks:
             track.reset()
 
-    def _check(self, rgb: Any, depth: Any, intrinsics: Any) -> Images:
-        """Return a frame in one form; all is checked of the first, and the shapes of the others."""
+    def check(self, rgb: Any, depth: Any, intrinsics: Any) -> Images:
+        """Return a frame in one form; all is checked of the first, and the shapes of the others.
+
+        Raises:
+            UserError: The frame is not as it should be.
+        """
         fast = (
             isinstance(rgb, np.ndarray)
             and isinstance(depth, np.ndarray)
