@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -130,27 +130,27 @@ class Result:
         limit = self.conformal.find_limit(level, value)
         return self.belief.level_set(level, -self.belief.differential_entropy - limit)
 
-    def draw_overlay(
-        self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
-    ) -> np.ndarray:
+    def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is
         found, dashed where the verdict is unsure, none where it is absent.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
             shape: A mesh, for the exact outline; None: the convex hull.
 
         Returns:
             The picture (h, w, 3) uint8.
+
+        Raises:
+            UserError: The image or the camera matrix is not as it should be.
         """
         from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
 
         shape = self.model.hull if shape is None else shape
         pose = None if self.verdict == "absent" else self.pose
         unsure = self.verdict == "unsure"
-        K, said = np.asarray(intrinsics), self.describe()
-        return draw_overlay(rgb, K, pose, shape, caption=said, dashed=unsure)
+        return draw_overlay(rgb, intrinsics, pose, shape, caption=self.describe(), dashed=unsure)
 
     def describe(self) -> str:
         """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""
@@ -165,11 +165,11 @@ class Result:
             return f"{self.object}: unsure, probability {self.probability:.2f}, {there}"
         return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
 
-    def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    def draw_belief(self, rgb: Any, intrinsics: Any) -> np.ndarray:
         """Draw the belief: rotations on a map, centers on the image, marginals.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
 
         Returns:
@@ -183,12 +183,12 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
+        return draw_belief(tensors, self.model, rgb, intrinsics)
 
     def draw_band(
         self,
-        rgb: np.ndarray,
-        intrinsics: np.ndarray,
+        rgb: Any,
+        intrinsics: Any,
         shape: "Shape | None" = None,
         level: float = 0.95,
     ) -> np.ndarray:
@@ -196,7 +196,7 @@ class Result:
         the outline, it lies with the probability `level`, if the belief is right.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
             shape: A mesh, for the exact outline; None: the convex hull.
             level: That probability.
@@ -205,14 +205,14 @@ class Result:
             The picture (h, w, 3) uint8.
 
         Raises:
-            UserError: The level is not in [0, 1].
+            UserError: The level is not in [0, 1], or the image not as it should be.
         """
         from posefilter.figures.band import draw_band  # slow to import, needed for pictures
 
         check_share(level)
-        shape, K = self.model.hull if shape is None else shape, np.asarray(intrinsics)
+        shape = self.model.hull if shape is None else shape
         poses, weights = self.belief.samples, self.belief.weights
-        return draw_band(rgb, K, poses, weights, shape, level, caption=self.describe())
+        return draw_band(rgb, intrinsics, poses, weights, shape, level, caption=self.describe())
 
 
 class Run(NamedTuple):

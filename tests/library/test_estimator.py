@@ -237,6 +237,34 @@ def test_pictures(small: posefilter.Estimator) -> None:
     assert posefilter.figures.draw_overlay is not None
 
 
+def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    result = small.predict(rgb, depth, K)
+    tensor, matrix = torch.from_numpy(rgb.copy()).permute(2, 0, 1), torch.from_numpy(K)
+    for draw in (
+        result.draw_overlay,
+        result.draw_belief,
+        result.draw_band,
+        lambda image, camera: posefilter.figures.draw_overlay(
+            image, camera, torch.from_numpy(result.pose), result.model.hull
+        ),
+        lambda image, camera: posefilter.figures.draw_belief(
+            result.belief, result.model, image, camera
+        ),
+    ):
+        plain = draw(rgb, K)
+        for image in (tensor, tensor.float() / 255, (rgb / 255).astype(np.float64)):
+            assert np.array_equal(draw(image, matrix), plain)
+        with pytest.raises(posefilter.UserError, match=r"rgb: .* one image is due"):
+            draw(rgb[None], K)
+        with pytest.raises(posefilter.UserError, match="rgb: is int64"):
+            draw(rgb.astype(np.int64), K)
+        with pytest.raises(posefilter.UserError, match="a camera matrix"):
+            draw(rgb, K[:2])
+    with pytest.raises(posefilter.UserError, match=r"pose: .* \(4, 4\)"):
+        posefilter.figures.draw_overlay(rgb, K, result.pose[:3], result.model.hull)
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [
