@@ -192,6 +192,21 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     assert "intrinsics" in warning
 
 
+def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimator) -> None:
+    """A black one is answered from the depth alone, with a probability that nothing supports."""
+    rgb, depth, K = read_scene(0, ONE_MODE)
+    images, depths = np.stack([rgb, 0 * rgb, rgb]), np.stack([depth, depth, 0 * depth + 0.7])
+    plain, black, flat = estimator.predict(images, depths, K)
+    assert (plain.verdict, plain.blank, plain.warnings) == ("found", "", ())
+    assert black.probability > 0.8
+    assert flat.presence < 0.2
+    for result, cause in ((black, "covered lens"), (flat, "right file")):
+        assert result.verdict == "unsure"
+        assert cause in result.blank == result.warnings[0]
+    (found,) = estimator.predict(0 * rgb, depth, K, instances=1)
+    assert found.verdict == "unsure"
+
+
 def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     arrays = small.predict(rgb, depth, K)

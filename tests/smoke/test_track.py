@@ -120,7 +120,7 @@ def test_a_broken_frame_can_be_left_out(
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "on_error=skip"]
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    (warned,) = (line for line in lines if line["event"] == "warning")
+    warned = next(line for line in lines if "skipped" in line)
     assert str(path) in warned["skipped"]
     with (out / "poses.csv").open() as file:
         assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9", "11"]
@@ -143,7 +143,7 @@ def test_what_is_lost_in_every_frame_is_told_with_a_cause(
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}", "depth_scale=600"]
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    (warned,) = (line for line in lines if line["event"] == "warning")
+    warned = [line for line in lines if line["event"] == "warning"][-1]
     assert warned["object"] == "003_cracker_box"
     assert "depth_scale" in warned["reason"]
 
@@ -157,6 +157,9 @@ def test_a_wrong_depth_scale_is_told_once(
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     warned = [line for line in lines if line["event"] == "warning"]
+    blank = warned.pop()  # the third frame, which is black
+    assert (blank["frame"], len(blank["warnings"])) == ("frame_10", 2)
+    assert "the color image is black" in blank["warnings"][0]
     assert len(warned) == (factor != 1.0)
     for line in warned:
         assert line["frame"] == "frame_8"

@@ -127,7 +127,7 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
-    doubted: set[str] = set()  # objects whose size was said to be wrong: once is enough
+    doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     with closing(tracker), writer, recorder:
         for frame in read_frames(video, tracker, cfg):
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
@@ -136,8 +136,9 @@ def follow(
             for number, result in enumerate(results):
                 ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
                 truth = frame.truth.get(result.object)
-                if result.wrong_size and result.object not in doubted:
-                    doubted.add(result.object)
+                doubt = result.blank or (result.object if result.wrong_size else "")
+                if doubt and doubt not in doubted:  # once is enough
+                    doubted.add(doubt)
                     told = {"frame": frame.name, "object": result.object}
                     said = f"warning: frame {frame.name}: {'; '.join(result.warnings)}"
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))

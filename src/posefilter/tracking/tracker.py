@@ -87,7 +87,8 @@ class Tracker:
             rgb: Color (H, W, 3) or (3, H, W), RGB, as a numpy array or tensor: uint8, or float in
                 [0, 1].
             depth: z-depth (H, W) in meters, as float, aligned with the color; 0 or NaN where
-                unknown. After the first frame it may be unknown everywhere.
+                unknown. Where it is unknown everywhere, or the color is one, the frame counts as
+                one that does not show the object; `TrackResult.blank` says so.
             intrinsics: Camera matrix (3, 3) [px] of this frame.
 
         Returns:
@@ -146,7 +147,7 @@ class Tracker:
             check_depth_unit(depth)
             K = check_intrinsics(np.asarray(intrinsics), 1, depth.shape)
             return Images(rgb[None], depth[None], K)
-        images, batched = check_images(rgb, depth, intrinsics, empty=self._size is not None)
+        images, batched = check_images(rgb, depth, intrinsics, empty=True)
         if batched:
             raise UserError("rgb: a tracker takes one frame after the other, not a batch")
         self._size = images.depth.shape[1:]
