@@ -7,15 +7,25 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
-from posefilter.cli.components import changes
+from posefilter.cli.components import SECTIONS, changes
 from posefilter.cli.job import Job
 from posefilter.confidence.verdicts import Costs
+from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
 from posefilter.weights import expand_weights
 
 if TYPE_CHECKING:
     from posefilter.data.module import PoseDataModule
+
+_COSTS = "give load costs=posefilter.Costs(...)"
+_INSTEAD = {  # of settings of `predict.py`
+    "seed": "give predict seed=",
+    "instances": "give predict instances=",
+    "plugins": "call posefilter.trust",
+    "threads": "call torch.set_num_threads",
+    **dict.fromkeys(("cost_false_alarm", "cost_miss", "cost_unsure"), _COSTS),
+}
 
 
 def load(
@@ -35,7 +45,8 @@ def load(
             such as `003_cracker_box`; a list of these, one an object; a pattern such as
             `weights/*.ckpt`; or `all` for those that ship.
         overrides: What to change of the filter, as typed on the command line: such as
-            `filter.particles=1000` or `filter/refine=none`.
+            `filter.particles=1000` or `filter/refine=none`.  Nothing else is one: the seed, for
+            one, is an argument of `Estimator.predict`.
         device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
         costs: What errors cost, which `Result.verdict` goes by; None: the default.
 
@@ -45,11 +56,32 @@ def load(
     Raises:
         UserError: A file is missing or holds no checkpoint, or an override does not fit it.
     """
+    check_overrides(overrides)
     wanted = changes(compose(overrides, "predict")) if overrides else {}
     methods = [
         method_of(read_checkpoint(one), wanted, lightning=False) for one in expand_weights(weights)
     ]
     return Estimator(methods, device, costs)
+
+
+def check_overrides(overrides: Sequence[str]) -> None:
+    """Refuse what changes nothing of a trained filter.
+
+    Raises:
+        UserError: They are no list of texts, or one sets what is not the filter's.
+    """
+    if isinstance(overrides, str) or not all(isinstance(one, str) for one in overrides):
+        raise UserError(
+            f"overrides={overrides!r}: a list is due, such as ['filter.particles=1000']"
+        )
+    for one in overrides:
+        key = one.lstrip("+~").split("=")[0].split("@")[0]
+        if not key.startswith(tuple(f"{section}{mark}" for section in SECTIONS for mark in "./")):
+            instead = f": {_INSTEAD[key]}" if key in _INSTEAD else ""
+            raise UserError(
+                f"overrides: '{one}' changes nothing of a trained filter{instead}; what does "
+                "begins with filter or model, such as filter.particles=1000 or filter/refine=none"
+            )
 
 
 def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig:
@@ -111,7 +143,6 @@ def build_data(config: DictConfig) -> "PoseDataModule":
     """
     from posefilter.cli.instantiate import instantiate
     from posefilter.data.module import PoseDataModule  # readers and meshes: `load` needs none
-    from posefilter.errors import UserError
 
     data: Any = instantiate(config.data, "data")
     if not isinstance(data, PoseDataModule):

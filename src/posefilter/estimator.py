@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 
+from posefilter.confidence.blank import find_blank
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
@@ -127,7 +128,7 @@ class Estimator:
         for method in self.methods:
             method.seed = seed
         size = (images.depth.shape[1], images.depth.shape[2])
-        out = []
+        out, blank = [], list_blank(images)
         for i in range(len(images.depth)):
             one = Images(*(part[i : i + 1] for part in images))
             batches = [
@@ -140,7 +141,8 @@ class Estimator:
             for each in found:
                 number, trace = each.number, Trace((), (), (), each.belief)
                 spent = seconds[number] / many[number]
-                run = Run(self.methods[number], batches[number], trace, spent, each.assessment)
+                method, batch = self.methods[number], batches[number]
+                run = Run(method, batch, trace, spent, each.assessment, blank=blank[i : i + 1])
                 result = make_result(run, 0, self.costs)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller
@@ -153,7 +155,7 @@ class Estimator:
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did."""
         check_seed(seed)
-        runs = []
+        runs, blank = [], list_blank(images)
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
             method.seed = seed
@@ -166,8 +168,13 @@ class Estimator:
                 apparent = method.measure_apparent_size(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, surface, apparent))
+            runs.append(Run(method, batch, trace, seconds, found, surface, apparent, blank))
         return runs
+
+
+def list_blank(images: Images) -> list[str]:
+    """Return of each image why it cannot be judged, "" where it can be."""
+    return [find_blank(*one) for one in zip(images.rgb, images.depth, strict=True)]
 
 
 def check_seed(seed: Any) -> None:

@@ -43,11 +43,7 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
     Raises:
         UserError: A shape, type or value is not as it should be.
     """
-    color, z, K = (_as_array(value) for value in (rgb, depth, intrinsics))
-    if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
-        raise UserError(f"rgb: has shape {color.shape}; (H, W, 3) is due, or a batch (B, H, W, 3)")
-    if color.shape[-1] != 3:
-        color = np.moveaxis(color, -3, -1)
+    color, z, K = _as_channels_last(rgb), _as_array(depth), _as_array(intrinsics)
     batched = color.ndim == 4
     color, z = (value if batched else value[None] for value in (color, z))
     if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
@@ -60,6 +56,40 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
         raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
     K = check_intrinsics(K, len(z), (z.shape[1], z.shape[2]))
     return Images(_check_color(color), _check_depth(z, empty), K), batched
+
+
+def to_picture(rgb: Any) -> np.ndarray:
+    """Return one color image, in any form that `check_images` takes, as (H, W, 3) uint8.
+
+    Raises:
+        UserError: It is a batch, or a shape, type or value is not as it should be.
+    """
+    color = _as_channels_last(rgb)
+    if color.ndim != 3:
+        raise UserError(f"rgb: has shape {color.shape}; one image is due, (H, W, 3)")
+    color = _check_color(color)
+    return color if color.dtype == np.uint8 else (255 * color).round().astype(np.uint8)
+
+
+def to_camera(intrinsics: Any) -> np.ndarray:
+    """Return one camera matrix, an array or tensor, as float64 (3, 3) [px].
+
+    Raises:
+        UserError: It is none.
+    """
+    return check_intrinsics(_as_array(intrinsics), 1)[0]
+
+
+def to_pose(pose: Any) -> np.ndarray:
+    """Return one pose, an array or tensor, as float64 (4, 4) [m].
+
+    Raises:
+        UserError: It is none.
+    """
+    out = _as_array(pose)
+    if out.shape != (4, 4) or out.dtype.kind not in "fiu":
+        raise UserError(f"pose: has shape {out.shape}; camera_from_object (4, 4) [m] is due")
+    return out.astype(np.float64)
 
 
 def make_batch(images: Images, image_width: int | None, image_height: int | None) -> Batch:
@@ -92,6 +122,13 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
         none,
         torch.full((len(z),), torch.nan),
     )
+
+
+def _as_channels_last(rgb: Any) -> np.ndarray:
+    color = _as_array(rgb)
+    if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
+        raise UserError(f"rgb: has shape {color.shape}; (H, W, 3) is due, or a batch (B, H, W, 3)")
+    return color if color.shape[-1] == 3 else np.moveaxis(color, -3, -1)
 
 
 def _as_array(value: Any) -> np.ndarray:

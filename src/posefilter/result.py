@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -45,6 +45,8 @@ class Result:
             intrinsics are right.  NaN where the method cannot tell, or too few pixels show it.
         wrong_size: Whether it appears so much larger or smaller that depth or intrinsics must be
             wrong.  `probability` supposes that they are right, so "found" becomes "unsure".
+        blank: Why the image cannot be judged, in words: it is of one color, or its depth is the
+            same everywhere.  The verdict is then "unsure".  Empty where it can be.
         seconds: The filter's time for this image, its share of a batch.
         model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
@@ -72,6 +74,7 @@ class Result:
     surface: float = field(default=math.nan, kw_only=True)
     apparent_size: float = field(default=math.nan, kw_only=True)
     wrong_size: bool = field(default=False, kw_only=True)
+    blank: str = field(default="", kw_only=True)
     instance: int = field(default=0, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
 
@@ -83,12 +86,15 @@ class Result:
     def verdict(self) -> Verdict | None:
         """What to go by: "found", "unsure" or "absent", whichever costs least on average.
 
-        None where there is no probability.  `decide` takes other costs.
+        None where there is no probability.  Of an image that cannot be judged (`blank`) always
+        "unsure".  `decide` takes other costs.
         """
         return self.decide(self.costs)
 
     def decide(self, costs: Costs) -> Verdict | None:
         """Return the verdict at other costs of errors; None where there is no probability."""
+        if self.blank:
+            return "unsure"
         if self.probability is None or self.presence is None:
             return None
         verdict = decide(self.presence, self.probability, costs)
@@ -130,30 +136,32 @@ class Result:
         limit = self.conformal.find_limit(level, value)
         return self.belief.level_set(level, -self.belief.differential_entropy - limit)
 
-    def draw_overlay(
-        self, rgb: np.ndarray, intrinsics: np.ndarray, shape: "Shape | None" = None
-    ) -> np.ndarray:
+    def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is
         found, dashed where the verdict is unsure, none where it is absent.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
             shape: A mesh, for the exact outline; None: the convex hull.
 
         Returns:
             The picture (h, w, 3) uint8.
+
+        Raises:
+            UserError: The image or the camera matrix is not as it should be.
         """
         from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
 
         shape = self.model.hull if shape is None else shape
         pose = None if self.verdict == "absent" else self.pose
         unsure = self.verdict == "unsure"
-        K, said = np.asarray(intrinsics), self.describe()
-        return draw_overlay(rgb, K, pose, shape, caption=said, dashed=unsure)
+        return draw_overlay(rgb, intrinsics, pose, shape, caption=self.describe(), dashed=unsure)
 
     def describe(self) -> str:
         """Return the verdict in a few words: `003_cracker_box: found, probability 0.97`."""
+        if self.blank:
+            return f"{self.object}: unsure, the image cannot be judged"
         if self.verdict is None:
             return f"{self.object}, score {self.score:.2f}"
         if self.verdict == "absent":
@@ -165,11 +173,11 @@ class Result:
             return f"{self.object}: unsure, probability {self.probability:.2f}, {there}"
         return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
 
-    def draw_belief(self, rgb: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    def draw_belief(self, rgb: Any, intrinsics: Any) -> np.ndarray:
         """Draw the belief: rotations on a map, centers on the image, marginals.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
 
         Returns:
@@ -183,12 +191,12 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(tensors, self.model, rgb, np.asarray(intrinsics))
+        return draw_belief(tensors, self.model, rgb, intrinsics)
 
     def draw_band(
         self,
-        rgb: np.ndarray,
-        intrinsics: np.ndarray,
+        rgb: Any,
+        intrinsics: Any,
         shape: "Shape | None" = None,
         level: float = 0.95,
     ) -> np.ndarray:
@@ -196,7 +204,7 @@ class Result:
         the outline, it lies with the probability `level`, if the belief is right.
 
         Args:
-            rgb: The image (H, W, 3) uint8, RGB.
+            rgb: The image, in any form that `Estimator.predict` takes.
             intrinsics: Its camera matrix (3, 3) [px].
             shape: A mesh, for the exact outline; None: the convex hull.
             level: That probability.
@@ -205,14 +213,14 @@ class Result:
             The picture (h, w, 3) uint8.
 
         Raises:
-            UserError: The level is not in [0, 1].
+            UserError: The level is not in [0, 1], or the image not as it should be.
         """
         from posefilter.figures.band import draw_band  # slow to import, needed for pictures
 
         check_share(level)
-        shape, K = self.model.hull if shape is None else shape, np.asarray(intrinsics)
+        shape = self.model.hull if shape is None else shape
         poses, weights = self.belief.samples, self.belief.weights
-        return draw_band(rgb, K, poses, weights, shape, level, caption=self.describe())
+        return draw_band(rgb, intrinsics, poses, weights, shape, level, caption=self.describe())
 
 
 class Run(NamedTuple):
@@ -225,6 +233,7 @@ class Run(NamedTuple):
     found: Assessment | None = None  # None where there is no probability
     surface: torch.Tensor | None = None  # (B,) the feature; None where there is no probability
     size: ApparentSize | None = None  # None where the method cannot tell
+    blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
 
 
 def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:
@@ -247,6 +256,14 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
     pose = belief.best[image].double().cpu().numpy()
     size = math.nan if run.size is None else float(run.size.scale[image])
     wrong_size = run.size is not None and bool(run.size.contradicts()[image])
+    blank = run.blank[image] if run.blank else ""
+    warnings = find_warnings(
+        pose,
+        model,
+        run.batch.depth[image, 0].cpu().numpy(),
+        run.batch.intrinsics[image].double().cpu().numpy(),
+        apparent_size=size if wrong_size else None,
+    )
     return Result(
         object=model.name,
         pose=pose,
@@ -262,13 +279,7 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
             model.name,
             model.symmetries.detach().cpu().double().numpy(),
         ),
-        warnings=find_warnings(
-            pose,
-            model,
-            run.batch.depth[image, 0].cpu().numpy(),
-            run.batch.intrinsics[image].double().cpu().numpy(),
-            apparent_size=size if wrong_size else None,
-        ),
+        warnings=(blank, *warnings) if blank else warnings,
         seconds=run.seconds,
         model=model,
         costs=costs or Costs(),
@@ -277,10 +288,11 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         surface=math.nan if run.surface is None else float(run.surface[image]),
         apparent_size=size,
         wrong_size=wrong_size,
+        blank=blank,
     )
 
 
 def explain_missing(method: PoseEstimator) -> str:
     """Return why an estimate has no probability."""
     known = method.calibration is not None
-    return "no pixel of the frame has depth" if known else method.calibration_note
+    return "the frame shows nothing" if known else method.calibration_note

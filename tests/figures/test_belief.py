@@ -242,9 +242,11 @@ def test_a_second_pose_is_reported_with_its_share() -> None:
     assert found.share == pytest.approx(0.7, abs=0.01)
     assert found.second is not None
     assert found.second.weight == pytest.approx(0.3, abs=0.01)
-    assert found.shift == pytest.approx(0.004 * math.sqrt(3), rel=0.15)
-    assert found.turn == pytest.approx(0.03 * math.sqrt(3), rel=0.15)
-    assert found.second_turn == pytest.approx(float(angle_between(a[:3, :3], b[:3, :3])), abs=0.15)
+    assert found.translation == pytest.approx(0.004 * math.sqrt(3), rel=0.15)
+    assert found.rotation == pytest.approx(0.03 * math.sqrt(3), rel=0.15)
+    assert found.second_rotation == pytest.approx(
+        float(angle_between(a[:3, :3], b[:3, :3])), abs=0.15
+    )
     sure, other = describe_belief(found)
     assert re.fullmatch(r"sure to ±[67]\.\d+ mm, ±[23]\.\d°", sure)
     assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)

@@ -103,7 +103,7 @@ def test_the_time_line_is_the_filters_steps_and_the_belief(pixels: bool, tmp_pat
         assert np.allclose(on_image["Points2D:positions"][t], moment.pixels + 0.5, atol=1e-4)
         assert np.allclose(inside["weight"][t], moment.weights)
         assert (rgba(inside["Points3D:colors"][t])[:, :3] == color_by_weight(moment.weights)).all()
-        starts = np.array([row[0] for row in found["/particles/axes"]["LineStrips3D:rows"][t]])
+        starts = np.array([one[0] for one in found["/particles/axes"]["LineStrips3D:strips"][t]])
         nearest = np.linalg.norm(starts[:, None] - moment.centers[None], axis=-1).min(1)
         assert nearest.max() < 1e-6
     noise = found["/filter/noise"]["Scalars:scalars"]

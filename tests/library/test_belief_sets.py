@@ -125,9 +125,9 @@ def test_words_say_the_distance_that_the_share_of_the_particles_keeps() -> None:
     sure = belief.uncertainty(0.95)
     shifts = np.linalg.norm(np.random.default_rng(0).normal(size=(200_000, 3)) * SCALE[:3], axis=1)
     turns = np.linalg.norm(np.random.default_rng(1).normal(size=(200_000, 3)) * SCALE[3:], axis=1)
-    assert sure.shift == pytest.approx(np.quantile(shifts, 0.95), rel=0.08)
-    assert sure.turn == pytest.approx(np.quantile(turns, 0.95), rel=0.08)
-    said = dataclasses.replace(sure, shift=0.0042, turn=math.radians(3.14), mass=1.0)
+    assert sure.translation == pytest.approx(np.quantile(shifts, 0.95), rel=0.08)
+    assert sure.rotation == pytest.approx(np.quantile(turns, 0.95), rel=0.08)
+    said = dataclasses.replace(sure, translation=0.0042, rotation=math.radians(3.14), mass=1.0)
     assert said.describe() == "within 4.2 mm and 3.1 degrees (95 %)"
     assert (
         dataclasses.replace(said, mass=0.7)
@@ -137,7 +137,7 @@ def test_words_say_the_distance_that_the_share_of_the_particles_keeps() -> None:
     mixed = np.concatenate([draw(40, 9, SCALE / 4), draw(20, 10, SCALE / 4) @ half_turn()[1]])
     # equivalent poses in one mode are no uncertainty
     one = belief_of(mixed, symmetries=half_turn()).uncertainty()
-    assert one.turn < 0.1
+    assert one.rotation < 0.1
 
 
 def test_a_point_of_the_object_lands_where_the_particles_put_it() -> None:

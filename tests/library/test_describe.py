@@ -23,9 +23,14 @@ def test_an_unsure_answer_says_both_whether_it_is_there_and_whether_it_is_right(
     assert Result.describe(one) == words  # type: ignore[arg-type]
 
 
-def answer(verdict: str | None, **more: float) -> SimpleNamespace:
+def answer(verdict: str | None, **more: object) -> SimpleNamespace:
     own = {"object": "box", "probability": 0.9, "presence": 0.95, "score": 1.5}
-    return SimpleNamespace(verdict=verdict, **{"wrong_size": False, **own, **more})
+    return SimpleNamespace(verdict=verdict, **{"wrong_size": False, "blank": "", **own, **more})
+
+
+def test_an_image_that_cannot_be_judged_is_told_also_without_a_probability() -> None:
+    said = Result.describe(answer("unsure", blank="black", probability=None))  # type: ignore[arg-type]
+    assert said == "box: unsure, the image cannot be judged"
 
 
 @pytest.mark.parametrize("verdict", ["found", "unsure", "absent"])

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -71,6 +72,11 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
     assert np.allclose(told["belief"]["covariance"], result.covariance)
     assert told["warnings"] == [] == list(result.warnings)
+    sure = told["belief"]["uncertainty"]
+    assert sure["translation_mm"] == 1000 * result.belief.uncertainty().translation
+    assert sure["rotation_deg"] == np.rad2deg(result.belief.uncertainty().rotation)
+    assert sure["shift_mm"] == sure["translation_mm"]  # earlier names stay
+    assert sure["turn_degrees"] == sure["rotation_deg"]
     again = posefilter.Belief.load(tmp_path / "belief.npz")
     assert np.allclose(again.samples, result.belief.samples, atol=1e-6)
     assert sum(mode["mass"] for mode in told["belief"]["modes"]) == pytest.approx(1)
@@ -186,6 +192,21 @@ def test_a_depth_that_is_a_fourth_too_large_is_measured_and_not_believed(
     assert "intrinsics" in warning
 
 
+def test_an_image_of_one_color_or_depth_is_doubted(estimator: posefilter.Estimator) -> None:
+    """A black one is answered from the depth alone, with a probability that nothing supports."""
+    rgb, depth, K = read_scene(0, ONE_MODE)
+    images, depths = np.stack([rgb, 0 * rgb, rgb]), np.stack([depth, depth, 0 * depth + 0.7])
+    plain, black, flat = estimator.predict(images, depths, K)
+    assert (plain.verdict, plain.blank, plain.warnings) == ("found", "", ())
+    assert black.probability > 0.8
+    assert flat.presence < 0.2
+    for result, cause in ((black, "covered lens"), (flat, "right file")):
+        assert result.verdict == "unsure"
+        assert cause in result.blank == result.warnings[0]
+    (found,) = estimator.predict(0 * rgb, depth, K, instances=1)
+    assert found.verdict == "unsure"
+
+
 def test_tensors_and_floats_are_the_same_image(small: posefilter.Estimator) -> None:
     rgb, depth, K = read_scene()
     arrays = small.predict(rgb, depth, K)
@@ -229,6 +250,34 @@ def test_pictures(small: posefilter.Estimator) -> None:
     with pytest.raises(posefilter.UserError, match="a share is between 0 and 1"):
         result.draw_band(rgb, K, level=1.5)
     assert posefilter.figures.draw_overlay is not None
+
+
+def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator) -> None:
+    rgb, depth, K = read_scene()
+    result = small.predict(rgb, depth, K)
+    tensor, matrix = torch.from_numpy(rgb.copy()).permute(2, 0, 1), torch.from_numpy(K)
+    for draw in (
+        result.draw_overlay,
+        result.draw_belief,
+        result.draw_band,
+        lambda image, camera: posefilter.figures.draw_overlay(
+            image, camera, torch.from_numpy(result.pose), result.model.hull
+        ),
+        lambda image, camera: posefilter.figures.draw_belief(
+            result.belief, result.model, image, camera
+        ),
+    ):
+        plain = draw(rgb, K)
+        for image in (tensor, tensor.float() / 255, (rgb / 255).astype(np.float64)):
+            assert np.array_equal(draw(image, matrix), plain)
+        with pytest.raises(posefilter.UserError, match=r"rgb: .* one image is due"):
+            draw(rgb[None], K)
+        with pytest.raises(posefilter.UserError, match="rgb: is int64"):
+            draw(rgb.astype(np.int64), K)
+        with pytest.raises(posefilter.UserError, match="a camera matrix"):
+            draw(rgb, K[:2])
+    with pytest.raises(posefilter.UserError, match=r"pose: .* \(4, 4\)"):
+        posefilter.figures.draw_overlay(rgb, K, result.pose[:3], result.model.hull)
 
 
 @pytest.mark.parametrize(
@@ -280,6 +329,25 @@ def test_what_cannot_be_loaded_is_refused_in_one_line(tmp_path: Path) -> None:
         posefilter.load(NAME, overrides=["filter.particle=3"])
     with pytest.raises(posefilter.UserError, match="there is no such choice"):
         posefilter.load(NAME, overrides=["filter/refine=nothing"])
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("seed=3", "'seed=3' changes nothing of a trained filter: give predict seed="),
+        ("++cost_miss=2", "give load costs="),
+        ("data.image_width=64", "begins with filter or model"),
+        ("filters.particles=3", "begins with filter or model"),
+    ],
+)
+def test_an_override_without_an_effect_is_refused(override: str, told: str) -> None:
+    with pytest.raises(posefilter.UserError, match=re.escape(told)):
+        posefilter.load(NAME, overrides=[override])
+
+
+def test_overrides_are_a_list() -> None:
+    with pytest.raises(posefilter.UserError, match="a list is due"):
+        posefilter.load(NAME, overrides="filter.particles=3")
 
 
 def test_a_configuration_is_composed_and_built() -> None:

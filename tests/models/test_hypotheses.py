@@ -162,6 +162,6 @@ def test_maps_that_are_right_cost_nothing_and_a_flipped_one_much() -> None:
 
 def test_an_image_without_depth_is_refused_where_depth_is_needed() -> None:
     batch = scenes(2)._replace(depth=torch.zeros(2, 1, 48, 64))
-    with pytest.raises(UserError, match="not one pixel of an image has a known depth"):
+    with pytest.raises(UserError, match="so few pixels of an image have depth"):
         make("dense_coordinates").eval().predict_step(batch, 0)
     assert make("keypoints").eval().predict_step(batch, 0).belief.best.isfinite().all()

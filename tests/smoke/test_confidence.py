@@ -154,7 +154,7 @@ def test_the_library_gives_what_the_command_gives(
     calibrated: Path, weights: Path, tiny_scenes: Path
 ) -> None:
     rgb = cv2.imread(str(min(tiny_scenes.rglob("*.left.jpg"))))[..., ::-1]
-    depth = np.full(rgb.shape[:2], 0.7)
+    depth = np.tile(np.linspace(0.6, 0.8, rgb.shape[1]), (len(rgb), 1))
     K = np.array([[266.0, 0, 78], [0, 266, 60], [0, 0, 1]])
     result = load(calibrated, device="cpu").predict(rgb, depth, K)
     assert 0 <= result.probability <= result.presence <= 1

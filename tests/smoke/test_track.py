@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.command import compose_job, run_command
 from posefilter.cli.track import make_settings
+from posefilter.data.sequences import VideoFrame
 from posefilter.tracking.settings import TrackerSettings
 
 HOME = Path(__file__).parents[2]
@@ -31,8 +32,9 @@ def folder(tmp_path: Path) -> Path:
         (tmp_path / "video" / name).mkdir(parents=True)
     for number in range(4):
         shown = number != 2
-        cv2.imwrite(str(tmp_path / "video" / "rgb" / f"{number:03d}.png"), rgb * shown)
-        cv2.imwrite(str(tmp_path / "video" / "depth" / f"{number:03d}.png"), depth * shown)
+        name = f"frame_{8 + number}.png"
+        cv2.imwrite(str(tmp_path / "video" / "rgb" / name), rgb * shown)
+        cv2.imwrite(str(tmp_path / "video" / "depth" / name), depth * shown)
     return tmp_path / "video"
 
 
@@ -49,7 +51,10 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert np.abs(places - places[0]).max() < 0.03
     assert np.linalg.norm(places[3] - truth) < 0.2  # the mesh's origin is not FAT's
     with (out / "poses.csv").open() as file:
-        assert [row["im_id"] for row in csv.DictReader(file)] == ["0", "1", "2", "3"]
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9", "10", "11"]
+    with (out / "tracks.csv").open() as file:
+        named = [(row["frame"], row["im_id"]) for row in csv.DictReader(file)]
+    assert named == [("frame_8", "8"), ("frame_9", "9"), ("frame_10", "10"), ("frame_11", "11")]
     metrics = json.loads((out / "metrics.json").read_text())["003_cracker_box"]
     assert metrics["frames"] == 4
     assert metrics["lost"] == 0
@@ -60,13 +65,85 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert run_command("track", HOME, typed) == 2  # nothing is overwritten
 
 
+def break_frame(folder: Path, which: str) -> Path:
+    """Cut the file of the third frame off, or make its depth implausible."""
+    if which == "depth in other units":
+        path = folder / "depth" / "frame_10.png"
+        cv2.imwrite(str(path), np.full((240, 320), 100, np.uint16))
+        return path
+    path = folder / "rgb" / "frame_10.png"
+    path.write_bytes((folder / "rgb" / "frame_9.png").read_bytes()[:5000])
+    return path
+
+
+@pytest.mark.parametrize("which", ["truncated", "depth in other units"])
+def test_what_was_tracked_before_a_broken_frame_is_kept(
+    which: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = break_frame(folder, which), tmp_path / "out"
+    assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert path.name in told or f"frame {path.stem}:" in told
+    assert "the 2 frames before it are in" in told
+    assert "on_error=skip" in told
+    lines = [json.loads(line) for line in (out / "poses.jsonl").read_text().splitlines()]
+    assert [one["frame"] for one in lines] == ["frame_8", "frame_9"]
+    with (out / "poses.csv").open() as file:
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9"]
+    assert json.loads((out / "metrics.json").read_text())["003_cracker_box"]["frames"] == 2
+    video = cv2.VideoCapture(str(out / "video.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2
+
+
+def test_what_was_tracked_before_an_interruption_is_kept(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+
+    def draw(frame: VideoFrame, *_: object) -> np.ndarray:
+        seen.append(frame.name)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        return frame.rgb
+
+    monkeypatch.setattr("posefilter.cli.track.draw_frame", draw)
+    out = tmp_path / "out"
+    assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 130
+    with (out / "poses.csv").open() as file:
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9"]
+
+
+def test_a_broken_frame_can_be_left_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = break_frame(folder, "truncated"), tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "on_error=skip"]
+    assert run_command("track", HOME, typed) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    warned = next(line for line in lines if "skipped" in line)
+    assert str(path) in warned["skipped"]
+    with (out / "poses.csv").open() as file:
+        assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9", "11"]
+
+
+def test_a_first_frame_that_is_broken_leaves_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "rgb" / "frame_8.png").write_bytes(b"")
+    out = tmp_path / "out"
+    assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert "frame_8.png: truncated or corrupt image" in told
+    assert not out.exists()
+
+
 def test_what_is_lost_in_every_frame_is_told_with_a_cause(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}", "depth_scale=600"]
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    (warned,) = (line for line in lines if line["event"] == "warning")
+    warned = [line for line in lines if line["event"] == "warning"][-1]
     assert warned["object"] == "003_cracker_box"
     assert "depth_scale" in warned["reason"]
 
@@ -80,9 +157,12 @@ def test_a_wrong_depth_scale_is_told_once(
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     warned = [line for line in lines if line["event"] == "warning"]
+    blank = warned.pop()  # the third frame, which is black
+    assert (blank["frame"], len(blank["warnings"])) == ("frame_10", 2)
+    assert "the color image is black" in blank["warnings"][0]
     assert len(warned) == (factor != 1.0)
     for line in warned:
-        assert line["frame"] == "000"
+        assert line["frame"] == "frame_8"
         assert any("times as large as its mesh" in one for one in line["warnings"])
 
 
@@ -124,6 +204,7 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
     [
         (["frames=FOLDER"], "intrinsics: is missing"),
         ([], "give either frames=DIR, or data="),
+        (["frames=FOLDER", CAMERA, "on_error=stop"], "on_error=stop: choose raise or skip"),
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),

@@ -14,6 +14,7 @@ from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.watch import Watch
 
 NONE = np.zeros_like(DEPTH)
+BLACK = np.zeros_like(RGB)
 
 
 def off(result: posefilter.TrackResult, truth: torch.Tensor) -> float:
@@ -146,12 +147,30 @@ def test_one_bad_frame_is_no_loss() -> None:
     toy, estimator = make_toy()
     tracker = posefilter.Tracker(estimator)
     toy.truth = pose = walk_pose(1)[0]
-    for depth in (DEPTH, DEPTH, NONE, DEPTH):
-        result = tracker.update(RGB, depth, K)
-        assert result.found
+    for rgb, depth in ((RGB, DEPTH), (RGB, DEPTH), (RGB, NONE), (BLACK, DEPTH), (RGB, DEPTH)):
+        result = tracker.update(rgb, depth, K)
+        assert result.found == (rgb is not BLACK)
         assert off(result, pose) < 0.01
-        assert (result.relevance == 0) == (depth is NONE)
-    assert result.status == "tracked"
+        blank = rgb is BLACK or depth is NONE
+        assert (result.relevance == 0) == blank
+        assert (result.verdict == "unsure") == blank
+    assert result.status == "found"  # two of them are a loss
+
+
+def test_the_first_frame_that_shows_something_is_the_first() -> None:
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator)
+    toy.truth = pose = walk_pose(1)[0]
+    for rgb, depth, told in ((RGB, NONE, "have depth"), (BLACK, DEPTH, "is black")):
+        result = tracker.update(rgb, depth, K)
+        assert result.status == "lost"
+        assert result.verdict == "unsure"
+        assert told in result.warnings[0]
+    result = tracker.update(RGB, DEPTH, K)
+    assert result.status == "started"
+    assert off(result, pose) < 0.01
+    first = posefilter.Tracker(estimator).update(RGB, DEPTH, K)
+    assert np.array_equal(result.pose, first.pose)
 
 
 def test_what_was_never_there_is_never_found() -> None:
@@ -159,8 +178,6 @@ def test_what_was_never_there_is_never_found() -> None:
     tracker = posefilter.Tracker(estimator)
     results = [tracker.update(RGB, DEPTH, K) for _ in range(8)]
     assert {one.status for one in results} == {"lost"}
-    with pytest.raises(UserError, match="no pixel has depth"):
-        posefilter.Tracker(estimator).update(RGB, NONE, K)
 
 
 def test_smoothing_damps_jitter_and_follows_a_jump() -> None:

@@ -27,7 +27,9 @@ CENTER = (0.02, 0.0, -0.01)
 SPACE = PoseSpace(CENTER, 0.08)
 K = np.array([[200.0, 0, 79.5], [0, 200, 59.5], [0, 0, 1]])
 RGB = np.zeros((120, 160, 3), np.uint8)
-DEPTH = np.full((120, 160), 0.7, np.float32)  # nearer than the object: nothing is seen through
+RGB[:, :80, 0] = 90  # that it is not blank
+# nearer than the object: nothing is seen through
+DEPTH = np.tile(np.linspace(0.69, 0.71, 160, dtype=np.float32), (120, 1))
 
 
 class ToyScene(NamedTuple):
@@ -107,7 +109,7 @@ class Toy(PoseEstimator):
 
 
 class SeeingToy(Toy):
-    """A toy that reads the true pose off the image: its gray level is the number of a pose.
+    """A toy that reads the true pose off the image: its green is the number of a pose.
 
     It can be sent to another process, since nothing has to be told to it.
 
@@ -120,7 +122,7 @@ class SeeingToy(Toy):
         self.poses = poses
 
     def encode(self, batch: Batch) -> Any:
-        self.truth = self.poses[round(255 * float(batch.rgb.mean()))]
+        self.truth = self.poses[round(255 * float(batch.rgb[:, 1].mean()))]
         return super().encode(batch)
 
 

@@ -98,9 +98,9 @@ class Belief:
     def covariance(self) -> np.ndarray:
         """The covariance (6, 6) of the particles' twists about the mean pose.
 
-        Rows and columns are [x, y, z, rx, ry, rz]: the shift of the object's center in the camera's
-        axes [m], then the rotation vector about that center in the object's own axes [rad].  Square
-        roots of the diagonal are standard deviations.
+        Rows and columns are [x, y, z, rx, ry, rz]: the translation of the object's center in the
+        camera's axes [m], then the rotation vector about that center in the object's own axes
+        [rad].  Square roots of the diagonal are standard deviations.
         """
         samples, weights = self._tensors
         mean = torch.from_numpy(self.mean)

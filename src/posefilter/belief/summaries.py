@@ -78,21 +78,32 @@ class Uncertainty:
 
     Attributes:
         level: Share of the mode's weight that is meant, such as 0.95.
-        shift: Distance of the object's center that this share does not exceed [m].
-        turn: Angle that this share does not exceed [rad], the least of what symmetries allow.
+        translation: Distance of the object's center that this share does not exceed [m].
+        rotation: Angle that this share does not exceed [rad], the least of what symmetries allow.
         mass: The mode's share of the belief.
     """
 
     level: float
-    shift: float
-    turn: float
+    translation: float
+    rotation: float
     mass: float
+
+    @property
+    def shift(self) -> float:
+        """The earlier name of `translation`."""
+        return self.translation
+
+    @property
+    def turn(self) -> float:
+        """The earlier name of `rotation`."""
+        return self.rotation
 
     def describe(self) -> str:
         """Return it in words: `within 4.2 mm and 3.1 degrees (95 %)`."""
-        turn = math.degrees(self.turn)
-        angle = f"{turn:.1f}" if turn < 10 else f"{turn:.0f}"
-        words = f"within {1000 * self.shift:.1f} mm and {angle} degrees ({100 * self.level:g} %)"
+        rotation = math.degrees(self.rotation)
+        angle = f"{rotation:.1f}" if rotation < 10 else f"{rotation:.0f}"
+        distance = f"{1000 * self.translation:.1f}"
+        words = f"within {distance} mm and {angle} degrees ({100 * self.level:g} %)"
         if self.mass > 0.995:
             return words
         return f"{words} of a pose that has {100 * self.mass:.0f} % of the belief"
@@ -159,13 +170,13 @@ def measure_uncertainty(
         level: Share of the weight that is meant.
     """
     copies = pose @ symmetries
-    turn, nearest = angle_between(rotation_of(samples)[:, None], rotation_of(copies)).min(1)
-    shift = (origin_of(samples, center) - origin_of(copies, center)[nearest]).norm(dim=-1)
+    rotation, nearest = angle_between(rotation_of(samples)[:, None], rotation_of(copies)).min(1)
+    translation = (origin_of(samples, center) - origin_of(copies, center)[nearest]).norm(dim=-1)
     share = weights.numpy()
     return Uncertainty(
         level,
-        find_quantile(shift.numpy(), share, level),
-        find_quantile(turn.numpy(), share, level),
+        find_quantile(translation.numpy(), share, level),
+        find_quantile(rotation.numpy(), share, level),
         mass,
     )
 

@@ -200,11 +200,14 @@ def print_result(result: Result) -> None:
 def describe_uncertainty(result: Result) -> dict[str, Any]:
     """Return how far the truth may be, in numbers and words."""
     sure = result.belief.uncertainty()
+    translation, rotation = 1000 * sure.translation, math.degrees(sure.rotation)
     return {
         "in_words": sure.describe(),
         "level": sure.level,
-        "shift_mm": 1000 * sure.shift,
-        "turn_degrees": math.degrees(sure.turn),
+        "translation_mm": translation,
+        "rotation_deg": rotation,
+        "shift_mm": translation,  # the two by their earlier names
+        "turn_degrees": rotation,
         "of_mode_with_mass": sure.mass,
     }
 

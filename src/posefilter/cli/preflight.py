@@ -97,6 +97,8 @@ def _check_video(cfg: DictConfig) -> None:
     """Raise UserError where there is no video to be tracked, or none that can be written."""
     if cfg.video not in _VIDEOS:
         raise UserError(f"video={cfg.video}: choose {', '.join(_VIDEOS)}")
+    if cfg.on_error not in ("raise", "skip"):
+        raise UserError(f"on_error={cfg.on_error}: choose raise or skip")
     find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
     for one in find_all:
         find_weights(one)

@@ -44,7 +44,13 @@ POSES = "poses.csv"
 
 
 def track(job: Job) -> None:
-    """Write poses.csv, poses.jsonl, tracks.csv, metrics.json, and a video of each scene."""
+    """Write poses.csv, poses.jsonl, tracks.csv, metrics.json, and a video of each scene.
+
+    What was tracked before a frame that cannot be read, or before Ctrl-C, is written, too.
+
+    Raises:
+        UserError: A frame cannot be read, and `on_error` is not "skip".
+    """
     cfg, folder = job.cfg, job.folder
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
@@ -61,17 +67,25 @@ def track(job: Job) -> None:
     }
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[TrackRow] = []
+    broken: UserError | KeyboardInterrupt | None = None
     files: dict[str, Path] = {"poses": folder / POSES, "lines": folder / "poses.jsonl"}
     for video in videos:
         name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
         writer = VideoWriter(folder / name, cfg.video, float(cfg.fps))
         view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.view else None
         recorder = TrackRecorder(view, shapes)
-        rows += list(follow(video, estimator, settings, cfg, writer, recorder, shapes, threads))
+        try:
+            follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, rows)
+        except (UserError, KeyboardInterrupt) as error:
+            broken = error
         if view is not None:
             files[view.stem] = view
         if cfg.video != "none":
             files[name] = writer.path
+        if broken is not None:
+            break
+    if not rows:
+        raise broken or UserError("no frame could be read; leave on_error=skip out to see why")
     for name in estimator.objects:
         _say_all_lost(name, [row.result for row in rows if row.result.object == name], cfg)
     write_rows(folder, [finite(describe_row(row)) for row in rows])
@@ -87,6 +101,11 @@ def track(job: Job) -> None:
         for name, figures in metrics.items():
             show_table(name, list_figures(figures))
     ended(cfg.console, "tracked", files, [], metrics=metrics)
+    if isinstance(broken, UserError):
+        count = len({(row.video, row.frame) for row in rows})
+        raise UserError(f"{broken}; the {count} frames before it are in {folder}") from broken
+    if broken is not None:
+        raise broken
 
 
 def follow(
@@ -98,8 +117,9 @@ def follow(
     recorder: TrackRecorder,
     shapes: dict[str, Shape],
     threads: int,
-) -> Iterator[TrackRow]:
-    """Track the objects through one video, write its pictures, and yield its rows."""
+    rows: list[TrackRow],
+) -> None:
+    """Track the objects through one video, write its pictures, and add to `rows` as they come."""
     methods = [
         m for m in estimator.methods if video.objects is None or m.model.name in video.objects
     ]
@@ -107,21 +127,56 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
-    doubted: set[str] = set()  # objects whose size was said to be wrong: once is enough
+    doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     with closing(tracker), writer, recorder:
-        for frame in video:
+        for frame in read_frames(video, tracker, cfg):
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
             writer.add(draw_frame(frame, results, shapes))
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
             for number, result in enumerate(results):
                 ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
                 truth = frame.truth.get(result.object)
-                if result.wrong_size and result.object not in doubted:
-                    doubted.add(result.object)
+                doubt = result.blank or (result.object if result.wrong_size else "")
+                if doubt and doubt not in doubted:  # once is enough
+                    doubted.add(doubt)
                     told = {"frame": frame.name, "object": result.object}
                     said = f"warning: frame {frame.name}: {'; '.join(result.warnings)}"
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
-                yield make_row(video.name, frame.name, ids, result, truth)
+                rows.append(make_row(video.name, frame.name, ids, result, truth))
+
+
+def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[VideoFrame]:
+    """Yield the frames that can be tracked in.
+
+    Raises:
+        UserError: One cannot be, and `on_error` is not "skip": then a warning names it.
+    """
+    skip = "skip" in (cfg.on_error, OmegaConf.select(cfg, "data.on_error"))
+    for index in range(len(video)):
+        try:
+            frame = read_frame(video, index, tracker)
+        except UserError as error:
+            if not skip:
+                raise UserError(f"{error}; on_error=skip leaves such frames out") from error
+            say(cfg.console, "warning", f"warning: left out: {error}", skipped=str(error))
+            continue
+        if frame is not None:
+            yield frame
+
+
+def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
+    """Return a frame; None where the dataset cannot show it.
+
+    Raises:
+        UserError: It cannot be read, or not be tracked in; the message names it.
+    """
+    frame = video.read(index)
+    if frame is not None:
+        try:
+            tracker.check(frame.rgb, frame.depth, frame.intrinsics)
+        except UserError as error:
+            raise UserError(f"frame {frame.name}: {error}") from error
+    return frame
 
 
 def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) -> None:

@@ -1,9 +1,10 @@
 """Videos: frames in their order, from a folder of pictures or from a dataset."""
 
+import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -19,14 +20,14 @@ class VideoFrame:
     """One frame of a video, with the poses that are known in it."""
 
     name: str  # of the image, unique in the video
-    im_id: int
+    im_id: int  # the number in its file's name, or the dataset's
     rgb: np.ndarray  # (H, W, 3) uint8
     depth: np.ndarray  # (H, W) float32 z-depth [m], 0 where unknown
     intrinsics: np.ndarray  # (3, 3) [px]
     truth: dict[str, np.ndarray]  # by object: camera_from_object (4, 4) [m], mesh frame
 
 
-class Video(Protocol):
+class Video(ABC):
     """Frames in their order; they are read when they are come to."""
 
     name: str
@@ -34,17 +35,32 @@ class Video(Protocol):
     objects: tuple[str, ...] | None  # that are known to be in it; None: that is not known
     ids: dict[str, int]  # their numbers in the dataset
 
+    @abstractmethod
     def __len__(self) -> int:
         """Return the number of frames."""
-        ...
+
+    @abstractmethod
+    def read(self, index: int) -> VideoFrame | None:
+        """Return a frame; None where the dataset cannot show it.
+
+        Raises:
+            BadData: A file is not as it should be.
+        """
 
     def __iter__(self) -> Iterator[VideoFrame]:
-        """Yield the frames.  Raises BadData where a file is not as it should be."""
-        ...
+        """Yield the frames."""
+        for index in range(len(self)):
+            frame = self.read(index)
+            if frame is not None:
+                yield frame
 
 
-class FolderVideo:
+class FolderVideo(Video):
     """A folder with `rgb/` and `depth/`: pictures of the same names, or as many of each.
+
+    Where the color pictures' names differ in one number alone (`000123.png`, `frame_7_rgb.png`),
+    the frames are in its order, and it is their `im_id`. Otherwise they are in the order of the
+    names, and `im_id` is the place in it, from 0.
 
     Args:
         folder: The folder.
@@ -64,8 +80,8 @@ class FolderVideo:
     ) -> None:
         self.name, self._K, self._scale = folder.name, intrinsics, depth_scale
         self.ids: dict[str, int] = {}
-        color = _list_pictures(folder, "rgb", _COLOR)
-        depth = _list_pictures(folder, "depth", _DEPTH)
+        color, numbers = _list_pictures(folder, "rgb", _COLOR)
+        depth, _ = _list_pictures(folder, "depth", _DEPTH)
         by_stem = {path.stem: path for path in depth}
         if all(path.stem in by_stem for path in color):
             depth = [by_stem[path.stem] for path in color]
@@ -74,21 +90,21 @@ class FolderVideo:
                 f"frames={folder}: {len(color)} pictures in rgb/ and {len(depth)} in depth/, of "
                 f"other names; name both alike"
             )
-        self._pairs = [*zip(color, depth, strict=True)][::stride]
+        self._frames = [*zip(numbers, color, depth, strict=True)][::stride]
 
     def __len__(self) -> int:
         """Return the number of frames."""
-        return len(self._pairs)
+        return len(self._frames)
 
-    def __iter__(self) -> Iterator[VideoFrame]:
-        """Yield the frames."""
-        for number, (color, depth) in enumerate(self._pairs):
-            rgb, z = read_color(color), read_depth(depth, self._scale)
-            expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
-            yield VideoFrame(color.stem, number, rgb, z, self._K, {})
+    def read(self, index: int) -> VideoFrame:
+        """Return a frame."""
+        number, color, depth = self._frames[index]
+        rgb, z = read_color(color), read_depth(depth, self._scale)
+        expect_size(depth, z, rgb.shape[0], rgb.shape[1], color.name)
+        return VideoFrame(color.stem, number, rgb, z, self._K, {})
 
 
-class SceneVideo:
+class SceneVideo(Video):
     """A scene of a dataset, with the true poses of the objects that are asked for.
 
     Args:
@@ -116,25 +132,24 @@ class SceneVideo:
         """Return the number of frames."""
         return len(self._frames)
 
-    def __iter__(self) -> Iterator[VideoFrame]:
-        """Yield the frames."""
-        for frame in self._frames:
-            truth: dict[str, np.ndarray] = {}
-            sample = None
-            for index, record in frame:
-                wanted = record.object in self._wanted and record.object not in truth
-                if sample is not None and not wanted:
-                    continue
-                try:
-                    sample = self._reader.read(index)
-                except NotShown:
-                    continue
-                if wanted:
-                    truth[record.object] = sample.camera_from_object.astype(np.float64)
-            if sample is None:  # nothing of it is labeled, so that no reader opens it
+    def read(self, index: int) -> VideoFrame | None:
+        """Return a frame; None where nothing of it is labeled, so that no reader opens it."""
+        truth: dict[str, np.ndarray] = {}
+        sample = None
+        for number, record in self._frames[index]:
+            wanted = record.object in self._wanted and record.object not in truth
+            if sample is not None and not wanted:
                 continue
-            K, record = sample.intrinsics.astype(np.float64), frame[0][1]
-            yield VideoFrame(record.name, record.im_id, sample.rgb, sample.depth, K, truth)
+            try:
+                sample = self._reader.read(number)
+            except NotShown:
+                continue
+            if wanted:
+                truth[record.object] = sample.camera_from_object.astype(np.float64)
+        if sample is None:
+            return None
+        K, record = sample.intrinsics.astype(np.float64), self._frames[index][0][1]
+        return VideoFrame(record.name, record.im_id, sample.rgb, sample.depth, K, truth)
 
 
 def list_groups(reader: Reader) -> list[str]:
@@ -142,12 +157,25 @@ def list_groups(reader: Reader) -> list[str]:
     return list(dict.fromkeys(record.group for record in reader.records()))
 
 
-def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> list[Path]:
-    """Return the pictures of a folder within, in the order of their names."""
+def number_names(names: Sequence[str]) -> list[int] | None:
+    """Return the number in each name; None where names do not differ in one number alone."""
+    parts = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in names]
+    found = [(part[1], int(part[2]), part[3]) for part in parts if part is not None]
+    numbers = [number for _, number, _ in found]
+    alike = len({(before, after) for before, _, after in found}) == 1
+    return numbers if alike and len({*numbers}) == len(names) else None
+
+
+def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> tuple[list[Path], list[int]]:
+    """Return the pictures of a folder within and their numbers, in order."""
     inner = folder / name
     if not inner.is_dir():
         raise UserError(f"frames={folder}: has no folder {name}/; rgb/ and depth/ are due")
     found = sorted(inner / one for one in list_folder(inner) if Path(one).suffix.lower() in endings)
     if not found:
         raise UserError(f"frames={folder}: no pictures in {name}/ ({', '.join(endings)})")
-    return found
+    numbers = number_names([path.stem for path in found])
+    if numbers is None:
+        return found, [*range(len(found))]
+    order = sorted(range(len(found)), key=numbers.__getitem__)
+    return [found[i] for i in order], [numbers[i] for i in order]

@@ -6,6 +6,8 @@ through a point of the outline, the silhouettes end at places that the belief ha
 and the band is the central interval of these: it holds the outline pointwise, not as a whole.
 """
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
@@ -14,6 +16,7 @@ from posefilter.figures.canvas import ESTIMATE, Color, View, draw_lines, draw_ro
 from posefilter.figures.overlay import WIDTH, Shape, get_vertices, render_silhouette, trace_outline
 from posefilter.figures.particles import choose_by_weight
 from posefilter.figures.silhouettes import compute_coverage, project_hulls
+from posefilter.images import to_camera, to_picture
 from posefilter.meshes.mesh import Mesh
 
 _DRAWN = 200  # silhouettes of a hull, which cost little
@@ -68,8 +71,8 @@ def find_band(cover: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_band(
-    rgb: np.ndarray,
-    K: np.ndarray,
+    rgb: Any,
+    K: Any,
     poses: np.ndarray,
     weights: np.ndarray,
     shape: Shape,
@@ -81,7 +84,7 @@ def draw_band(
     """Draw the band of a belief on the photograph, and the outline at which half of it ends.
 
     Args:
-        rgb: (H, W, 3) uint8.
+        rgb: One image, in any form that `Estimator.predict` takes.
         K: (3, 3) [px].
         poses: (N, 4, 4) camera_from_object [m].
         weights: (N,) that sum to 1.
@@ -93,7 +96,11 @@ def draw_band(
 
     Returns:
         The picture (h, w, 3) uint8.
+
+    Raises:
+        UserError: The image or the camera matrix is not as it should be.
     """
+    rgb, K = to_picture(rgb), to_camera(K)
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     picture = view.show(rgb)
     cover = measure_cover(poses, weights, shape, K, view)

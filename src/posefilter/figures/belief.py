@@ -2,16 +2,17 @@
 marginals of each axis.
 
 The map follows Murphy et al. 2021 (Implicit-PDF, figure 3): a rotation is a point where one of the
-object's axes points, and a color for the turn about that axis. Ours looks along the camera: the
+object's axes points, and a color for the rotation about that axis. Ours looks along the camera: the
 center is towards it, right and up are the image's.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from posefilter.belief import Belief
 from posefilter.figures.belief_summary import describe_belief, summarize_belief
 from posefilter.figures.canvas import Color, View, arrange_grid, draw_dots, halve
 from posefilter.figures.layout import (
@@ -35,7 +36,9 @@ from posefilter.figures.panels import arrange_row, draw_mark
 from posefilter.figures.particles import color_by_weight, draw_weight_scale, fade
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, rotation_of
-from posefilter.types import Belief, ObjectModel
+from posefilter.images import to_camera, to_picture, to_pose
+from posefilter.types import Belief as BeliefTensors
+from posefilter.types import ObjectModel
 
 _SECOND: Color = (226, 110, 0)
 _REACH = {"ring": 44, "square": 20, "diamond": 32}  # [px] of marks, at twice the size
@@ -50,22 +53,25 @@ class Mark(NamedTuple):
 
 
 def draw_belief(
-    belief: Belief,
+    belief: Belief | BeliefTensors,
     model: ObjectModel,
-    rgb: np.ndarray,
-    K: np.ndarray,
-    truth: np.ndarray | None = None,
+    rgb: Any,
+    K: Any,
+    truth: Any = None,
     title: str = "",
     axis: int | None = None,
 ) -> np.ndarray:
     """Draw the belief of one image: its rotations on a map, its centers on the photograph, and six
     marginals.
 
-    belief: of one image, with its leading dimension of 1 or without; rgb (H, W, 3) uint8; K (3, 3)
-    [px]; truth (4, 4); axis: the object's axis on the map (its longest, if None).
+    belief: a result's, whose heaviest mode is then the estimate, or a filter's tensors of one
+    image, with their leading dimension of 1 or without; rgb: one image in any form that
+    `Estimator.predict` takes; K (3, 3) [px]; truth (4, 4); axis: the object's axis on the map (its
+    longest, if None). Raises UserError where one is not as it should be.
     """
+    rgb, K = to_picture(rgb), to_camera(K)
     poses, weights, best = select_single(belief)
-    true = None if truth is None else torch.as_tensor(np.asarray(truth), dtype=torch.float64)
+    true = None if truth is None else torch.from_numpy(to_pose(truth))
     axis = find_longest_axis(model) if axis is None else axis
     ess = float(1 / weights.square().sum())
     summary = summarize_belief(poses, weights, best, model)
@@ -79,9 +85,9 @@ def draw_belief(
     words = [
         f"{len(weights)} particles, {ess:.0f} effective.",
         f"±: root mean square in the estimate's mode, {summary.share:.0%} of the belief.",
-        f"Map, above: where the object's {axis_name} axis points, colored by the turn about it.",
+        f"Map: where the object's {axis_name} axis points; color: the rotation about that axis.",
         "Photograph: where the particles put the object's center, colored by weight.",
-        "Below: shares of the belief. Shifts are from its mean, turns from the estimate.",
+        "Below: shares of the belief. Translations are from its mean, rotations from the estimate.",
     ]
     notes = np.concatenate(
         [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
@@ -100,10 +106,15 @@ def draw_belief(
     )
 
 
-def select_single(belief: Belief) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def select_single(
+    belief: Belief | BeliefTensors,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the poses (N, 4, 4), weights (N,) that sum to 1, and estimate (4, 4) of a belief about
     one image.
     """
+    if isinstance(belief, Belief):
+        best = torch.from_numpy(belief.modes[0].pose)
+        return torch.from_numpy(belief.samples), torch.from_numpy(belief.weights), best
     poses, log_weights, best = (
         x.detach().cpu().double() for x in (belief.poses, belief.log_weights, belief.best)
     )
@@ -123,8 +134,8 @@ def find_longest_axis(model: ObjectModel) -> int:
 def draw_rotations(
     poses: torch.Tensor, weights: torch.Tensor, marks: Sequence[Mark], axis: int, width: int
 ) -> np.ndarray:
-    """Draw rotations on a Mollweide map: place = where the axis points, color = turn about it, area
-    = weight.
+    """Draw rotations on a Mollweide map: place = where the axis points, color = rotation about it,
+    area = weight.
     """
     fine = 2 * width  # drawn at twice the size and shrunk: OpenCV's smallest discs are no discs
     picture = draw_blank_map(fine)

@@ -19,20 +19,21 @@ class BeliefSummary(NamedTuple):
     """How sure a belief about one image is.
 
     Attributes:
-        shift: Root mean square distance of the centers in the estimate's mode from their mean [m].
-        turn: The same of the rotations [rad].
+        translation: Root mean square distance of the centers in the estimate's mode from their
+            mean [m].
+        rotation: The same of the rotations [rad].
         share: Weight of the estimate's mode, 0 where the estimate belongs to none.
         second: The heaviest of the other modes, None where there is none that counts.
-        second_shift: How far its center is from the estimate's [m].
-        second_turn: By how much it is turned from the estimate [rad].
+        second_translation: How far its center is from the estimate's [m].
+        second_rotation: By how much it is turned from the estimate [rad].
     """
 
-    shift: float
-    turn: float
+    translation: float
+    rotation: float
     share: float
     second: Hypothesis | None
-    second_shift: float
-    second_turn: float
+    second_translation: float
+    second_rotation: float
 
 
 def summarize_belief(
@@ -51,24 +52,26 @@ def summarize_belief(
     space = PoseSpace((*center.tolist(),), model.radius)
     members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
     own = torch.where(members, weights, 0.0)
-    shift, turn = spread(poses[None], (own / own.sum()).log()[None], space)
+    translation, rotation = spread(poses[None], (own / own.sum()).log()[None], space)
     second = found.others[0] if found.others else None
     away = turned = 0.0
     if second is not None:
         other = torch.from_numpy(second.pose).to(best)
         away = float((origin_of(other, center) - origin_of(best, center)).norm())
         turned = float(angle_between(rotation_of(other), rotation_of(best)))
-    return BeliefSummary(float(shift), float(turn), found.estimate.weight, second, away, turned)
+    return BeliefSummary(
+        float(translation), float(rotation), found.estimate.weight, second, away, turned
+    )
 
 
 def describe_belief(summary: BeliefSummary) -> tuple[str, str]:
     """Return how sure a belief is, and what it says of a second pose: two sentences."""
-    turn = math.degrees(summary.turn)
-    angle = f"{turn:.2g}" if turn < 10 else f"{turn:.0f}"
-    sure = f"sure to ±{format_length(summary.shift)}, ±{angle}°"
+    rotation = math.degrees(summary.rotation)
+    angle = f"{rotation:.2g}" if rotation < 10 else f"{rotation:.0f}"
+    sure = f"sure to ±{format_length(summary.translation)}, ±{angle}°"
     if summary.share == 0:
         sure = "the estimate lies apart from the particles"
     if summary.second is None:
         return sure, "no second pose above 1 %"
-    away, turned = format_length(summary.second_shift), math.degrees(summary.second_turn)
+    away, turned = format_length(summary.second_translation), math.degrees(summary.second_rotation)
     return sure, f"second pose {100 * summary.second.weight:.0f} %: {away} and {turned:.0f}° off"

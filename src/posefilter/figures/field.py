@@ -70,7 +70,8 @@ class PointField(NamedTuple):
 
 
 def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = None) -> np.ndarray:
-    """Draw a column a noise level: three planes of shifts, and the turns about the object's axes.
+    """Draw a column a noise level: three planes of translations, and the rotations about the
+    object's axes.
 
     estimate: (3,) where the estimate's center lies, from the true one, along the object's axes [m].
     """
@@ -79,7 +80,9 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
         own = np.concatenate([field.planes[k].ravel(), field.turns[k].ravel()])
         low = min(float(np.percentile(own, 2)), -1e-3)
         for row, (a, b), values in zip(rows[:3], PLANES, field.planes[k], strict=True):
-            x, y = (make_shift_axis(f"shift in {_NAMES[axis]} [mm]", reach) for axis in (a, b))
+            x, y = (
+                make_shift_axis(f"translation in {_NAMES[axis]} [mm]", reach) for axis in (a, b)
+            )
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
                 marks.append(
@@ -88,7 +91,7 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
             row.append(draw_heat_panel(color_scores(values, low), x, y, _COLUMN, marks))
         ends = draw_color_scale(f"{low:.3g}", "0", width=_COLUMN, size=DETAIL)
         rows[0][-1] = add_caption(np.concatenate([ends, rows[0][-1]]), f"{1000 * sigma:.3g} mm")
-        x = Axis("turn [degrees]", -180, 180, (-180, 0, 180))
+        x = Axis("rotation [degrees]", -180, 180, (-180, 0, 180))
         y = Axis(
             "score", low, max(1.15 * max(float(own.max()), 0.0), -0.06 * low), (round_down(low), 0)
         )
@@ -97,11 +100,11 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
     entries = [("truth", TRUTH), *([] if estimate is None else [("estimate", ESTIMATE)])]
     entries += [
         ("beats truth", _ABOVE),
-        *((f"turn {name}" if name == "x" else name, c) for name, c in list_axes()),
+        *((f"rotation {name}" if name == "x" else name, c) for name, c in list_axes()),
     ]
     note = (
-        "score: log-likelihood less the truth's [nat], of the true pose shifted and turned along "
-        "the object's axes"
+        "score: log-likelihood less the truth's [nat], of the true pose translated along and "
+        "rotated about the object's axes"
     )
     parts = [
         draw_text("at noise levels of", CAPTION),

@@ -1,4 +1,4 @@
-"""Draw the marginals of a belief over one pose: three shifts and three turns."""
+"""Draw the marginals of a belief over one pose: three translations and three rotations."""
 
 import math
 from typing import NamedTuple
@@ -32,14 +32,14 @@ OBJECT_AXES = "xyz"
 CAMERA_AXES = ("right", "down", "away")  # camera axes
 
 
-def compute_shifts_and_turns(
+def compute_offsets(
     poses: torch.Tensor, reference: torch.Tensor, mean: torch.Tensor, center: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return centers less `mean`, camera axes (*, 3) [m], and turns from the reference, object axes
-    (*, 3) [rad].
+    """Return centers less `mean`, camera axes (*, 3) [m], and rotations from the reference, object
+    axes (*, 3) [rad].
     """
-    turn = log_so3(rotation_of(reference).mT @ rotation_of(poses))
-    return origin_of(poses, center) - mean, turn
+    rotation = log_so3(rotation_of(reference).mT @ rotation_of(poses))
+    return origin_of(poses, center) - mean, rotation
 
 
 class Marginal(NamedTuple):
@@ -58,15 +58,11 @@ def compute_marginals(
     true: torch.Tensor | None,
     center: torch.Tensor,
 ) -> tuple[list[Marginal], list[Marginal]]:
-    """Return three shifts from the mean, camera axes [mm], and three turns from the estimate,
-    object axes [degrees].
+    """Return three translations from the mean, camera axes [mm], and three rotations from the
+    estimate, object axes [degrees].
     """
     mean = (weights[:, None] * origin_of(poses, center)).sum(0)
-    parts = [
-        compute_shifts_and_turns(p, best, mean, center)
-        for p in (poses, best, true)
-        if p is not None
-    ]
+    parts = [compute_offsets(p, best, mean, center) for p in (poses, best, true) if p is not None]
     out: tuple[list[Marginal], list[Marginal]] = ([], [])
     for kind, unit in enumerate((1000.0, 180 / math.pi)):
         for i in range(3):
@@ -85,15 +81,17 @@ def draw_marginals(
     model: ObjectModel,
 ) -> list[np.ndarray]:
     """Draw six weighted histograms, in two rows with what they are above them."""
-    shifts, turns = compute_marginals(poses, weights, best, true, model.center.cpu().double())
+    translations, rotations = compute_marginals(
+        poses, weights, best, true, model.center.cpu().double()
+    )
     names = [
         [f"{CAMERA_AXES[i]} [mm]" for i in range(3)],
         [f"about {name} [degrees]" for name in OBJECT_AXES],
     ]
     out = []
     for kind, row, labels in (
-        ("shift of the center", shifts, names[0]),
-        ("turn about the object's axes", turns, names[1]),
+        ("translation of the center", translations, names[0]),
+        ("rotation about the object's axes", rotations, names[1]),
     ):
         out.append(draw_text(kind, CAPTION))
         out.append(

@@ -130,4 +130,4 @@ def color_by_turn(turn: np.ndarray) -> np.ndarray:
 
 def draw_turn_scale() -> np.ndarray:
     """Return what the colors mean, as wide as a figure."""
-    return draw_scale("turn: -180°", color_by_turn(np.linspace(-math.pi, math.pi, 256)), "180°")
+    return draw_scale("rotation: -180°", color_by_turn(np.linspace(-math.pi, math.pi, 256)), "180°")

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from posefilter.figures.canvas import (
     full_view,
     split_dashes,
 )
+from posefilter.images import to_camera, to_picture, to_pose
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.embree import EmbreeRenderer, render_depth
 
@@ -29,12 +31,12 @@ _NEAR = 0.01  # [m]; what is nearer to the camera's plane is not drawn
 
 
 def draw_overlay(
-    rgb: np.ndarray,
-    K: np.ndarray,
-    pose: np.ndarray | None,
+    rgb: Any,
+    K: Any,
+    pose: Any,
     shape: Shape,
     color: Color = ESTIMATE,
-    truth: np.ndarray | None = None,
+    truth: Any = None,
     caption: str = "",
     label: str = "estimate",
     width: int = WIDTH,
@@ -43,10 +45,12 @@ def draw_overlay(
     """Draw where a pose puts the object, and where the truth does; caption and legend are on a row
     below the photograph.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; pose, truth: (4, 4) camera_from_object [m], None where there
-    is none; width: of the result at least [px]; dashed: the pose is not sure. -> (s H + row, s W,
-    3) uint8, enlarged by s = max(1, width / W).
+    rgb: one image in any form that `Estimator.predict` takes; K (3, 3) [px]; pose, truth: (4, 4)
+    camera_from_object [m], None where there is none; width: of the result at least [px]; dashed:
+    the pose is not sure. -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W). Raises
+    UserError where one is not as it should be.
     """
+    rgb = to_picture(rgb)
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     drawn = np.full((4, 4), np.nan) if pose is None else pose  # which draws nothing
     picture = draw_poses(rgb, K, drawn, shape, view, color, truth, dashed=dashed)
@@ -64,13 +68,13 @@ def draw_overlay(
 
 
 def draw_poses(
-    rgb: np.ndarray,
-    K: np.ndarray,
-    pose: np.ndarray,
+    rgb: Any,
+    K: Any,
+    pose: Any,
     shape: Shape,
     view: View,
     color: Color = ESTIMATE,
-    truth: np.ndarray | None = None,
+    truth: Any = None,
     coarse: int = 1,
     dashed: bool = False,
 ) -> np.ndarray:
@@ -79,12 +83,11 @@ def draw_poses(
     coarse: pixels that a mesh's outline may miss its silhouette by; rays are cast that much more
     sparsely.
     """
-    picture = view.show(rgb)
-    shown = view.camera(K)
+    picture = view.show(to_picture(rgb))
+    shown = view.camera(to_camera(K))
     if truth is not None:
-        draw_pose(picture, shown, np.asarray(truth, np.float64), shape, TRUTH, coarse=coarse)
-    own = np.asarray(pose, np.float64)
-    draw_pose(picture, shown, own, shape, color, coarse=coarse, dashed=dashed)
+        draw_pose(picture, shown, to_pose(truth), shape, TRUTH, coarse=coarse)
+    draw_pose(picture, shown, to_pose(pose), shape, color, coarse=coarse, dashed=dashed)
     return picture
 
 

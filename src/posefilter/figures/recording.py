@@ -187,7 +187,7 @@ def describe(shown: ViewData) -> str:
     lines = [
         f"# {shown.name}, score {shown.score:.2f}",
         "",
-        "| pose | weight | center x, y, z [mm] | from the estimate [mm] | turned by |",
+        "| pose | weight | center x, y, z [mm] | from the estimate [mm] | rotated by |",
         "|---|---|---|---|---|",
     ]
     for name, one in [

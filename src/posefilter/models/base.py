@@ -18,6 +18,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.confidence.apparent_size import ApparentSize
+from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth
 from posefilter.confidence.verdicts import Costs, score_verdicts
@@ -399,6 +400,10 @@ class PoseEstimator(Module):
             verdict = torch.where(
                 size.contradicts().to(verdict.device), verdict.clamp_max(0), verdict
             )
+        rgb, depth = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu(), batch.depth[:, 0].cpu()
+        pairs = zip(rgb.numpy(), depth.numpy(), strict=True)
+        blank = torch.tensor([bool(find_blank(*pair)) for pair in pairs])
+        verdict = torch.where(blank.to(verdict.device), 0, verdict)  # as of a result
         self.scores["confidence"].update(*found, torch.full_like(right, there), right, verdict)
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:

@@ -86,6 +86,4 @@ class Hypotheses(PoseParticles):
 def require_depth(valid: Tensor) -> None:
     """Raise UserError where an image has no known depth.  (B, ...) bool."""
     if not bool(valid.flatten(1).any(1).all()):
-        raise UserError(
-            "depth: not one pixel of an image has a known depth, so no pose can be proposed"
-        )
+        raise UserError("depth: so few pixels of an image have depth that no pose can be proposed")

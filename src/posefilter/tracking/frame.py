@@ -1,7 +1,9 @@
 """One frame of a video, prepared once for all objects that are tracked in it."""
 
+from functools import cached_property
 from threading import Lock
 
+from posefilter.confidence.blank import find_blank
 from posefilter.images import Images, make_batch
 from posefilter.tracking.window import Window, clean_depth, cut_window
 from posefilter.types import Batch
@@ -20,6 +22,11 @@ class Frame:
         self.images = clean_depth(images)
         self._whole: dict[tuple[int | None, int | None], Batch] = {}
         self._lock = Lock()
+
+    @cached_property
+    def blank(self) -> str:
+        """Why it cannot be judged, in words; "" where it can be."""
+        return find_blank(self.images.rgb[0], self.images.depth[0])
 
     def see_whole(self, size: tuple[int | None, int | None]) -> Batch:
         """Return the whole photograph at a size; of each size it is made once.

@@ -19,8 +19,8 @@ from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
 _COLUMNS = (
-    "video", "frame", "object", "status", "score", "relevance", "presence", "probability",
-    "particles", "add_mm", "add_s_mm", "seconds",
+    "video", "frame", "scene_id", "im_id", "obj_id", "object", "status", "score", "relevance",
+    "presence", "probability", "particles", "add_mm", "add_s_mm", "seconds",
 )  # fmt: skip
 
 
@@ -127,6 +127,9 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
     return {
         "video": row.video,
         "frame": row.frame,
+        "scene_id": row.scene_id,
+        "im_id": row.im_id,
+        "obj_id": row.obj_id,
         "object": result.object,
         "status": result.status,
         "camera_from_object": result.pose.tolist(),

@@ -79,7 +79,7 @@ class Sight(NamedTuple):
     """What one frame shows."""
 
     batch: Batch  # the image, or the window of it that was looked at
-    belief: Belief | None  # None where nothing has depth
+    belief: Belief | None  # None where nothing has depth, or the frame cannot be judged
     relevance: float  # the mean relevance of the pixels that the estimate covers
     presence: float  # what the track is judged by
     found: Assessment | None  # the calibrated probabilities
@@ -153,7 +153,7 @@ class Track:
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
-        result = make_result(self._describe(sight), 0)
+        result = make_result(self._describe(sight, frame.blank), 0)
         content = {**vars(result), "seconds": time.perf_counter() - start}
         return TrackResult(**content, status=status, relevance=sight.relevance)
 
@@ -186,7 +186,7 @@ class Track:
     def _estimate(self, frame: Frame) -> Sight:
         """Run the estimator's own filter on the whole image."""
         batch = self._take(frame.see_whole(self.size))
-        if not bool(batch.depth.any()):
+        if frame.blank or not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
@@ -198,7 +198,7 @@ class Track:
         window = self._choose_window(frame.images, predicted.best[0])
         seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
         batch = self._take(seen)
-        if not bool(batch.depth.any()):
+        if frame.blank or not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
         effort, settings = self._effort, self.settings
         # what a window shows is the predicted belief's already
@@ -221,10 +221,14 @@ class Track:
         )
         return self._weigh(batch, filter(batch, glance, self.generator))
 
-    def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State:
-        """Return the state after a frame; `belief` is None where what it shows is not trusted."""
+    def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State | None:
+        """Return the state after a frame; `belief` is None where what it shows is not trusted.
+
+        It is None until a frame shows something: the next one is then the first.
+        """
         if belief is None:
-            assert predicted is not None  # the first frame has depth
+            if predicted is None:
+                return None
             return predicted._replace(velocity=torch.zeros_like(predicted.velocity))
         if predicted is None or self.state is None or status != TRACKED:
             return begin(belief)
@@ -272,15 +276,22 @@ class Track:
         presence, found = measure_presence(self.method, trace, batch, relevance)
         return Sight(batch, belief, relevance, presence, found)
 
-    def _describe(self, sight: Sight) -> Run:
+    def _describe(self, sight: Sight, blank: str) -> Run:
         """Return the state as an estimator's run on what was looked at."""
-        assert self.state is not None
         state = self.state
+        if state is None:  # no more than a guess: a meter ahead
+            ahead = torch.eye(4, device=self.method.device)
+            ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.model.center.to(ahead)
+            state = begin(
+                Belief(ahead[None, None], ahead.new_zeros(1, 1), ahead[None], ahead.new_zeros(1))
+            )
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
         belief = Belief(state.belief.state, state.belief.log_weights, state.best, score)
         trace = Trace((), (), (), belief)
-        return Run(self.method, sight.batch, trace, 0.0, sight.found, size=sight.size)
+        return Run(
+            self.method, sight.batch, trace, 0.0, sight.found, size=sight.size, blank=[blank]
+        )
 
 
 def begin(belief: Belief) -> State:

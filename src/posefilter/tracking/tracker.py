@@ -87,7 +87,8 @@ class Tracker:
             rgb: Color (H, W, 3) or (3, H, W), RGB, as a numpy array or tensor: uint8, or float in
                 [0, 1].
             depth: z-depth (H, W) in meters, as float, aligned with the color; 0 or NaN where
-                unknown. After the first frame it may be unknown everywhere.
+                unknown. Where it is unknown everywhere, or the color is one, the frame counts as
+                one that does not show the object; `TrackResult.blank` says so.
             intrinsics: Camera matrix (3, 3) [px] of this frame.
 
         Returns:
@@ -101,7 +102,7 @@ class Tracker:
 
     def update_all(self, rgb: Any, depth: Any, intrinsics: Any) -> list[TrackResult]:
         """Find each object in the next frame; as `update`, but always a list."""
-        frame = Frame(self._check(rgb, depth, intrinsics))
+        frame = Frame(self.check(rgb, depth, intrinsics))
         if self._others is not None:
             return self._others.update(frame)
         return [track.update(frame) for track in self.tracks]
@@ -128,8 +129,12 @@ class Tracker:
         for track in self.tracks:
             track.reset()
 
-    def _check(self, rgb: Any, depth: Any, intrinsics: Any) -> Images:
-        """Return a frame in one form; all is checked of the first, and the shapes of the others."""
+    def check(self, rgb: Any, depth: Any, intrinsics: Any) -> Images:
+        """Return a frame in one form; all is checked of the first, and the shapes of the others.
+
+        Raises:
+            UserError: The frame is not as it should be.
+        """
         fast = (
             isinstance(rgb, np.ndarray)
             and isinstance(depth, np.ndarray)
@@ -142,7 +147,7 @@ class Tracker:
             check_depth_unit(depth)
             K = check_intrinsics(np.asarray(intrinsics), 1, depth.shape)
             return Images(rgb[None], depth[None], K)
-        images, batched = check_images(rgb, depth, intrinsics, empty=self._size is not None)
+        images, batched = check_images(rgb, depth, intrinsics, empty=True)
         if batched:
             raise UserError("rgb: a tracker takes one frame after the other, not a batch")
         self._size = images.depth.shape[1:]

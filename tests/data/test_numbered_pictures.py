@@ -1,0 +1,37 @@
+"""The number of a frame is that in its file's name, where every file has one."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from posefilter.data.sequences import FolderVideo
+
+
+@pytest.mark.parametrize(
+    ("names", "order", "numbers"),
+    [
+        (["000010", "000002"], ["000002", "000010"], [2, 10]),
+        (["f10_rgb", "f9_rgb"], ["f9_rgb", "f10_rgb"], [9, 10]),
+        (["2024_7", "2024_12"], ["2024_7", "2024_12"], [7, 12]),
+        (["2.5", "1.75"], ["1.75", "2.5"], [0, 1]),  # seconds: two numbers
+        (["b1", "a2"], ["a2", "b1"], [0, 1]),
+        (["01", "1"], ["01", "1"], [0, 1]),
+        (["a", "7"], ["7", "a"], [0, 1]),
+    ],
+)
+def test_frames_are_in_the_order_of_their_numbers(
+    names: list[str], order: list[str], numbers: list[int], tmp_path: Path
+) -> None:
+    for folder, picture in (
+        ("rgb", np.zeros((4, 4, 3), np.uint8)),
+        ("depth", np.ones((4, 4), np.uint16)),
+    ):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            cv2.imwrite(str(tmp_path / folder / f"{name}.png"), picture)
+    video = FolderVideo(tmp_path, np.eye(3), 1000.0)
+    assert [(frame.name, frame.im_id) for frame in video] == [*zip(order, numbers, strict=True)]
+    every_second = FolderVideo(tmp_path, np.eye(3), 1000.0, stride=2)
+    assert [frame.im_id for frame in every_second] == numbers[::2]
