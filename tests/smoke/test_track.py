@@ -3,6 +3,9 @@
 import csv
 import importlib.util
 import json
+import os
+import signal
+import time
 from pathlib import Path
 
 import cv2
@@ -12,6 +15,7 @@ from omegaconf import OmegaConf
 
 from posefilter.cli.command import compose_job, run_command
 from posefilter.cli.track import make_settings
+from posefilter.locks import LOCK, hold
 from posefilter.tracking.settings import TrackerSettings
 
 HOME = Path(__file__).parents[2]
@@ -126,6 +130,8 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         ([], "give either frames=DIR, or data="),
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
+        (["frames=FOLDER", CAMERA, "fps=1e-9"], "fps=1e-09: must be a number, at least 0.1"),
+        (["frames=FOLDER", CAMERA, "tracker=null"], "tracker=null: track cannot do without"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
         (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0: must be a whole number"),
         (
@@ -140,6 +146,37 @@ def test_a_mistake_is_one_line(
     typed = [one.replace("FOLDER", str(folder)) for one in wrong]
     assert run_command("track", HOME, [*COMMON, *typed, f"out={tmp_path / 'out'}"]) == 2
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
+
+
+def test_a_damaged_frame_leaves_no_half_of_a_video(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    np.save(folder / "depth" / "003.npy", np.full((240, 320), 1e200))
+    (folder / "depth" / "003.png").unlink()
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}"]
+    assert run_command("track", HOME, typed) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.endswith("003.npy: depth is too large (1e+200)")
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_a_folder_has_one_track_at_a_time(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    number = os.fork()
+    if number == 0:
+        hold(tmp_path / "out")
+        time.sleep(60)
+        os._exit(0)
+    while not (tmp_path / "out" / LOCK).exists():
+        time.sleep(0.01)
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}"]
+    try:
+        assert run_command("track", HOME, typed) == 2
+    finally:
+        os.kill(number, signal.SIGKILL)
+        os.waitpid(number, 0)
+    assert f"track: {tmp_path / 'out'}: is in use by another run" in capfd.readouterr().err
 
 
 def test_the_commands_defaults_are_the_librarys(tmp_path: Path) -> None:
