@@ -42,6 +42,21 @@ LINES = {
         ["data=fat", "data.root=/nope/\u00fc"],
         "data.root=/nope/\u00fc: no such",
     ),
+    "weights that are not there": (
+        "onboard",
+        ["mesh=carton", "warm_start=/nope"],
+        "/nope: no such file",
+    ),
+    "a number for settings": (
+        "onboard",
+        ["mesh=carton", "settings=5"],
+        "settings=5: must be a list",
+    ),
+    "a mapping among settings": (
+        "onboard",
+        ["mesh=carton", "settings=[{a: 1}]"],
+        "must be a list, such as",
+    ),
     "an equals sign": (
         "train",
         ["data=fat", "data.root=/nope/a=b"],

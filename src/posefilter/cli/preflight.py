@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from posefilter.errors import UserError
 from posefilter.weights import expand_weights, find_weights, is_several
@@ -56,6 +56,11 @@ def check_files(command: str, cfg: DictConfig) -> None:
             find_weights(one)
     if command == "onboard":
         _check_mesh(cfg.mesh)
+        if cfg.warm_start is not None:
+            find_weights(cfg.warm_start)
+        more = cfg.settings
+        if not (isinstance(more, ListConfig) and all(isinstance(one, str) for one in more)):
+            raise UserError(f"settings={more}: must be a list, such as ['filter.particles=200']")
     for key in _NEEDED.get(command, ()):
         if cfg[key] is None:
             raise UserError(
