@@ -86,6 +86,12 @@ def test_what_a_library_refuses_is_one_line() -> None:
         instantiate(node, "callbacks.best")
 
 
+def test_what_the_program_gives_is_no_setting() -> None:
+    node = {"_target_": "lightning.Trainer", "plugins": [1]}
+    with pytest.raises(UserError, match=r"^trainer.plugins: is not a setting"):
+        instantiate(node, "trainer", plugins=None)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     job = compose_job("train", HOME / "conf", ["trainer.accelerator=gpu"], tmp_path)

@@ -245,6 +245,15 @@ def test_a_damaged_compressed_image_is_named(data: bytes, told: str, capfd) -> N
     assert capfd.readouterr().err == ""
 
 
+def test_a_bag_that_claims_more_than_the_memory_has_is_named(tmp_path: Path) -> None:
+    """The record after a file's magic bytes is its header: a byte of its kind, then its length."""
+    content = bytearray(write_scene(tmp_path / "in").read_bytes())
+    content[9:17] = struct.pack("<Q", 1 << 60)
+    (tmp_path / "bag.mcap").write_bytes(content)
+    with pytest.raises(UserError, match=r"bag\.mcap: cannot be read as a ROS 2 bag \("):
+        BagReader(tmp_path / "bag.mcap", TOPICS, 0.01)
+
+
 def test_a_bag_that_was_being_written_is_in_nobodys_way(tmp_path: Path) -> None:
     """Of a process that was killed nothing is left; beside one that lives there is no second."""
     path = tmp_path / "out.mcap"
