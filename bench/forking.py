@@ -19,6 +19,7 @@ import yaml
 from forked import end_with
 
 # what the commands import when they are called: before the fork, so that it is paid once
+import posefilter.cli.calibrate
 import posefilter.cli.check_data
 import posefilter.cli.evaluate
 import posefilter.cli.export
@@ -26,6 +27,7 @@ import posefilter.cli.generate
 import posefilter.cli.onboard
 import posefilter.cli.predict
 import posefilter.cli.report
+import posefilter.cli.track
 import posefilter.cli.train  # noqa: F401
 from posefilter.cli.command import run_command
 

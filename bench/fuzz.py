@@ -158,6 +158,9 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
     rgb, depth = folder / "rgb.png", folder / "depth.png"
     cv2.imwrite(str(rgb), np.full((120, 160, 3), 90, np.uint8))
     cv2.imwrite(str(depth), np.full((120, 160), 7000, np.uint16))
+    for picture in (rgb, depth):  # a video of one frame
+        (folder / "video" / picture.stem).mkdir(parents=True)
+        (folder / "video" / picture.stem / "0.png").write_bytes(picture.read_bytes())
     quiet = ["console=json", "threads=1"]
     small = ["debug=smoke", *quiet, "logger=none", "data.progress=false", f"data.root={data}"]
     small += [
@@ -189,6 +192,10 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
         ],
         "report": ["console=json", f"run={run_folder}", f"out={folder}/NEW"],
         "export": ["console=json", f"checkpoint={best}", f"out={folder}/NEW.ckpt"],
+        "track": [
+            *quiet, f"checkpoint={best}", f"frames={folder}/video", f"out={folder}/NEW",
+            "intrinsics=180,180,80,60", "depth_scale=10000", "video=gif",
+        ],
         "onboard": [*quiet, "mesh=carton", f"out={folder}/NEW"],
     }  # fmt: skip
 
@@ -233,6 +240,7 @@ def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -
                 "meshes",
                 "data.meshes",
                 "run",
+                "frames",
             )
             typed.append(f"{rng.choice([key for key in names if key in keys] or ['out'])}={place}")
         else:

@@ -5,12 +5,13 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
 from posefilter.errors import UserError
 
-_PARTS = ".*.part"
+_PARTS = (".*.part", ".*.part.mp4")  # a video's ending tells its encoder the format
 
 
 @contextmanager
@@ -67,8 +68,8 @@ def remove_parts(folder: Path, places: Sequence[str], seconds: float = 0.0) -> N
         places: Patterns of the folders in it that are looked at, "." for itself.
         seconds: Only what is older.
     """
-    for place in places:
-        for part in folder.glob(f"{place}/{_PARTS}"):
+    for place, name in product(places, _PARTS):
+        for part in folder.glob(f"{place}/{name}"):
             with suppress(OSError):  # of another user, or gone by now
                 if time.time() - part.lstat().st_mtime >= seconds:
                     part.unlink()

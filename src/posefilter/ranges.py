@@ -124,7 +124,7 @@ RANGES: dict[str, Range] = {
     "calibrate.frames": _whole(10, 1_000_000),
     "track.depth_scale": Range(1e-2, 1e7),
     "track.stride": COUNT,
-    "track.fps": Range(0, 1000, above=True),
+    "track.fps": Range(0.1, 1000),
     "export.points": COUNT,
     "export.width": _whole(16, MOST_SIDE),
     "export.height": _whole(16, MOST_SIDE),

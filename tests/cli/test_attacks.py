@@ -42,6 +42,26 @@ LINES = {
         ["data=fat", "data.root=/nope/\u00fc"],
         "data.root=/nope/\u00fc: no such",
     ),
+    "weights that are not there": (
+        "onboard",
+        ["mesh=carton", "warm_start=/nope"],
+        "warm_start=/nope: no such file",
+    ),
+    "one of several weights that is not there": (
+        "train",
+        ["warm_start=[003_cracker_box,nope]"],
+        "warm_start=nope: no such file",
+    ),
+    "a number for settings": (
+        "onboard",
+        ["mesh=carton", "settings=5"],
+        "settings=5: must be a list",
+    ),
+    "a mapping among settings": (
+        "onboard",
+        ["mesh=carton", "settings=[{a: 1}]"],
+        "must be a list, such as",
+    ),
     "an equals sign": (
         "train",
         ["data=fat", "data.root=/nope/a=b"],
@@ -69,6 +89,12 @@ def test_what_a_library_refuses_is_one_line() -> None:
     node = {"_target_": "posefilter.cli.best.Best", "dirpath": "x", "monitor": "a", "mode": "/"}
     with pytest.raises(UserError, match=r"^callbacks.best: cannot be built \(`mode` can be min"):
         instantiate(node, "callbacks.best")
+
+
+def test_what_the_program_gives_is_no_setting() -> None:
+    node = {"_target_": "lightning.Trainer", "plugins": [1]}
+    with pytest.raises(UserError, match=r"^trainer.plugins: is not a setting"):
+        instantiate(node, "trainer", plugins=None)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -19,6 +19,7 @@ from posefilter.data.checking.contact_figure import write_sheet
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
+from posefilter.figures.video import VideoWriter
 from posefilter.metrics.bop_results import PoseRow, write_poses_csv
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.synthetic.fat_format import write_image
@@ -86,3 +87,16 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half(kind: str, full_disk: P
     assert "\n" not in str(caught.value)
     left = [p for p in full_disk.rglob("*") if p.is_file() and p.name != "README"]
     assert left == []
+
+
+def film(path: Path) -> None:
+    with VideoWriter(path, "mp4", 10) as writer:
+        for number in range(30):
+            writer.add(np.roll(NOISE, 7 * number, 1))
+
+
+def test_a_full_disk_leaves_no_video(full_disk: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UserError, match=r"video\.mp4: cannot be written \(.* of 30 frames"):
+        film(full_disk / "video")
+    assert not [*full_disk.glob("*video*")]
+    assert capfd.readouterr().err == ""

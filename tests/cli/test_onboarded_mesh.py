@@ -71,3 +71,10 @@ def test_given_symmetries_beat_those_that_are_found(
     assert len(MeshStore(store).load("brick").symmetries) == 1
     with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose found"):
         find_and_draw(mesh, "nowhere", None, tmp_path)
+
+
+def test_a_mesh_too_small_for_a_hull_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "dot.obj"
+    file.write_text("v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\n")
+    with pytest.raises(UserError, match=r"has no convex hull; 1e-09 m across"):
+        read_onboarded(settings(file))

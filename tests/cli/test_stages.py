@@ -1,9 +1,12 @@
 """Stages: what is done is not done again, what follows a change is, and what is costly is kept."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from posefilter.cli.onboard import FOUND
 from posefilter.cli.stages import Stages
 from posefilter.errors import UserError
 
@@ -47,7 +50,30 @@ def test_a_costly_stage_is_not_begun_anew(tmp_path: Path) -> None:
         stages.run("train", {"steps": 6, "seed": 0}, lambda: None, costly=True)
 
 
-def test_a_damaged_record_is_named(tmp_path: Path) -> None:
-    (tmp_path / "record.json").write_text("[]")
-    with pytest.raises(UserError, match=r"record\.json: is no record"):
-        Stages(tmp_path / "record.json")
+STAGE = {"done": True, "settings": {}, "seconds": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("stages", "values", "told"),
+    [
+        ([1], {}, "its stages should be a mapping"),
+        ({"mesh": 5}, {}, "its stages.mesh should be a mapping"),
+        ({"mesh": {}}, {}, "its stages.mesh has no settings"),
+        ({"mesh": {**STAGE, "seconds": "x"}}, {}, "its stages.mesh.seconds should be a number"),
+        ({"mesh": {**STAGE, "seconds": float("nan")}}, {}, "NaN cannot be computed with"),
+        ({}, {"steps": []}, "its values.steps should be a number"),
+        ({}, {"training": 5}, "its values.training should be a mapping"),
+    ],
+)
+def test_a_damaged_record_is_named(stages: Any, values: Any, told: str, tmp_path: Path) -> None:
+    file = tmp_path / "record.json"
+    file.write_text(json.dumps({"stages": stages, "values": values}))
+    with pytest.raises(UserError, match=rf"record\.json: is no record.*{told}"):
+        Stages(file, FOUND)
+
+
+def test_what_is_no_record_is_named(tmp_path: Path) -> None:
+    for content in ("[]", "[" * 100_000, "{}", "{"):
+        (tmp_path / "record.json").write_text(content)
+        with pytest.raises(UserError, match=r"record\.json: is no record"):
+            Stages(tmp_path / "record.json")

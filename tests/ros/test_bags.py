@@ -2,7 +2,12 @@
 
 import dataclasses
 import json
+import os
+import signal
+import struct
+import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +25,7 @@ from posefilter.cli import run_command
 from posefilter.errors import UserError
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.rotation import log_so3, quat_xyzw_from_matrix, random_rotation
-from posefilter.ros.bags import BagReader, Topics
+from posefilter.ros.bags import BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections, to_ros_covariance
 from posefilter.ros.messages import (
     CAMERA_INFO,
@@ -213,6 +218,60 @@ def test_a_damaged_image_is_named(broken: dict[str, Any]) -> None:
     message = dataclasses.replace(make_image(np.zeros((4, 4, 3), np.uint8), "rgb8"), **broken)
     with pytest.raises(UserError, match="color=/rgb"):
         decode_color(message, "/rgb")
+
+
+def make_png(width: int, height: int) -> bytes:
+    """Return a PNG of one color whose header names another size."""
+    data = bytearray(cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes())
+    data[16:24] = struct.pack(">II", width, height)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"", "the file is empty"),
+        (make_png(2, 2)[:-20], "the PNG has no end"),
+        (make_png(60_000, 60_000), "image too large"),
+    ],
+    ids=["empty", "cut off", "a bomb"],
+)
+def test_a_damaged_compressed_image_is_named(data: bytes, told: str, capfd) -> None:
+    fields = {"header": make_header(0), "format": "png"}
+    message = make_message(COMPRESSED, **fields, data=np.frombuffer(data, np.uint8))
+    with pytest.raises(UserError, match=f"^color=/rgb: .*{told}"):
+        decode_color(message, "/rgb")
+    assert capfd.readouterr().err == ""
+
+
+def test_a_bag_that_claims_more_than_the_memory_has_is_named(tmp_path: Path) -> None:
+    """The record after a file's magic bytes is its header: a byte of its kind, then its length."""
+    content = bytearray(write_scene(tmp_path / "in").read_bytes())
+    content[9:17] = struct.pack("<Q", 1 << 60)
+    (tmp_path / "bag.mcap").write_bytes(content)
+    with pytest.raises(UserError, match=r"bag\.mcap: cannot be read as a ROS 2 bag \("):
+        BagReader(tmp_path / "bag.mcap", TOPICS, 0.01)
+
+
+def test_a_bag_that_was_being_written_is_in_nobodys_way(tmp_path: Path) -> None:
+    """Of a process that was killed nothing is left; beside one that lives there is no second."""
+    path = tmp_path / "out.mcap"
+    number = os.fork()
+    if number == 0:
+        BagWriter(path, "/d").__enter__()
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(number, 0)
+    assert [one.name for one in tmp_path.iterdir()] == [".out.mcap.part"]
+    with BagWriter(path, "/d"):
+        number = os.fork()
+        if number == 0:
+            with suppress(UserError):
+                BagWriter(path, "/d")
+                os._exit(1)
+            os._exit(0)
+        assert os.waitstatus_to_exitcode(os.waitpid(number, 0)[1]) == 0
+    assert [one.name for one in tmp_path.iterdir()] == ["out.mcap"]
 
 
 def test_each_image_has_the_depth_nearest_in_time(tmp_path: Path) -> None:

@@ -3,6 +3,9 @@
 import csv
 import importlib.util
 import json
+import os
+import signal
+import time
 from pathlib import Path
 
 import cv2
@@ -13,6 +16,7 @@ from omegaconf import OmegaConf
 from posefilter.cli.command import compose_job, run_command
 from posefilter.cli.track import make_settings
 from posefilter.data.sequences import VideoFrame
+from posefilter.locks import LOCK, hold
 from posefilter.tracking.settings import TrackerSettings
 
 HOME = Path(__file__).parents[2]
@@ -66,7 +70,12 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
 
 
 def break_frame(folder: Path, which: str) -> Path:
-    """Cut the file of the third frame off, or make its depth implausible."""
+    """Cut the file of the third frame off, or make its depth implausible or impossible."""
+    if which == "depth beyond numbers":
+        (folder / "depth" / "frame_10.png").unlink()
+        path = folder / "depth" / "frame_10.npy"
+        np.save(path, np.full((240, 320), 1e200))
+        return path
     if which == "depth in other units":
         path = folder / "depth" / "frame_10.png"
         cv2.imwrite(str(path), np.full((240, 320), 100, np.uint16))
@@ -76,7 +85,7 @@ def break_frame(folder: Path, which: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("which", ["truncated", "depth in other units"])
+@pytest.mark.parametrize("which", ["truncated", "depth in other units", "depth beyond numbers"])
 def test_what_was_tracked_before_a_broken_frame_is_kept(
     which: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -93,6 +102,7 @@ def test_what_was_tracked_before_a_broken_frame_is_kept(
     assert json.loads((out / "metrics.json").read_text())["003_cracker_box"]["frames"] == 2
     video = cv2.VideoCapture(str(out / "video.mp4"))
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2
+    assert not list(out.glob(".*part*"))
 
 
 def test_what_was_tracked_before_an_interruption_is_kept(
@@ -207,6 +217,8 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         (["frames=FOLDER", CAMERA, "on_error=stop"], "on_error=stop: choose raise or skip"),
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
+        (["frames=FOLDER", CAMERA, "fps=1e-9"], "fps=1e-09: must be a number, at least 0.1"),
+        (["frames=FOLDER", CAMERA, "tracker=null"], "tracker=null: track cannot do without"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),
         (["frames=FOLDER", CAMERA, "tracker.patience=0"], "patience=0: must be a whole number"),
         (
@@ -221,6 +233,25 @@ def test_a_mistake_is_one_line(
     typed = [one.replace("FOLDER", str(folder)) for one in wrong]
     assert run_command("track", HOME, [*COMMON, *typed, f"out={tmp_path / 'out'}"]) == 2
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
+
+
+def test_a_folder_has_one_track_at_a_time(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    number = os.fork()
+    if number == 0:
+        hold(tmp_path / "out")
+        time.sleep(60)
+        os._exit(0)
+    while not (tmp_path / "out" / LOCK).exists():
+        time.sleep(0.01)
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={tmp_path / 'out'}"]
+    try:
+        assert run_command("track", HOME, typed) == 2
+    finally:
+        os.kill(number, signal.SIGKILL)
+        os.waitpid(number, 0)
+    assert f"track: {tmp_path / 'out'}: is in use by another run" in capfd.readouterr().err
 
 
 def test_the_commands_defaults_are_the_librarys(tmp_path: Path) -> None:

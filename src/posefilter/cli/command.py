@@ -64,7 +64,8 @@ EXPECTED = (
 )
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
 _MULTIRUN = ("-m", "--multirun")
-_OWN_FOLDER = ("train", "evaluate", "predict", "check_data")  # others write to a folder of another
+# others write to a folder of another
+_OWN_FOLDER = ("train", "evaluate", "predict", "check_data", "track")
 
 
 def run_command(name: str, home: Path | None = None, arguments: list[str] | None = None) -> int:

@@ -68,9 +68,13 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
 
 
 def first_line(error: BaseException) -> str:
-    """Return an error's first line, or its kind where it says nothing."""
+    """Return an error's first line, or its kind where it says nothing.
+
+    What a terminal would obey rather than show is replaced: names in files of others are quoted.
+    """
     lines = str(error).splitlines()
-    return lines[0] if lines else type(error).__name__
+    line = lines[0] if lines else type(error).__name__
+    return "".join(one if one.isprintable() else "?" for one in line)
 
 
 def near(wrong: str, known: list[str]) -> str:

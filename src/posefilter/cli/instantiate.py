@@ -90,6 +90,8 @@ def _build(
         return arguments
     partial = bool(node.get("_partial_", False))
     check_arguments(target, arguments, given, where, partial)
+    if twice := sorted(arguments.keys() & given.keys()):
+        raise UserError(f"{where}.{twice[0]}: is not a setting; the program gives it itself")
     target = variant(target) if variant is not None else target
     made = functools.partial(target, **arguments, **given)
     if partial:

@@ -35,6 +35,7 @@ from posefilter.cli.train import build, finish, fit, test
 from posefilter.confidence.fit import FEWEST
 from posefilter.errors import UserError
 from posefilter.files import write_whole
+from posefilter.forms import NUMBER, TEXT
 from posefilter.meshes.inspect_mesh import list_concerns
 from posefilter.meshes.mesh import Mesh
 from posefilter.paths import find_conf
@@ -43,6 +44,8 @@ from posefilter.report.gather import read_json, read_run
 from posefilter.report.onboarding_page import make_onboarding_page
 
 RECORD = "onboarding.json"
+_SPEED = ("steps", "seconds_per_step", "seconds_per_image")  # known once the training begins
+FOUND = {**dict.fromkeys(_SPEED, NUMBER), "concerns": [TEXT], "facts": {}, "training": {}}
 _FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 40, 200, 2000
 _FEWEST_STEPS, _MOST_STEPS = 100, 8000
 _VALIDATED = 8  # images, once at the end
@@ -156,10 +159,15 @@ class Onboarding:
         return build(job)
 
     @property
+    def is_measured(self) -> bool:
+        """Whether the number of steps and the time of one are known."""
+        return all(self.stages.values.get(name) is not None for name in _SPEED)
+
+    @property
     def seconds_left(self) -> float | None:
         """How long the rest will take, as far as it is known [s]."""
         values, spent = self.stages.values, sum(self.stages.seconds.values())
-        if "seconds_per_step" not in values:
+        if not self.is_measured:
             known = self.cfg.steps is None
             return max(0.0, 60 * self.cfg.budget_minutes - spent) if known else None
         speed = Speed(values["seconds_per_step"], values["seconds_per_image"])
@@ -183,7 +191,7 @@ def onboard(job: Job) -> None:
     mesh = read_onboarded(cfg)
     out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
     hold_folder(out)
-    work = Onboarding(cfg, mesh, out, Stages(out / RECORD))
+    work = Onboarding(cfg, mesh, out, Stages(out / RECORD, FOUND))
     for number, stage in enumerate(STAGES, 1):
         settings = work.settings_of(stage)
         head = f"[{number}/{len(STAGES)}] {stage.doing}"
@@ -224,7 +232,7 @@ def render(work: Onboarding) -> None:
 def train(work: Onboarding) -> None:
     """Train for as many steps as fit, from where it was interrupted if it was."""
     values, console = work.stages.values, work.cfg.console
-    if "steps" not in values:
+    if not work.is_measured:
         speed = measure_speed(work.job(work.out / ".trial"))
         steps, seconds = work.cfg.steps, speed.step
         if steps is None:

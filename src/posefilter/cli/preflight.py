@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 
 from posefilter.errors import UserError
 from posefilter.weights import expand_weights, find_weights, is_several
@@ -54,8 +54,13 @@ def check_files(command: str, cfg: DictConfig) -> None:
         several = command == "predict" and is_several(cfg.checkpoint)
         for one in expand_weights(cfg.checkpoint) if several else [cfg.checkpoint]:
             find_weights(one)
+    if command in ("train", "onboard") and cfg.warm_start:
+        _check_start(cfg.warm_start)
     if command == "onboard":
         _check_mesh(cfg.mesh)
+        more = cfg.settings
+        if not (isinstance(more, ListConfig) and all(isinstance(one, str) for one in more)):
+            raise UserError(f"settings={more}: must be a list, such as ['filter.particles=200']")
     for key in _NEEDED.get(command, ()):
         if cfg[key] is None:
             raise UserError(
@@ -146,3 +151,11 @@ def _select(cfg: Any, key: str) -> Any:
     for part in key.split("."):
         cfg = cfg.get(part) if isinstance(cfg, DictConfig) else None
     return cfg
+
+
+def _check_start(weights: Any) -> None:
+    try:
+        for one in expand_weights(weights):
+            find_weights(one)
+    except UserError as error:
+        raise UserError(str(error).replace("checkpoint=", "warm_start=")) from error

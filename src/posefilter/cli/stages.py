@@ -8,6 +8,11 @@ from typing import Any
 
 from posefilter.cli.results import write_json
 from posefilter.errors import UserError
+from posefilter.forms import NUMBER, Each, Record, check_form, parse_json
+from posefilter.limits import read_bytes
+
+_LONGEST = 1 << 20  # of the file [bytes]
+_STAGE = Record({"settings": {}, "seconds": NUMBER})
 
 
 class Stages:
@@ -15,22 +20,24 @@ class Stages:
 
     Args:
         file: Where it is kept, as JSON.
+        form: Of what the stages find out, as `check_form` has it; None for anything.
 
     Raises:
         UserError: The file is there and is no such record.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, form: Mapping[str, Any] | None = None) -> None:
         self.file = file
         self.content: dict[str, Any] = {"stages": {}, "values": {}}
         if file.is_file():
             try:
-                found = json.loads(file.read_text())
-                self.content = {"stages": dict(found["stages"]), "values": dict(found["values"])}
-            except (OSError, ValueError, TypeError, KeyError) as error:
+                found = parse_json(read_bytes(file, _LONGEST))
+                check_form(found, Record({"stages": Each(_STAGE), "values": form or {}}), file)
+            except (UserError, ValueError, RecursionError) as error:
                 raise UserError(
-                    f"{file}: is no record of an onboarding any more; choose another out="
+                    f"{file}: is no record of an onboarding any more; choose another out= ({error})"
                 ) from error
+            self.content = {name: found[name] for name in self.content}
 
     @property
     def values(self) -> dict[str, Any]:
@@ -51,7 +58,7 @@ class Stages:
     def is_done(self, name: str, settings: Mapping[str, Any]) -> bool:
         """Tell whether a stage was finished with these settings."""
         one = self.content["stages"].get(name)
-        return bool(one and one["done"] and one["settings"] == _plain(settings))
+        return bool(one and one.get("done") and one["settings"] == _plain(settings))
 
     def run(
         self, name: str, settings: Mapping[str, Any], work: Callable[[], None], costly: bool = False

@@ -1,9 +1,11 @@
 """Write annotated frames as a video."""
 
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
+from cv2.utils import logging
 
 from posefilter.errors import UserError
 from posefilter.figures.gif import encode_gif
@@ -15,6 +17,9 @@ _GIF_WIDTH = 480  # [px]
 class VideoWriter:
     """Write pictures to an .mp4 or .gif file as they come; use as a context.
 
+    The file takes its name at the end, when it is whole. A user's mistake or an interruption ends
+    it early, with the pictures so far; after another error there is none.
+
     Args:
         path: The file, without its ending.
         form: "mp4", "gif", or "none" to write nothing.
@@ -24,12 +29,17 @@ class VideoWriter:
 
     def __init__(self, path: Path, form: str, fps: float) -> None:
         self.path, self.form, self.fps = path.with_name(f"{path.name}.{form}"), form, fps
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # likewise, of FFmpeg's
+        self._part = path.with_name(f".{path.name}.{os.getpid()}.part.mp4")
         self._writer: cv2.VideoWriter | None = None
+        self._count = 0
         self._pictures: list[np.ndarray] = []
         self._size: tuple[int, int] | None = None
 
     def __enter__(self) -> "VideoWriter":
         """Return the writer."""
+        # of a full disk it has a line a frame to say, which is said in one at the end
+        self._level = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
         return self
 
     def add(self, picture: np.ndarray) -> None:
@@ -52,15 +62,39 @@ class VideoWriter:
             return
         if self._writer is None:
             code = cv2.VideoWriter.fourcc(*"mp4v")
-            self._writer = cv2.VideoWriter(str(self.path), code, self.fps, self._size)
+            self._writer = cv2.VideoWriter(str(self._part), code, self.fps, self._size)
             if not self._writer.isOpened():
                 raise UserError("video=mp4: this OpenCV cannot encode it; choose video=gif or none")
         self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
+        self._count += 1
 
-    def __exit__(self, *_: object) -> None:
-        """Finish the file."""
-        if self._writer is not None:
-            self._writer.release()
-        if self._pictures:
-            wait = round(1000 / self.fps)
-            write_whole(self.path, encode_gif(self._pictures, wait, hold=wait))
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Finish the file.
+
+        Raises:
+            UserError: It cannot be written, as on a full disk.
+        """
+        keep = kind is None or issubclass(kind, UserError | KeyboardInterrupt)
+        try:
+            if self._writer is not None:
+                self._writer.release()
+                if keep:
+                    self._check_part()
+                    self._part.replace(self.path)
+            if self._pictures and keep:
+                wait = round(1000 / self.fps)
+                write_whole(self.path, encode_gif(self._pictures, wait, hold=wait))
+        finally:
+            self._part.unlink(missing_ok=True)
+            logging.setLogLevel(self._level)
+
+    def _check_part(self) -> None:
+        """Raise UserError where frames are missing: OpenCV does not tell that a disk is full."""
+        written = cv2.VideoCapture(str(self._part))
+        frames = int(written.get(cv2.CAP_PROP_FRAME_COUNT))
+        written.release()
+        if frames != self._count:
+            raise UserError(
+                f"{self.path}: cannot be written ({frames} of {self._count} frames are on the "
+                f"disk; is it full?)"
+            )

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
+from posefilter.errors import UserError
 from posefilter.types import ObjectModel
 
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet at more than this share no normal
@@ -169,11 +170,22 @@ def surface_colors(mesh: Mesh, face: np.ndarray, weights: np.ndarray) -> np.ndar
 
 
 def hull_vertices(vertices: np.ndarray) -> np.ndarray:
-    """Return the vertices of the convex hull.  (V, 3) -> (H, 3)."""
+    """Return the vertices of the convex hull.  (V, 3) -> (H, 3).
+
+    Raises UserError where there is none.
+    """
     try:
         return vertices[ConvexHull(vertices).vertices]
     except QhullError:  # a flat mesh has no volume: joggle it
+        pass
+    try:
         return vertices[ConvexHull(vertices, qhull_options="QJ").vertices]
+    except QhullError as error:
+        size = float(np.ptp(vertices, axis=0).max())
+        raise UserError(
+            f"mesh: has no convex hull; {size:.3g} m across, it is a point or too small: mind the "
+            f"unit (mesh_scale)"
+        ) from error
 
 
 def outline_hull(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 
 from posefilter.files import open_whole_text
+from posefilter.forms import MOST
 from posefilter.metrics.scores import summarize
 
 FILE = "errors.csv"
@@ -68,7 +69,11 @@ def parse_row(row: dict[str, str]) -> ImageError:
     if missing:
         raise ValueError(f"column {missing[0]} is missing")
     kinds = ImageError.__annotations__
-    return ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
+    made = ImageError(*(kinds[name](row[name]) for name in ImageError._fields))
+    for name, value in zip(ImageError._fields, made, strict=True):
+        if isinstance(value, float) and MOST < abs(value) < math.inf:
+            raise ValueError(f"{name}={value} cannot be computed with")
+    return made
 
 
 def summarize_errors(rows: Sequence[ImageError]) -> dict[str, dict[str, float]]:

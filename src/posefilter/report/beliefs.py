@@ -26,7 +26,7 @@ def show_calibration(metrics: Mapping[str, Any]) -> list[Block]:
 def chart_coverage(metrics: Mapping[str, Any]) -> list[Panel]:
     """Return the chart of how often credible sets hold the truth, at every level."""
     found = metrics.get("credibility") or {}
-    levels = [100 * level for level in found.get("levels", ())]
+    levels = [100 * level for level in found.get("levels") or ()]
     lines = [
         Line(
             label if label == "all" else f"visible share {label}",
@@ -55,11 +55,12 @@ def chart_reliability(metrics: Mapping[str, Any]) -> list[Panel]:
 def list_coverage(metrics: Mapping[str, Any]) -> list[Block]:
     """Return the coverage of some levels, of all images and by visibility."""
     levels = (metrics.get("credibility") or {}).get("levels") or []
+    places = [levels.index(level) for level in _TABLED if level in levels]
     rows: list[list[Cell]] = [
-        [label, str(count), *(f"{100 * shares[levels.index(level)]:.0f}" for level in _TABLED)]
+        [label, str(count), *(f"{100 * shares[place]:.0f}" for place in places)]
         for label, count, shares in _list_groups(metrics)
     ]
-    head = ("visible share", "images", *(f"{100 * level:g} % set" for level in _TABLED))
+    head = ("visible share", "images", *(f"{100 * levels[place]:g} % set" for place in places))
     caption = Paragraph(["Truths in the credible set [%]:"])
     return [caption, Table(head, rows, numeric=range(1, len(head)))] if rows else []
 
@@ -87,7 +88,7 @@ def _list_groups(metrics: Mapping[str, Any]) -> list[tuple[str, int, list[float]
     if not found.get("levels"):
         return []
     groups = [("all", int(metrics.get("instances") or 0), list(found["all"]))]
-    for one in found["quarters"]:
+    for one in found.get("quarters") or ():
         label = f"{one['from']:g} to {one['to']:g}"
         groups.append((label, one["instances"], list(one["coverage"])))
     return groups

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from posefilter.metrics.registry import MetricInfo, find_metric
+from posefilter.metrics.registry import MetricInfo, find_metric, read_number
 from posefilter.report.events import Curve
 from posefilter.report.gather import Run
 
@@ -71,9 +71,10 @@ def collect_numbers(run: Run) -> dict[str, float]:
     none.
     """
     out = flatten(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
-    for name, values in (run.metrics.get("diagnostics") or {}).items():
-        if isinstance(values, list) and values:
-            out[f"diagnostics/{name}/last"] = float(values[-1])
+    for name in run.metrics.get("diagnostics") or {}:
+        last = f"diagnostics/{name}/last"
+        if (value := read_number(run.metrics, last)) is not None:
+            out[last] = value
     if out.get("instances"):
         out["missed_fraction"] = out.get("missed", 0.0) / out["instances"]
     score = run.curves.get("val/score")

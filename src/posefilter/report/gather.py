@@ -1,6 +1,6 @@
 """Gather what a run's folder holds; what it lacks is written down rather than fatal."""
 
-import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from posefilter.errors import UserError
+from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.limits import PlainLoader, read_bytes
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
@@ -18,6 +19,22 @@ from posefilter.report.images import StoredImage, read_images
 MARKS = ("metrics.json", ".hydra/config.yaml")
 _MOST_YAML, _MOST_JSON = 1 << 20, 1 << 26  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
+
+# what pages compute with, and follow into
+_QUARTER = {"from": NUMBER, "to": NUMBER, "instances": NUMBER, "coverage": [NUMBER]}
+_BIN = dict.fromkeys(("from", "to", "frames", "probability", "right"), NUMBER)
+_DATA = {"objects": [TEXT], "splits": Each({})}
+_METRICS = {
+    "instances": NUMBER,
+    "missed": NUMBER,
+    "by_visibility": Each(Record({"instances": NUMBER})),
+    "confidence": {"bins": [Record(_BIN)]},
+    "credibility": {"levels": [NUMBER], "all": [NUMBER], "quarters": [Record(_QUARTER)]},
+    "data": _DATA,
+    "diagnostics": {},
+    "versions": {},
+}
+_SETTINGS: dict[str, Any] = {"data": {}, "trainer": {}}
 
 
 @dataclass(frozen=True)
@@ -48,11 +65,12 @@ def read_run(folder: Path) -> Run:
     Raises UserError where it is none, or holds a file that cannot be read.
     """
     check_run(folder)
-    metrics = read_json(folder / "metrics.json")
-    config, hydra = (
-        read_yaml(folder / ".hydra" / "config.yaml"),
-        read_yaml(folder / ".hydra" / "hydra.yaml"),
-    )
+    metrics = read_metrics(folder / "metrics.json")
+    config = read_yaml(folder / ".hydra" / "config.yaml")
+    check_form(config, _SETTINGS, folder / ".hydra" / "config.yaml")
+    hydra = read_yaml(folder / ".hydra" / "hydra.yaml")
+    data = read_json(folder / "data.json")
+    check_form(data, _DATA, folder / "data.json")
     said = folder / ".hydra" / "hydra.yaml"
     chosen = read_part(hydra, ("hydra", "runtime", "choices"), said)
     choices = {str(k): str(v) for k, v in chosen.items() if v is not None}
@@ -62,12 +80,12 @@ def read_run(folder: Path) -> Run:
     return Run(
         folder=folder,
         metrics=metrics,
-        metrics_train=read_json(folder / "metrics_train.json"),
+        metrics_train=read_metrics(folder / "metrics_train.json"),
         config=config,
         choices=choices,
         overrides=read_texts(typed, "task", said)
         or read_texts(metrics, "overrides", folder / "metrics.json"),
-        data=read_json(folder / "data.json"),
+        data=data,
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],
         errors=read_image_errors(folder),
@@ -119,6 +137,25 @@ def list_missing(folder: Path, pictures: bool) -> list[str]:
     return [sentence for sentence, true in lacks if true]
 
 
+def read_metrics(path: Path) -> dict[str, Any]:
+    """Return what a test found, empty where there is no file.
+
+    Raises UserError where it is malformed, or has other parts than a page can be made of.
+    """
+    metrics = read_json(path)
+    check_form(metrics, _METRICS, path)
+    ends = r"\d+(\.\d+)?"
+    for name in metrics.get("by_visibility") or {}:
+        if not re.fullmatch(f"{ends}-{ends}", name):
+            raise UserError(f"{path}: its by_visibility should have ranges, as 0.3-0.5: {name:.40}")
+    found = metrics.get("credibility") or {}
+    curves = [found.get("all"), *(one["coverage"] for one in found.get("quarters") or ())]
+    levels = found.get("levels")
+    if levels and any(curve is None or len(curve) != len(levels) for curve in curves):
+        raise UserError(f"{path}: its credibility should have a share for each of its levels")
+    return metrics
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Return a JSON file's object, empty where there is no file.
 
@@ -127,7 +164,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(read_bytes(path, _MOST_JSON))
+        content = parse_json(read_bytes(path, _MOST_JSON))
     except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
         raise UserError(f"{path}: is no JSON ({error})") from error
     if not isinstance(content, dict):

@@ -48,5 +48,5 @@ def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, s
         if isinstance(value, Mapping):
             out |= flatten_settings(value, f"{name}.")
         else:
-            out[name] = value if isinstance(value, str) else json.dumps(value)
+            out[name] = value if isinstance(value, str) else json.dumps(value, default=str)
     return out

@@ -5,12 +5,14 @@ the seed as one.
 import csv
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean
 from typing import NamedTuple
 
 from posefilter.errors import UserError
+from posefilter.forms import MOST
 from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import flatten
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
@@ -183,12 +185,12 @@ def make_sort_key(order: Sequence[Value]) -> Callable[[Value], tuple[int, float,
 
 
 def parse_number(text: str) -> Value:
-    """Return a text as the number that it is, else as it is."""
+    """Return a text as the number that it is, else as it is; so is NaN, and what is too large."""
     for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
+        with suppress(ValueError):
+            number = kind(text)
+            if abs(number) <= MOST:
+                return number
     return text
 
 

@@ -1,7 +1,6 @@
 """Frames out of a ROS 2 bag, and detections into another."""
 
 import shutil
-import tempfile
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from posefilter.errors import UserError
+from posefilter.locks import hold, release
 from posefilter.ros.messages import (
     CAMERA_INFO,
     COMPRESSED,
@@ -58,7 +58,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path, topics: Topics, tolerance: float) -> None:
-        from rosbags.rosbag2 import Reader, ReaderError
+        from rosbags.rosbag2 import Reader
 
         self.path, self.topics, self.tolerance = path, topics, int(tolerance * 1e9)
         self.distorted = False  # whether a camera had a lens distortion that is not undone
@@ -66,8 +66,10 @@ class BagReader:
         try:
             self.reader = Reader(path)
             self.reader.open()
-        except (ReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-            raise UserError(f"bag={path}: cannot be read as a ROS 2 bag ({error})") from error
+        except Exception as error:  # a damaged header decides what breaks, memory included
+            raise UserError(
+                f"bag={path}: cannot be read as a ROS 2 bag ({first_words(error)})"
+            ) from error
         try:
             self._check_topics()
         except UserError:
@@ -169,7 +171,7 @@ class BagWriter:
         topic: Where detections go.
 
     Raises:
-        UserError: The path exists already.
+        UserError: The path exists already, or another process is about to write it.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
@@ -178,9 +180,10 @@ class BagWriter:
         if path.exists():
             raise UserError(f"out={path}: exists already; choose another")
         self.path, self.topic = path, topic
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self.parts = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+        self.parts = path.with_name(f".{path.name}.part")
+        hold(self.parts)
         name = path.stem if path.suffix == ".mcap" else path.name
+        shutil.rmtree(self.parts / name, ignore_errors=True)  # of a process that was killed
         self.writer = Writer(self.parts / name, version=9, storage_plugin=StoragePlugin.MCAP)
         self.copies: dict[int, Any] = {}
 
@@ -205,6 +208,7 @@ class BagWriter:
                     (whole,) = whole.glob("*.mcap")
                 whole.rename(self.path)
         finally:
+            release(self.parts)
             shutil.rmtree(self.parts, ignore_errors=True)
 
     def write(self, message: Any, time: int) -> None:

@@ -4,11 +4,13 @@ A bag's own definitions of its messages are not used: code would be made of them
 """
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from posefilter.data.readers.decode import decode_image
 from posefilter.errors import UserError
 from posefilter.limits import MOST_SIDE
 
@@ -65,9 +67,7 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
         UserError: It is damaged, or of an encoding that is not known.
     """
     if hasattr(message, "format"):
-        picture = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise UserError(f"color={topic}: an image cannot be decoded ({message.format})")
+        picture = decode_image(bytes(message.data), Path(f"color={topic}"), cv2.IMREAD_COLOR)
         return np.ascontiguousarray(picture[..., ::-1])
     encoding = str(message.encoding)
     if encoding not in _CHANNELS:

@@ -52,6 +52,8 @@ def read_depth(path: Path, units: float) -> np.ndarray:
     if path.suffix == ".npy" and image.ndim == 2 and image.dtype.kind in "fui":
         if (image < 0).any():
             raise BadData(path, "depth is negative", f"{image.min()}")
+        if (image > np.finfo(np.float32).max).any():
+            raise BadData(path, "depth is too large", f"{image.max()}")
         if image.dtype.kind == "f":
             return image.astype(np.float32)
     elif image.dtype != np.uint16 or image.ndim != 2:
@@ -139,13 +141,26 @@ def expect_size(path: Path, image: np.ndarray, height: int, width: int, of: str)
 
 
 def _read_image(path: Path) -> np.ndarray:
-    data = read_bytes(path)
+    return decode_image(read_bytes(path), path)
+
+
+def decode_image(data: bytes, path: Path, mode: int = cv2.IMREAD_UNCHANGED) -> np.ndarray:
+    """Decode an image as it is, or by another mode of OpenCV.
+
+    Args:
+        data: The file's content.
+        path: Where it is, for messages.
+        mode: Such as `cv2.IMREAD_COLOR`.
+
+    Raises:
+        BadData: It is damaged, or larger than photographs are.
+    """
     flaw = _flaw(data)
     if flaw:
         raise BadData(path, "truncated or corrupt image", flaw)
     check_picture(path, data)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except cv2.error as error:
         raise BadData(path, "truncated or corrupt image", "cannot be decoded") from error
     if image is None:
