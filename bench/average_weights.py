@@ -17,6 +17,9 @@ import torch
 from torch import Tensor
 
 import posefilter
+from posefilter.cli.checkpoints import read_checkpoint
+from posefilter.cli.files import save_whole
+from posefilter.errors import UserError
 
 _ZERO_AT_FIRST = "likelihood.surface.leave."
 
@@ -65,10 +68,14 @@ def main() -> int:
     options = parser.parse_args()
     if not 0 <= options.share <= 1:
         parser.error("--share is in [0, 1]")
-    method = posefilter.load(options.before, device="cpu").methods[0]
-    checkpoint = torch.load(options.after, map_location="cpu", weights_only=True)
-    state = average(method.state_dict(), checkpoint["state_dict"], options.share)
-    torch.save({**checkpoint, "state_dict": state}, options.out)
+    try:
+        method = posefilter.load(options.before, device="cpu").methods[0]
+        checkpoint = read_checkpoint(options.after)
+        state = average(method.state_dict(), checkpoint["state_dict"], options.share)
+        save_whole({**checkpoint, "state_dict": state}, options.out)
+    except (UserError, ValueError) as error:
+        print(f"average_weights: {error}", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -1,6 +1,7 @@
 """The average of weights before and after a training."""
 
 from collections.abc import Callable
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -32,3 +33,15 @@ def test_weights_of_another_network_are_refused(bench: ModuleType) -> None:
         bench.average({}, {"other": torch.ones(2)}, 0.5)
     with pytest.raises(ValueError, match=r"a: \(3,\) before, \(2,\) after"):
         bench.average({"a": torch.ones(3)}, {"a": torch.ones(2)}, 0.5)
+
+
+def test_a_file_that_is_no_checkpoint_is_one_line(
+    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd
+) -> None:
+    (tmp_path / "run.ckpt").write_text("x")
+    typed = ["003_cracker_box", str(tmp_path / "run.ckpt"), str(tmp_path / "out.ckpt")]
+    monkeypatch.setattr("sys.argv", ["average_weights", *typed])
+    assert bench.main() == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "run.ckpt: not readable as a checkpoint" in line
+    assert not (tmp_path / "out.ckpt").exists()
