@@ -55,8 +55,13 @@ class Estimator:
         except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there
             why = str(error).splitlines()[0]
             raise UserError(f"device={device}: cannot be used ({why})") from error
+        if not isinstance(costs, Costs | None):
+            raise UserError(f"costs={costs!r}: posefilter.Costs(...) is due")
         self.costs = costs or Costs()
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(self.objects)}; {self.methods[0].device})"
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -124,7 +129,7 @@ class Estimator:
 
     def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
         """Find several instances: a list of results an image, the most probable first."""
-        check_seed(seed)
+        seed = check_seed(seed)
         for method in self.methods:
             method.seed = seed
         size = (images.depth.shape[1], images.depth.shape[2])
@@ -154,7 +159,7 @@ class Estimator:
 
     def run(self, images: Images, seed: int = 0) -> list[Run]:
         """Run each object's filter, and return every step of it: for figures of what it did."""
-        check_seed(seed)
+        seed = check_seed(seed)
         runs, blank = [], list_blank(images)
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
@@ -177,14 +182,15 @@ def list_blank(images: Images) -> list[str]:
     return [find_blank(*one) for one in zip(images.rgb, images.depth, strict=True)]
 
 
-def check_seed(seed: Any) -> None:
-    """Refuse what is no seed.
+def check_seed(seed: Any) -> int:
+    """Return a seed as Python's own number: numpy's overflow.
 
     Raises:
         UserError: It is no whole number, 0 or more.
     """
     if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
         raise UserError(f"seed={seed!r}: a whole number, 0 or more, is due")
+    return int(seed)
 
 
 def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) -> list[int]:

@@ -1,5 +1,6 @@
 """Images as a user has them, checked and made into what a method takes."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -43,7 +44,8 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
     Raises:
         UserError: A shape, type or value is not as it should be.
     """
-    color, z, K = _as_channels_last(rgb), _as_array(depth), _as_array(intrinsics)
+    color = _as_channels_last(rgb)
+    z, K = _as_array(depth, "depth"), _as_array(intrinsics, "intrinsics")
     batched = color.ndim == 4
     color, z = (value if batched else value[None] for value in (color, z))
     if z.ndim == 4 and z.shape[1] == 1:  # (B, 1, H, W), as torch has it
@@ -52,6 +54,8 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
         raise UserError(
             f"depth: has shape {z.shape[1 - batched :]}, but rgb {color.shape[1 - batched : 3]}"
         )
+    if not len(z):
+        raise UserError("rgb: is a batch of no images")
     if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
         raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
     K = check_intrinsics(K, len(z), (z.shape[1], z.shape[2]))
@@ -77,7 +81,7 @@ def to_camera(intrinsics: Any) -> np.ndarray:
     Raises:
         UserError: It is none.
     """
-    return check_intrinsics(_as_array(intrinsics), 1)[0]
+    return check_intrinsics(_as_array(intrinsics, "intrinsics"), 1)[0]
 
 
 def to_pose(pose: Any) -> np.ndarray:
@@ -86,7 +90,7 @@ def to_pose(pose: Any) -> np.ndarray:
     Raises:
         UserError: It is none.
     """
-    out = _as_array(pose)
+    out = _as_array(pose, "pose")
     if out.shape != (4, 4) or out.dtype.kind not in "fiu":
         raise UserError(f"pose: has shape {out.shape}; camera_from_object (4, 4) [m] is due")
     return out.astype(np.float64)
@@ -125,13 +129,15 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
 
 
 def _as_channels_last(rgb: Any) -> np.ndarray:
-    color = _as_array(rgb)
+    color = _as_array(rgb, "rgb")
     if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
         raise UserError(f"rgb: has shape {color.shape}; (H, W, 3) is due, or a batch (B, H, W, 3)")
     return color if color.shape[-1] == 3 else np.moveaxis(color, -3, -1)
 
 
-def _as_array(value: Any) -> np.ndarray:
+def _as_array(value: Any, name: str) -> np.ndarray:
+    if value is None or isinstance(value, str | Path):
+        raise UserError(f"{name}: is {value!r}; an array or tensor is due, not a file's name")
     if isinstance(value, torch.Tensor):
         plain = value.detach().cpu()
         return np.asarray((plain.float() if plain.dtype == torch.bfloat16 else plain).numpy())

@@ -2,7 +2,7 @@
 
 import difflib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from urllib.parse import urlparse
@@ -84,6 +84,8 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
         UserError: There are none.
     """
     found: list[str | Path]
+    if not isinstance(weights, str | Path | Iterable):
+        raise UserError(f"checkpoint={weights}: a name or a file of weights is due, or a list")
     if not isinstance(weights, str | Path):
         found = [one for part in weights for one in expand_weights(part)]
     elif not is_several(weights):

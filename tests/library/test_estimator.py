@@ -398,6 +398,30 @@ def test_every_public_name_is_documented() -> None:
         assert "Raises:" in getattr(posefilter, name).__doc__
 
 
+def test_what_is_typed_first_is_answered_or_refused_in_one_line(
+    small: posefilter.Estimator, tmp_path: Path
+) -> None:
+    rgb, depth, K = read_scene()
+    for wrong, told in (
+        (lambda: small.predict("a.png", depth, K), "rgb: is 'a.png'; an array"),
+        (lambda: small.predict(rgb, None, K), "depth: is None"),
+        (lambda: small.predict(rgb[None][:0], depth[None][:0], K), "rgb: is a batch of no images"),
+        (lambda: posefilter.load(3), "checkpoint=3: a name"),  # type: ignore[arg-type]
+        (lambda: posefilter.load(NAME, costs={"miss": 2}), "costs={'miss': 2}: posefilter.Costs"),
+        (lambda: posefilter.Tracker(small, {"patience": 3}), "settings={'patience': 3}: posefilt"),
+        (lambda: posefilter.figures.draw_poses(rgb, K, np.eye(4), NAME), "shape: is str; a mesh"),
+    ):
+        with pytest.raises(posefilter.UserError, match=re.escape(told)):
+            wrong()
+    result = small.predict(rgb, depth, K, seed=np.int64(3))
+    assert np.array_equal(result.pose, small.predict(rgb, depth, K, seed=3).pose)
+    assert repr(small) == f"Estimator({NAME}; cpu)"
+    assert repr(result.belief).startswith(f"Belief({NAME}: 40 particles within ")
+    drawn = posefilter.figures.draw_poses(rgb, K, result.pose, result.model.hull)
+    posefilter.figures.save_image(drawn, str(tmp_path / "new" / "drawn.png"))
+    assert np.array_equal(cv2.imread(str(tmp_path / "new" / "drawn.png"))[..., ::-1], drawn)
+
+
 @pytest.mark.parametrize("seed", ["a", None, 1.5, -1, True])
 def test_what_is_no_seed_is_refused_in_one_line(small: posefilter.Estimator, seed: object) -> None:
     with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):

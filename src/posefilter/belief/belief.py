@@ -35,7 +35,7 @@ from posefilter.geometry.spaces import PoseSpace
 _MOST_SYMMETRIES = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Belief:
     """Weighted poses of one object in one image.
 
@@ -85,6 +85,10 @@ class Belief:
             )
         if not np.isfinite(group).all() or not is_rigid(torch.from_numpy(group)):
             raise UserError("belief: the symmetries should be rigid transforms")
+
+    def __repr__(self) -> str:
+        about = f"{len(self.weights)} particles {self.uncertainty().describe()}"
+        return f"{type(self).__name__}({self.object}: {about})"
 
     @cached_property
     def mean(self) -> np.ndarray:

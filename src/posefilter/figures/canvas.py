@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from posefilter.files import write_whole
+from posefilter.images import to_picture
 
 Color = tuple[int, int, int]
 # neither is a color that photographs of cartons and tables are full of
@@ -295,6 +296,10 @@ def to_jpeg(picture: np.ndarray, quality: int = 85) -> bytes:
     return stream.getvalue()
 
 
-def save_image(picture: np.ndarray, path: Path) -> None:
-    """Write a picture as PNG, its folder made where it is missing."""
-    write_whole(path, to_png(picture))
+def save_image(picture: np.ndarray, path: str | Path) -> None:
+    """Write a picture as PNG, its folder made where it is missing.
+
+    Raises:
+        UserError: It is no picture, or cannot be written.
+    """
+    write_whole(Path(path), to_png(to_picture(picture)))

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
+from posefilter.errors import UserError
 from posefilter.figures.canvas import (
     AXES,
     ESTIMATE,
@@ -72,18 +73,21 @@ def draw_poses(
     K: Any,
     pose: Any,
     shape: Shape,
-    view: View,
+    view: View | None = None,
     color: Color = ESTIMATE,
     truth: Any = None,
     coarse: int = 1,
     dashed: bool = False,
 ) -> np.ndarray:
-    """Return the same without writing, of the part of the photograph that `view` shows.
+    """Return the same without writing, of the part of the photograph that `view` shows: all of it,
+    if None.
 
     coarse: pixels that a mesh's outline may miss its silhouette by; rays are cast that much more
     sparsely.
     """
-    picture = view.show(to_picture(rgb))
+    rgb = to_picture(rgb)
+    view = view or full_view(rgb.shape[0], rgb.shape[1], max(WIDTH, rgb.shape[1]))
+    picture = view.show(rgb)
     shown = view.camera(to_camera(K))
     if truth is not None:
         draw_pose(picture, shown, to_pose(truth), shape, TRUTH, coarse=coarse)
@@ -203,9 +207,13 @@ def get_vertices(shape: Shape) -> np.ndarray:
     """Return the points that bound the object.  -> (V, 3) [m]."""
     if isinstance(shape, Mesh):
         return shape.vertices
-    return np.asarray(
-        shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape, np.float64
-    )
+    vertices = shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape
+    if not isinstance(vertices, np.ndarray) or vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise UserError(
+            f"shape: is {type(shape).__name__}; a mesh is due, or the vertices of a hull (V, 3) "
+            "[m], such as result.model.hull"
+        )
+    return vertices.astype(np.float64)
 
 
 def get_bounds(shape: Shape) -> np.ndarray:

@@ -60,7 +60,9 @@ class Tracker:
         methods = [method for one in estimators for method in one.methods]
         if not methods:
             raise UserError("a tracker needs an estimator of one object at least")
-        check_seed(seed)
+        seed = check_seed(seed)
+        if not isinstance(settings, TrackerSettings | None):
+            raise UserError(f"settings={settings!r}: posefilter.TrackerSettings(...) is due")
         self.settings = settings or TrackerSettings()
         self.tracks = tuple(
             Track(
