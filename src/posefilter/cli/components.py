@@ -57,9 +57,12 @@ def _merge(old: dict[str, Any], new: dict[str, Any], where: str) -> dict[str, An
             raise UserError(
                 f"{place}: the checkpoint's {section} has no such setting{hint(key, merged)}"
             )
-        nested = isinstance(value, dict) and isinstance(merged[key], dict)
-        if nested and "_target_" not in value:
-            merged[key] = _merge(merged[key], value, place)
+        here = merged[key]
+        if isinstance(here, list) and isinstance(value, dict):  # `components.1.pixels=64`
+            numbered = {str(number): one for number, one in enumerate(here)}
+            merged[key] = list(_merge(numbered, value, place).values())
+        elif isinstance(here, dict) and isinstance(value, dict) and "_target_" not in value:
+            merged[key] = _merge(here, value, place)
         else:
             merged[key] = value
     return merged

@@ -1,0 +1,44 @@
+"""Settings of a trained method that are changed at test time."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from posefilter.cli.command import compose_job
+from posefilter.cli.components import changed, changes
+from posefilter.errors import UserError
+
+CONF = Path(__file__).parents[2] / "conf"
+TRAINED: dict[str, Any] = {
+    "filter": {"particles": 50, "refine": {"_target_": "Chain", "components": [{"a": 1}, {"b": 2}]}}
+}
+
+
+def change(typed: str, folder: Path) -> dict[str, Any]:
+    """Return what `evaluate.py checkpoint=... TYPED` makes of TRAINED."""
+    job = compose_job("evaluate", CONF, [f"++{typed}"], folder)
+    return changed(TRAINED, changes(job.cfg))
+
+
+def test_one_of_a_list_is_changed_and_the_others_stay(tmp_path: Path) -> None:
+    found = change("filter.refine.components.1.b=9", tmp_path)["filter"]
+    assert found["refine"] == {"_target_": "Chain", "components": [{"a": 1}, {"b": 9}]}
+    assert found["particles"] == 50
+    assert TRAINED["filter"]["refine"]["components"][1] == {"b": 2}
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("filter.refine.components.2.b=9", r"filter\.refine\.components\.2: the checkpoint's"),
+        ("filter.refine.components.1.c=9", r"filter\.refine\.components\.1\.c: the checkpoint's"),
+        (
+            "filter.particle=9",
+            r"filter\.particle: .* has no such setting; did you mean 'particles'",
+        ),
+    ],
+)
+def test_what_is_not_there_is_named(typed: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=told):
+        change(typed, tmp_path)
