@@ -138,9 +138,10 @@ RANGES: dict[str, Range] = {
     "motion.translation_mm": Range(0, 10_000, many=True),  # or by axis
     "motion.rotation_deg": Range(0, 180, many=True),
     "motion.momentum": SHARE,
+    "motion.widest": Range(1, 1000),
     **{
         f"tracker.{effort}.{name}": allowed
-        for effort in ("follow", "search")
+        for effort in ("follow", "look", "search")
         for name, allowed in {
             "min_particles": _whole(1, 100_000),
             "max_particles": _whole(1, 100_000),
@@ -165,7 +166,8 @@ RANGES: dict[str, Range] = {
     "tracker.lost_below": SHARE,
     "tracker.found_above": SHARE,
     "tracker.patience": COUNT,
-    "tracker.full_search_every": COUNT_OR_NONE,
+    "tracker.search_above": SHARE,
+    "tracker.search_every": COUNT_OR_NONE,
     # trainer, callbacks
     "trainer.max_steps": _whole(1, 10**12, words=(-1,)),
     "trainer.min_steps": _whole(0, 10**12),

@@ -27,7 +27,7 @@ def walk(motion: RandomWalk, frames: int, velocity: torch.Tensor) -> tuple[torch
     )
     state = start.expand(1, COUNT, 4, 4)
     for _ in range(frames):
-        state = motion(state, velocity.double(), SPACE, g)
+        state = motion(state, motion.expect(velocity.double()), 1.0, SPACE, g)
     return start, state[0]
 
 
@@ -53,7 +53,44 @@ def test_momentum_is_the_share_of_the_last_motion_that_goes_on(momentum: float) 
     velocity = torch.tensor([[0.01, 0.0, -0.02, 0.0, 0.1, 0.0]])
     start, state = walk(RandomWalk(1, 0.5, momentum), 1, velocity)
     mean = twist_between(start, state, torch.tensor(CENTER).double()).mean(0)
-    assert torch.allclose(mean, momentum * velocity[0].double(), atol=2e-4)
+    # 1 - 1 / d, where the motion is of d = 500 variances
+    assert torch.allclose(mean, momentum * (1 - 1 / 500) * velocity[0].double(), atol=1e-4)
+
+
+def test_a_motion_that_the_walk_explains_is_not_continued() -> None:
+    """James and Stein's estimate of a mean: at d = |shift|^2 / s^2 its share is 1 - 1 / d."""
+    motion = RandomWalk(translation_mm=5)
+    for shift, share in ((0.0, 0.0), (0.005, 0.0), (0.01, 0.75), (0.05, 0.99)):
+        velocity = torch.tensor([[0.0, shift, 0.0, 0.3, 0.0, 0.0]])
+        assert torch.allclose(motion.expect(velocity), share * velocity)
+
+
+def test_the_walk_widens_with_surprising_motion_and_narrows_again() -> None:
+    motion, still = RandomWalk(5, 2), torch.zeros(1, 6)
+    surprising = torch.tensor([[0.02, 0.02, 0.02, 0.0, 0.0, 0.0]])  # four deviations on each axis
+    known = motion.adapt(None, surprising)
+    assert motion.widen(known) == pytest.approx(4)
+    assert motion.widen(motion.adapt(known, surprising)) == pytest.approx(4)
+    assert motion.widen(motion.adapt(known, still)) == pytest.approx(4 / math.sqrt(2))
+    for _ in range(4):
+        known = motion.adapt(known, still)
+    assert motion.widen(known) == 1
+    turned = torch.tensor([[0.0, 0, 0, *3 * [math.radians(10)]]])  # may be noise
+    assert motion.widen(motion.adapt(None, turned)) == 1
+    assert not motion.is_jump(turned, 1.0)
+    assert motion.is_jump(2 * turned, 1.0)
+    assert motion.widen(motion.adapt(None, 1e3 * surprising)) == motion.widest
+    assert motion.is_jump(surprising, 1.0)
+    assert not motion.is_jump(surprising, 4.0)
+    fixed = RandomWalk(5, 2, widest=1)
+    assert fixed.widen(fixed.adapt(None, surprising)) == fixed.widen(None) == 1
+
+
+def test_an_axis_without_deviation_stays_still() -> None:
+    motion = RandomWalk((5, 0, 0), 0)
+    assert motion.widen(motion.adapt(None, torch.tensor([[0.0, 1, 1, 1, 1, 1]]))) == 1
+    _, state = walk(motion, 1, torch.zeros(1, 6))
+    assert state[:, 1, 3].std() < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -63,6 +100,8 @@ def test_momentum_is_the_share_of_the_last_motion_that_goes_on(momentum: float) 
         {"rotation_deg": (1, 2)},
         {"momentum": 1.5},
         {"translation_mm": math.nan},
+        {"widest": 0.5},
+        {"widest": math.nan},
     ],
 )
 def test_what_is_no_motion_is_refused(wrong: dict[str, float]) -> None:

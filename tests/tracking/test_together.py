@@ -194,26 +194,33 @@ def test_objects_take_turns_to_see_the_whole_image() -> None:
         assert number == 0 or whole[-number % 4]
 
 
-def test_lost_objects_take_turns_to_be_searched_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    toys = [make_toy() for _ in range(5)]
-    searched: list[Toy] = []
-    for toy, _ in toys:
-        filter = toy.filter.forward
-
-        def search(*given: object, toy: Toy = toy, filter: object = filter) -> object:
-            searched.append(toy)
-            return filter(*given)  # type: ignore[operator]
-
-        monkeypatch.setattr(toy.filter, "forward", search)
+def test_lost_objects_take_turns_to_be_searched_for() -> None:
+    """All are looked for in every frame, and one of three is searched for, in six steps more."""
+    toys = [make_toy() for _ in range(3)]
     tracker = posefilter.Tracker([estimator for _, estimator in toys])
-    counts = []
-    for _ in range(16):
-        searched.clear()
+    for number in range(16):
+        for toy, _ in toys:
+            toy.scored.clear()
         tracker.update_all(RGB, DEPTH, K)
-        counts.append(len(searched))
-        assert len(set(map(id, searched))) == len(searched)
-    assert counts[0] == 5
-    assert counts[1:] == 15 * [1]
+        searched = [len(toy.scored) > 2 for toy, _ in toys]
+        assert all(toy.scored for toy, _ in toys)
+        if number:
+            assert searched == [(number + turn) % 3 == 0 for turn in range(3)]
+
+
+def test_a_search_costs_a_bounded_number_of_points() -> None:
+    """And none where a look shows nothing; where it shows the object, it follows at once."""
+    toy, estimator = make_toy()
+    tracker = posefilter.Tracker(estimator, TrackerSettings(search_every=0))
+    costs = []
+    for number in range(6):
+        toy.truth = None if number < 5 else walk_pose(1)[0]
+        toy.scored.clear()
+        result = tracker.update(RGB, DEPTH, K)
+        costs.append(sum(toy.scored))
+    assert max(costs[1:5]) < 5_000
+    assert result.status == "started"
+    assert 10_000 < costs[5] < 30_000 < costs[0]
 
 
 def test_the_whole_image_is_prepared_once() -> None:

@@ -10,6 +10,7 @@ from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 import posefilter
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.errors import UserError
+from posefilter.tracking.motion import RandomWalk
 from posefilter.tracking.settings import Effort, TrackerSettings
 from posefilter.tracking.watch import Watch
 
@@ -37,6 +38,24 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
             assert len(result.belief.weights) < 150 < toy.filter.particles
     assert result.object == "toy"
     assert result.belief.weights.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("shift", [0.03, 0.06])
+def test_an_object_that_starts_to_move_fast_is_followed(shift: float) -> None:
+    """The walk widens by itself: a fixed one of 5 mm stays behind by more than a frame's motion."""
+    off_by = []
+    for motion in (RandomWalk(), RandomWalk(widest=1, momentum=0)):
+        toy, estimator = make_toy()
+        tracker = posefilter.Tracker(estimator, TrackerSettings(motion=motion, whole_image_every=0))
+        start, distances = walk_pose(1)[0], []
+        for number in range(14):
+            moved = 0.001 * number + shift * max(0, min(number - 5, 5))
+            toy.truth = SPACE.move(start, torch.tensor([moved, 0, 0, 0, 0, 0]))
+            result = tracker.update(RGB, DEPTH, K)
+            distances.append(off(result, toy.truth))
+        assert max(distances[:6]) < 0.01
+        off_by.append(max(distances[7:]))
+    assert off_by[0] < shift / 2 < shift < off_by[1]
 
 
 def test_the_network_sees_a_window_and_now_and_then_the_whole_image() -> None:
@@ -69,7 +88,9 @@ def test_the_network_proposes_poses_where_it_sees_the_whole_image(
         result = tracker.update(RGB, DEPTH, K)
         whole = frame % 3 == 0
         assert ((120, 160) in toy.encoded) == whole
-        assert asked == ([tracker.settings.follow.proposals] if whole else [])
+        # of the motion in the first frame nothing is known
+        times = [3] if frame == 1 else [1] if whole else []
+        assert asked == [n * tracker.settings.follow.proposals for n in times]
         assert off(result, toy.truth) < 0.01
 
 
@@ -212,6 +233,7 @@ def test_several_objects_give_a_list_and_the_seed_decides() -> None:
     ("wrong", "told"),
     [
         ({"patience": 0}, "patience=0 must be a whole number, 1 or more"),
+        ({"search_above": 1.5}, "search_above=1.5 must lie in"),
         ({"lost_below": 0.9}, "found_above=0.5 must lie in"),
         ({"window_scale": 0.5}, "window_scale 1 or more"),
         ({"kld_quantile": 1.0}, "kld_quantile between 0 and 1"),

@@ -59,6 +59,7 @@ class Toy(PoseEstimator):
         self.truth: Tensor | None = None
         self.ghost: Tensor | None = None  # what the network takes for the object where it is not
         self.encoded: list[tuple[int, ...]] = []  # sizes of the images that were encoded
+        self.scored: list[int] = []  # image points that poses were scored from, call by call
         line = torch.linspace(-0.05, 0.05, 3)
         points = torch.cartesian_prod(line, line, line) + torch.tensor(CENTER)
         self.set_object(
@@ -89,6 +90,7 @@ class Toy(PoseEstimator):
     def score_poses(
         self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
+        self.scored.append(poses.shape[1] * pixels)
         noise = 0.2 * torch.randn(poses.shape[:2], generator=generator)
         if scene.truth is None:
             return noise - 10

@@ -231,8 +231,7 @@ def make_settings(node: DictConfig) -> TrackerSettings:
             **{
                 **plain,
                 "motion": RandomWalk(**plain["motion"]),
-                "follow": Effort(**plain["follow"]),
-                "search": Effort(**plain["search"]),
+                **{name: Effort(**plain[name]) for name in ("follow", "look", "search")},
             }
         )
     except TypeError as error:

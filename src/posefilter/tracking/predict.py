@@ -14,7 +14,8 @@ from posefilter.types import Batch, Particles
 
 def draw_predicted(
     belief: Particles,
-    velocity: Tensor,
+    drift: Tensor,
+    factor: float,
     motion: RandomWalk,
     most: int,
     space: PoseSpace,
@@ -24,7 +25,8 @@ def draw_predicted(
 
     Args:
         belief: Of the frame before, one image.
-        velocity: (1, 6) the motion of the frame before [m, rad].
+        drift: (1, 6) expected motion [m, rad].
+        factor: Of the walk's standard deviations.
         motion: Moves poses to the next frame.
         most: Number of draws.
         space: The space of poses.
@@ -34,7 +36,7 @@ def draw_predicted(
         Poses (1, most, 4, 4) [m].
     """
     drawn = Multinomial()(belief, most, space, generator)
-    return motion(inherit(belief.state, drawn), velocity, space, generator)
+    return motion(inherit(belief.state, drawn), drift, factor, space, generator)
 
 
 def take_enough(

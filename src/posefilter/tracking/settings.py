@@ -61,7 +61,8 @@ class TrackerSettings:
     Attributes:
         motion: How an object may move between two frames.
         follow: What a frame costs while the object is tracked.
-        search: What it costs while the object is lost.
+        look: What a first look at the whole image costs while the object is lost.
+        search: What a search costs that goes on from the best of what was seen.
         move_scale: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
@@ -81,8 +82,8 @@ class TrackerSettings:
         found_above: What a search finds is taken up where its presence is above. While a track's is
             not, the network sees the whole image in the next frame.
         patience: Frames in a row that count against an object that is lost.
-        full_search_every: While it is lost, every so many frames the estimator's own filter
-            searches; 0: never.
+        search_above: While the object is lost, a look whose presence is above is worth a search.
+        search_every: While it is lost, every so many frames it is searched for anyway; 0: never.
 
     Raises:
         UserError: A number is out of range.
@@ -90,7 +91,8 @@ class TrackerSettings:
 
     motion: RandomWalk = field(default_factory=RandomWalk)
     follow: Effort = Effort(32, 300, 8, 1, 0.008, 0.008, 64)
-    search: Effort = Effort(64, 64, 160, 6, 0.04, 0.004, 64)
+    look: Effort = Effort(32, 32, 64, 1, 0.02, 0.02, 32)
+    search: Effort = Effort(64, 64, 64, 6, 0.04, 0.004, 32)
     move_scale: float = 0.4
     rounds: int = 1
     fit_points: int = 128
@@ -105,18 +107,21 @@ class TrackerSettings:
     lost_below: float = 0.3
     found_above: float = 0.5
     patience: int = 2
-    full_search_every: int = 5
+    search_above: float = 0.1
+    search_every: int = 3
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_whole(self, rounds=0, fit_points=1, patience=1)
-        check_whole(self, whole_image_every=0, window_side=64, full_search_every=0)
+        check_whole(self, whole_image_every=0, window_side=64, search_every=0)
         least = min(self.move_scale, self.smoothing_noise, self.jump_penalty)
         if not (least >= 0 and self.window_scale >= 1):
             raise UserError(
                 "tracker: move_scale, smoothing_noise and jump_penalty must be 0 or more, "
                 "window_scale 1 or more"
             )
+        if not 0 <= self.search_above <= 1:
+            raise UserError(f"tracker: search_above={self.search_above} must lie in [0, 1]")
         if not 0 <= self.lost_below <= self.found_above <= 1:
             raise UserError(
                 f"tracker: lost_below={self.lost_below} and found_above={self.found_above} must "

@@ -1,8 +1,9 @@
 """One object, followed from frame to frame."""
 
+import math
 import time
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,10 +11,9 @@ from torch import Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.data.resize import network_size
-from posefilter.filters.loop import ParticleFilter, make_particles
+from posefilter.filters.loop import ParticleFilter, inherit, make_particles
 from posefilter.filters.propagate import Gaussian
-from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import Systematic
+from posefilter.filters.resample import Multinomial, Systematic
 from posefilter.filters.reweight import Annealed
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose_statistics import twist_between
@@ -32,6 +32,7 @@ from posefilter.tracking.watch import LOST, TRACKED, Watch
 from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, Belief, Particles, Trace
 
+_WIDE = 0.04  # [m] the highest level at which a tracked frame is measured
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
 
 
@@ -64,6 +65,7 @@ class State(NamedTuple):
     belief: Particles  # of one image
     best: Tensor  # (1, 4, 4) the estimate, smoothed over time [m]
     velocity: Tensor  # (1, 6) its motion in the last frame [m, rad]
+    surprise: float | None  # what innovations tell of the motion; see `RandomWalk.adapt`
 
 
 class Memory(NamedTuple):
@@ -120,7 +122,7 @@ class Track:
         """Forget the object: the next frame is the first."""
         self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
         self.state: State | None = None
-        self.watch = Watch(self.settings, self.turn)
+        self.watch = Watch(self.settings)
         self.frames = 0
 
     @property
@@ -136,17 +138,21 @@ class Track:
     @property
     def burden(self) -> float:
         """About what the next frame will cost, in frames that are tracked in a window."""
-        if self.state is None or self.watch.search_is_due:
+        if self.state is None:
             return 8.0
-        return 3.0 if self.watch.lost else 1.5 if self._whole_is_due else 1.0
+        if self.watch.lost:
+            return 2.5 if self._search_is_due else 1.0
+        return 1.5 if self._whole_is_due else 1.0
 
     @torch.no_grad()
     def update(self, frame: Frame) -> TrackResult:
         """Return where the object is in the next frame."""
         start = time.perf_counter()
         predicted = None if self.state is None else self._predict(self.state)
-        if predicted is None or self.watch.search_is_due:
+        if predicted is None:
             sight = self._estimate(frame)
+        elif self.watch.lost:
+            sight = self._search(frame, predicted)
         else:
             sight = self._follow(frame, predicted)
         trusted, status = self.watch.judge(sight.presence)
@@ -161,13 +167,16 @@ class Track:
 
     def _predict(self, state: State) -> State:
         """Return where the object is expected: draws of the moved belief, of equal weight."""
-        settings, effort = self.settings, self._effort
-        drift = settings.motion.momentum * state.velocity
+        settings = self.settings
+        effort = settings.look if self.watch.lost else settings.follow
+        motion = settings.motion
+        drift = motion.expect(state.velocity)
         expected = self.space.move(state.best, drift)
         draws = draw_predicted(
             state.belief,
-            state.velocity,
-            settings.motion,
+            drift,
+            motion.widen(state.surprise),
+            motion,
             effort.max_particles,
             self.space,
             self.generator,
@@ -181,7 +190,7 @@ class Track:
             settings.kld_quantile,
             effort.min_particles,
         )
-        return State(make_particles(draws, 0), expected, state.velocity)
+        return state._replace(belief=make_particles(draws, 0), best=expected)
 
     def _estimate(self, frame: Frame) -> Sight:
         """Run the estimator's own filter on the whole image."""
@@ -195,30 +204,63 @@ class Track:
 
     def _follow(self, frame: Frame, predicted: State) -> Sight:
         """Run a filter of few particles from the predicted belief."""
-        window = self._choose_window(frame.images, predicted.best[0])
+        window = self._choose_window(frame.images, predicted)
         seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
         batch = self._take(seen)
         if frame.blank or not bool(batch.depth.any()):
             return Sight(batch, None, 0.0, 0.0, None)
-        effort, settings = self._effort, self.settings
-        # what a window shows is the predicted belief's already
-        proposals = effort.proposals if window is None else 0
-        scene = self.method.encode(batch)
-        against = 0.0 if self.watch.lost else settings.jump_penalty
-        glance = Glance(self.method, scene, effort.points, proposals, against)
-        fit = QuadraticFit(settings.rounds, pixels=settings.fit_points)
-        refine = fit if settings.rounds else NoRefine()
+        settings, effort = self.settings, self.settings.follow
+        factor, against = settings.motion.widen(predicted.surprise), settings.jump_penalty
+        if factor > 1:
+            # from wide levels down; what the network proposes gains on a prior that is thinner
+            # by the factor in each of six dimensions
+            steps = effort.steps + math.ceil(math.log(factor, 4))
+            level = max(effort.start, min(_WIDE, factor * effort.start))
+            effort = replace(effort, steps=steps, start=level, proposals=3 * effort.proposals)
+            against = max(0.0, against - 6 * math.log(factor))
+        elif window is not None:  # what it shows is the predicted belief's already
+            effort = replace(effort, proposals=0)
+        scene, start = self.method.encode(batch), predicted.belief.state
+        return self._filter(batch, scene, start, effort, settings.rounds, against)
+
+    def _search(self, frame: Frame, predicted: State) -> Sight:
+        """Look for a lost object in the whole image, and search where that is worth it."""
+        batch = self._take(frame.see_whole(self.size))
+        if frame.blank or not bool(batch.depth.any()):
+            return Sight(batch, None, 0.0, 0.0, None)
+        settings, scene = self.settings, self.method.encode(batch)
+        seen = self._filter(batch, scene, predicted.belief.state, settings.look, 0)
+        if seen.presence < settings.search_above and not self._search_is_due:
+            return seen
+        assert seen.belief is not None
+        begun, effort = begin(seen.belief).belief, settings.search
+        drawn = Multinomial()(begun, effort.min_particles, self.space, self.generator)
+        start = inherit(begun.state, drawn)
+        return self._filter(batch, scene, start, effort, settings.rounds)
+
+    def _filter(
+        self,
+        batch: Batch,
+        scene: Any,
+        start: Tensor,
+        effort: Effort,
+        rounds: int,
+        against: float = 0.0,
+    ) -> Sight:
+        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
+        settings = self.settings
         filter = ParticleFilter(
-            particles=predicted.belief.state.shape[1],
+            particles=min(start.shape[1], 2 * effort.min_particles),  # after the first step
             steps=effort.steps,
-            initialize=FromBelief(predicted.belief.state, proposals),
+            initialize=FromBelief(start, effort.proposals),
             schedule=Geometric(effort.start, effort.stop),
             reweight=Annealed(),
             resample=Systematic(),
             propagate=Gaussian(settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=refine,
+            refine=QuadraticFit(rounds, pixels=settings.fit_points),
         )
+        glance = Glance(self.method, scene, effort.points, effort.proposals, against)
         return self._weigh(batch, filter(batch, glance, self.generator))
 
     def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State | None:
@@ -226,23 +268,32 @@ class Track:
 
         It is None until a frame shows something: the next one is then the first.
         """
+        motion = self.settings.motion
         if belief is None:
             if predicted is None:
                 return None
-            return predicted._replace(velocity=torch.zeros_like(predicted.velocity))
+            # what is hidden must not be looked for all over the image, by a track's low bar
+            return predicted._replace(velocity=torch.zeros_like(predicted.velocity), surprise=0.0)
+        begun = begin(belief)
         if predicted is None or self.state is None or status != TRACKED:
-            return begin(belief)
+            return begun
+        center = belief.best.new_tensor(self.space.center)
+        innovation = twist_between(predicted.best, belief.best, center)
+        if motion.is_jump(innovation, predicted.surprise):
+            return begun
         best = smooth(predicted.best, belief.best, self.space, self.settings.smoothing_noise)
-        center = best.new_tensor(self.space.center)
-        return begin(belief)._replace(
-            best=best, velocity=twist_between(self.state.best, best, center)
+        return begun._replace(
+            best=best,
+            velocity=twist_between(self.state.best, best, center),
+            surprise=motion.adapt(predicted.surprise, innovation),
         )
 
     # -- what is looked at, and what it says ------------------------------------------------------
 
     @property
-    def _effort(self) -> Effort:
-        return self.settings.search if self.watch.lost else self.settings.follow
+    def _search_is_due(self) -> bool:
+        every = self.settings.search_every
+        return every > 0 and (self.frames + self.turn) % every == 0
 
     @property
     def _whole_is_due(self) -> bool:
@@ -250,20 +301,22 @@ class Track:
         # what a window leaves in doubt the whole image may tell
         return not self.watch.sure or (every > 0 and (self.frames + self.turn) % every == 0)
 
-    def _choose_window(self, images: Images, pose: Tensor) -> Window | None:
+    def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
         settings = self.settings
         height, width = images.depth.shape[1:]
         if self._whole_is_due:
             return None
+        motion = settings.motion
+        more = 2 * (motion.widen(predicted.surprise) - 1) * max(motion.scale[:3])
         return place_window(
-            pose.double().cpu().numpy(),
+            predicted.best[0].double().cpu().numpy(),
             self.method.model,
             images.intrinsics[0],
             (height, width),
             network_size(height, width, *self.size)[1] / width,
             settings.window_side,
-            settings.window_scale,
+            settings.window_scale + more / self.space.radius,
         )
 
     def _take(self, batch: Batch) -> Batch:
@@ -297,4 +350,5 @@ class Track:
 def begin(belief: Belief) -> State:
     """Return the state of a belief whose motion is not known."""
     particles = make_particles(belief.poses, 0)._replace(log_weights=belief.log_weights)
-    return State(particles, belief.best, belief.best.new_zeros(1, 6))
+    still = belief.best.new_zeros(1, 6)
+    return State(particles, belief.best, still, None)

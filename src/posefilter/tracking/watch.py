@@ -14,13 +14,12 @@ class Watch:
 
     Args:
         settings: Of the tracker.
-        turn: Frames by which searches come sooner.
     """
 
-    def __init__(self, settings: TrackerSettings, turn: int = 0) -> None:
-        self.settings, self.turn = settings, turn
+    def __init__(self, settings: TrackerSettings) -> None:
+        self.settings = settings
         self.lost, self.ever_found = True, False
-        self.doubts = self.lost_for = 0
+        self.doubts = 0
         self.sure = False  # of the last frame
 
     def judge(self, presence: float) -> tuple[bool, str]:
@@ -39,14 +38,7 @@ class Watch:
             self.doubts = 0 if trusted else self.doubts + 1
             status = LOST if self.doubts >= settings.patience else TRACKED
         self.lost = status == LOST
-        self.lost_for = self.lost_for + 1 if self.lost else 0
         self.ever_found |= not self.lost
         if self.lost:
             self.doubts = 0
         return trusted, status
-
-    @property
-    def search_is_due(self) -> bool:
-        """Whether the estimator's own filter is to search in the next frame."""
-        every = self.settings.full_search_every
-        return self.lost and every > 0 and (self.lost_for + self.turn) % every == every - 1
