@@ -110,6 +110,10 @@ def _check_video(cfg: DictConfig) -> None:
     data = cfg.get("data")
     if bool(cfg.frames) == bool(data):
         raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
+    if cfg.frames and cfg.scene is not None:
+        raise UserError(f"scene={cfg.scene}: is one of a dataset; frames=DIR is one video")
+    if data and cfg.intrinsics is not None:
+        raise UserError("intrinsics: are of frames=DIR; a dataset brings its own, leave them out")
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
     if data and data.root is None:
