@@ -21,6 +21,7 @@ from forked import end_with
 # what the commands import when they are called: before the fork, so that it is paid once
 import posefilter.cli.calibrate
 import posefilter.cli.check_data
+import posefilter.cli.convert_bag
 import posefilter.cli.evaluate
 import posefilter.cli.export
 import posefilter.cli.generate

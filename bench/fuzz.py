@@ -8,7 +8,8 @@ of range, of another kind, or not in Hydra's grammar; to keys, choices, files an
 are not. It runs in a process of its own, forked from this one; trainings are cut to four steps. A
 line may be accepted, or be refused in one line with a status that is not 0. Prints the counts; the
 exit status is 1 where a line ended otherwise. Line n of a seed is always the same: a run that was
-stopped, by --minutes say, goes on with `--first` the number that it tells.
+stopped, by --minutes say, goes on with `--first` the number that it tells. Lines of `convert_bag`
+need the package rosbags.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import chdir
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -35,6 +37,7 @@ from forking import RAW, Ended, prepare, run, warm  # noqa: E402
 import posefilter.cli.onboard  # noqa: E402
 from posefilter.cli.command import compose_job  # noqa: E402
 from posefilter.ranges import list_values  # noqa: E402
+from posefilter.ros.messages import CAMERA_INFO, IMAGE, make_message, open_types  # noqa: E402
 
 SECONDS, PATIENCE, MEMORY = 20, 300, 12 << 30  # of one line: processor [s], clock [s], [bytes]
 ACCEPTED, REFUSED, USAGE = "accepted", "refused in one line", "refused with Hydra's usage"
@@ -70,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("count", nargs="?", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--command")
+    parser.add_argument("--command", help="one, or several: a,b")
     parser.add_argument("--list", action="store_true", help="print each line")
     parser.add_argument("--first", type=int, default=0, help="line to begin with")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which it stops")
@@ -83,13 +86,14 @@ def main(arguments: list[str] | None = None) -> int:
         place, scratch = Path(folder), Path(folder) / "scratch"
         scratch.mkdir()
         lines = make_lines(place)
-        commands = [given.command] if given.command else [*lines, "train", "train", "predict"]
-        keys = {name: list_keys(name, place) for name in lines}
+        chosen = given.command.split(",") if given.command else []
+        commands = chosen or [*lines, "train", "train", "predict"]
+        keys = {name: list_keys(name, place) for name in {*commands}}
         warm(
             {
                 name: [word.replace("NEW", f"warm_{name}") for word in line]
                 for name, line in lines.items()
-                if name != "onboard"  # which would take minutes
+                if name in commands and name != "onboard"  # which would take minutes
             }
         )
         for number in range(given.first, given.first + given.count):
@@ -175,7 +179,10 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
     if done.status:
         raise SystemExit(done.err)
     best = run_folder / "checkpoints" / "best.ckpt"
-    return {
+    absent = [word for word in once if not word.startswith("out=")]
+    absent += ["absent_share=1", f"out={folder / 'absent'}"]
+    assert run("generate", absent, folder / "log").status == 0
+    lines = {
         "train": [*small, f"out={folder}/NEW", "model=cnn_patch"],
         "evaluate": [*quiet, f"checkpoint={best}", f"data.root={data}", f"out={folder}/NEW"],
         "predict": [
@@ -196,8 +203,50 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
             *quiet, f"checkpoint={best}", f"frames={folder}/video", f"out={folder}/NEW",
             "intrinsics=180,180,80,60", "depth_scale=10000", "video=gif",
         ],
+        "calibrate": [
+            *quiet, f"checkpoint={best}", f"data.root={data}", f"absent={folder / 'absent'}",
+            "data.split={train: 0, val: 1.0, test: 0}", "data.min_visibility_test=0", "frames=12",
+            f"out={folder}/NEW.ckpt",
+        ],
         "onboard": [*quiet, "mesh=carton", f"out={folder}/NEW"],
     }  # fmt: skip
+    if find_spec("rosbags") is not None:
+        bag = write_bag(folder / "bag")
+        lines["convert_bag"] = [
+            *quiet, f"bag={bag}", f"out={folder}/NEW.mcap", f"checkpoint={best}", "color=/rgb",
+            "depth=/depth", "camera_info=/info",
+        ]  # fmt: skip
+    return lines
+
+
+def write_bag(path: Path) -> Path:
+    """Write a bag of one gray image, 0.7 m from a wall; return its folder."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    stamp = make_message("builtin_interfaces/msg/Time", sec=0, nanosec=0)
+    header = make_message("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
+    size = {"header": header, "height": 120, "width": 160}
+    region = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    K = np.array([180.0, 0, 80, 0, 180, 60, 0, 0, 1])
+    P = np.array([180.0, 0, 80, 0, 0, 180, 60, 0, 0, 0, 1, 0])
+    info = {
+        "distortion_model": "plumb_bob", "d": np.zeros(5), "k": K, "r": np.eye(3).reshape(9),
+        "p": P, "binning_x": 0, "binning_y": 0,
+        "roi": make_message("sensor_msgs/msg/RegionOfInterest", **region),
+    }  # fmt: skip
+    images = {
+        "/rgb": ("rgb8", 480, np.full(120 * 480, 90, np.uint8)),
+        "/depth": ("16UC1", 320, np.full(120 * 160, 700, np.uint16).view(np.uint8)),
+    }
+    messages = [("/info", CAMERA_INFO, make_message(CAMERA_INFO, **size, **info))]
+    for topic, (encoding, step, pixels) in images.items():
+        own = {"encoding": encoding, "is_bigendian": 0, "step": step, "data": pixels}
+        messages.append((topic, IMAGE, make_message(IMAGE, **size, **own)))
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind, message in messages:
+            connection = writer.add_connection(topic, kind, typestore=open_types())
+            writer.write(connection, 0, open_types().serialize_cdr(message, kind))
+    return path
 
 
 def list_keys(command: str, folder: Path) -> list[str]:
@@ -241,6 +290,8 @@ def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -
                 "data.meshes",
                 "run",
                 "frames",
+                "absent",
+                "bag",
             )
             typed.append(f"{rng.choice([key for key in names if key in keys] or ['out'])}={place}")
         else:

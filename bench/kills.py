@@ -38,13 +38,13 @@ sys.path.insert(0, str(HOME / "bench"))
 from forking import prepare, run, start, wait, warm  # noqa: E402
 
 MODELS = ("pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized")
-_SMALL = (
+SMALL = (
     "debug=smoke", "console=json", "threads=1", "logger=none", "callbacks=checkpoints",
     "data.progress=false", "callbacks.last.minutes=0", "trainer.max_steps=6",
     "trainer.val_check_interval=3", "data.limit_test=2", "data.limit_val=2",
 )  # fmt: skip
 _TICKS = os.sysconf("SC_CLK_TCK")  # a second, of a process's clock
-_TIMES = ("seconds_per_image", "training", "git", "overrides", "checkpoint")
+TIMES = ("seconds_per_image", "training", "git", "overrides", "checkpoint")
 
 
 class Whole(NamedTuple):
@@ -111,12 +111,8 @@ def kill_many(
     """
     began = time.monotonic()
     keep = (keep or folder / "kept") / digest_code()
-    data = keep / "data"
-    if not data.is_dir():
-        frames = ["frames=24", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=4"]
-        typed = [*frames, "object=carton", "workers=1", "console=json", f"out={data}"]
-        assert run("generate", typed, folder / "log").status == 0
-    common = [*_SMALL, f"data.root={data}"]
+    data = make_data(keep / "data", folder / "log")
+    common = [*SMALL, f"data.root={data}"]
     warm({"train": [*common, "model=pose_pf", "trainer.max_steps=1", f"out={folder / 'warm'}"]})
     wholes: dict[tuple[str, str], Whole] = {}
     counts: Counter[str] = Counter()
@@ -136,9 +132,18 @@ def kill_many(
     return counts
 
 
+def make_data(folder: Path, log: Path) -> Path:
+    """Render what is trained with, where it is not there; return its folder."""
+    if not folder.is_dir():
+        frames = ["frames=24", "size=[160,120]", "distractors=[1,2]", "frames_per_scene=4"]
+        typed = [*frames, "object=carton", "workers=1", "console=json", f"out={folder}"]
+        assert run("generate", typed, log).status == 0
+    return folder
+
+
 def digest_code() -> str:
     """Return what changes when the code or the configuration does."""
-    digest = hashlib.sha256(" ".join(_SMALL).encode())
+    digest = hashlib.sha256(" ".join(SMALL).encode())
     for file in sorted([*(HOME / "src").rglob("*.py"), *(HOME / "conf").rglob("*.yaml")]):
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
@@ -227,7 +232,7 @@ def read_bits(out: Path) -> dict[str, Any]:
     return {
         **{key: state.get(key) for key in (*kept, "epoch")},
         "best": torch.load(out / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"],
-        "metrics": {key: value for key, value in metrics.items() if key not in _TIMES},
+        "metrics": {key: value for key, value in metrics.items() if key not in TIMES},
     }
 
 

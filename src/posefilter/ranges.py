@@ -24,6 +24,7 @@ class Range(NamedTuple):
     share: bool = False  # also a share of all: a number with a point, in [0, 1]
     words: tuple[Any, ...] = ()  # other values that have a meaning
     many: bool = False  # a list of such numbers, too
+    note: str = ""  # what else a refusal says
 
     def holds(self, value: Any) -> bool:
         """Tell whether a value lies within; NaN does not."""
@@ -48,7 +49,7 @@ class Range(NamedTuple):
         parts += [f"at most {self.most:.12g}"] if self.most < math.inf else []
         shares = [f"a share in {'(' if self.above else '['}0, 1]"] if self.share else []
         options = [f"a {'whole ' if self.whole else ''}number, {', '.join(parts)}", *shares]
-        return ", or ".join([*options, *map(str, self.words)])
+        return ", or ".join([*options, *map(str, self.words)]) + (self.note and f": {self.note}")
 
 
 def _whole(least: float, most: float = math.inf, **more: Any) -> Range:
@@ -60,6 +61,12 @@ COUNT, COUNT_OR_NONE, WIDTH = _whole(1, 1_000_000), _whole(0, 1_000_000), _whole
 SEED, LONG_SEED = _whole(0, 2**32 - 1), _whole(0, 2**63 - 1)
 METERS, PIXELS = Range(0, 100, above=True), Range(0, MOST_SIDE)
 BATCHES = _whole(0, share=True)
+UNITS = Range(
+    1,
+    1e7,
+    note="units of the depth images in a meter, 10000 for YCB-Video, 1000 for millimeters; what "
+    "BOP's scene_camera.json calls 0.1 is 10000 here",
+)
 
 # By the end of a setting's place, the command's name before it: of several that fit, the longest
 # counts.  tests/conf/test_ranges.py holds it to have every number of conf/.
@@ -115,14 +122,13 @@ RANGES: dict[str, Range] = {
     # other commands
     "check_data.limit": COUNT,
     "predict.instances": _whole(1, 100),
-    "predict.depth_scale": Range(1e-2, 1e7),
+    "depth_scale": UNITS,
     "cost_false_alarm": POSITIVE,
     "cost_miss": POSITIVE,
     "cost_unsure": POSITIVE,
     "convert_bag.tolerance": Range(0, 10),
     "evaluate.absent_frames": COUNT_OR_NONE,
     "calibrate.frames": _whole(10, 1_000_000),
-    "track.depth_scale": Range(1e-2, 1e7),
     "track.stride": COUNT,
     "track.fps": Range(0.1, 1000),
     "export.points": COUNT,

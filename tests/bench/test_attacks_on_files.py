@@ -61,6 +61,29 @@ def test_killed_trainings_end_with_the_same_bits(load: Load, tmp_path: Path) -> 
     assert kills.list_differing({"a": [1, 2]}, {"a": [1, 3]}) == [".a[1]"]
 
 
+@pytest.mark.slow
+def test_a_killed_sweep_does_each_job_once(load: Load, tmp_path: Path) -> None:
+    sweeps = load("killed_sweeps")
+    sweeps.prepare()
+    counts, wrong = sweeps.kill_sweep(tmp_path, jobs=4, kills=2, seed=3, model="cnn_patch")
+    assert wrong == []
+    assert sum(count for what, count in counts.items() if what.startswith("killed ")) == 2
+    assert [count for what, count in counts.items() if "jobs that" in what] == [4, 4]
+
+
+def test_a_sweep_that_did_a_job_twice_is_told(load: Load, tmp_path: Path) -> None:
+    sweeps = load("killed_sweeps")
+    file = tmp_path / "seed=0" / "metrics.json"
+    file.parent.mkdir()
+    file.write_text("{}")
+    (file.parent / ".hydra").mkdir()
+    before = sweeps.list_done(tmp_path)
+    (file.parent / ".hydra" / "config.yaml").write_text("")  # at each start
+    assert sweeps.list_done(tmp_path) == before
+    os.utime(file, ns=(1, 1))
+    assert sweeps.list_done(tmp_path) != before
+
+
 def test_a_process_is_followed_by_its_own_time(load: Load) -> None:
     """So that a kill falls where it was drawn, however busy the machine is."""
     kills = load("kills")

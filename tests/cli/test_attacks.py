@@ -35,6 +35,11 @@ LINES = {
         ["checkpoint=003_cracker_box", "out=0.5"],
         "out=0.5: ",
     ),
+    "a word for true": (
+        "calibrate",
+        ["checkpoint=003_cracker_box", "replace=no"],
+        "replace=no: choose true or false",
+    ),
     "no model": ("train", ["model=null"], "model=null: cannot be read"),
     "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
     "an umlaut": (

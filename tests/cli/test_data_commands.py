@@ -74,6 +74,18 @@ def test_one_frame_can_be_generated(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert json.loads(capsys.readouterr().out)["frames"] == 1
 
 
+def test_frames_without_the_object_can_be_generated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As calibrate.py asks for; there is nothing to outline in a preview."""
+    typed = ["absent_share=1", "frames=2", "size=[96,72]", "workers=1", "console=json"]
+    generate(compose_job("generate", CONF, [f"out={tmp_path}/none", *typed], tmp_path))
+    told = json.loads(capsys.readouterr().out)
+    assert told["frames"] == 2
+    assert "preview" not in told["files"]
+    assert not (tmp_path / "none" / "preview.png").exists()
+
+
 def test_problems_end_with_a_status(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -98,7 +98,12 @@ REFUSED = {
         "seed": (-1, 4294967296, 0.5, None),
         "loss": (None,),
     },
-    "predict": {"depth_scale": (0, -1, 1e-9, math.nan), "seed": (-1,), "threads": (0,)},
+    "predict": {
+        "depth_scale": (0, -1, 1e-9, 0.1, math.nan, None),
+        "seed": (-1,),
+        "threads": (0,),
+    },
+    "track": {"depth_scale": (0.1, 0)},
     "generate": {"frames": (0, -1), "workers": (0,), "occlusion": (1, math.nan), "size": (8,)},
     "check_data": {"limit": (0, -1, 10**21)},
     "export": {"points": (0,), "max_mb": (0, None)},
@@ -137,6 +142,18 @@ def test_a_value_that_makes_no_sense_is_named(
         check_settings(cfg, command)
     assert str(caught.value).startswith(f"{key}={shown}: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("command", ["predict", "track"])
+def test_a_depth_scale_of_bop_is_told_from_ours(
+    command: str, composed: dict[str, DictConfig]
+) -> None:
+    cfg = composed[command].copy()
+    OmegaConf.set_readonly(cfg, False)
+    for scale in (0.1, "${seed}"):  # which is 0
+        OmegaConf.update(cfg, "depth_scale", scale)
+        with pytest.raises(UserError, match=r"1000 for millimeters; .*BOP.* 0\.1 is 10000 here$"):
+            check_settings(cfg, command)
 
 
 @pytest.mark.parametrize("command", ["train", "onboard", "generate"])

@@ -214,6 +214,10 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
     [
         (["frames=FOLDER"], "intrinsics: is missing"),
         ([], "give either frames=DIR, or data="),
+        (["frames=FOLDER", CAMERA, "data=fat"], "give either frames=DIR, or data="),
+        (["frames=FOLDER", CAMERA, "+data.root=FOLDER"], "give either frames=DIR, or data="),
+        (["frames=FOLDER", CAMERA, "scene=1"], "scene=1: is one of a dataset; frames=DIR is"),
+        (["data=fat", "data.root=FOLDER", CAMERA], "intrinsics: are of frames=DIR"),
         (["frames=FOLDER", CAMERA, "on_error=stop"], "on_error=stop: choose raise or skip"),
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
         (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),

@@ -39,7 +39,7 @@ def generate(job: Job) -> None:
     ended(
         job.cfg.console,
         "generated",
-        {"data": summary.out, "preview": preview},
+        {"data": summary.out, **({"preview": preview} if preview else {})},
         [following],
         frames=summary.frames,
         rendered=summary.rendered,
@@ -47,13 +47,16 @@ def generate(job: Job) -> None:
     )
 
 
-def draw(summary: Summary, job: Job) -> Path:
-    """Write preview.png: four of the frames."""
+def draw(summary: Summary, job: Job) -> Path | None:
+    """Write preview.png, four of the frames; return None where none shows the object."""
     name = job.cfg.object
     # the instances of a class are told apart by its mesh
     several = job.cfg.instances > 1
     meshes = MeshStore(job.cfg.meshes, scale=job.cfg.mesh_scale or 1.0) if several else None
     reader = open_reader("scenes", summary.out, name, meshes)
     path = summary.out / "preview.png"
-    save_image(draw_preview(reader, f"{name}: four of {summary.frames} frames"), path)
+    picture = draw_preview(reader, f"{name}: four of {summary.frames} frames")
+    if picture is None:
+        return None
+    save_image(picture, path)
     return path

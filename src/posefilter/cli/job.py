@@ -15,7 +15,7 @@ _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
 # settings that a command cannot do without
 _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
-    "predict": ("seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
+    "predict": ("depth_scale", "seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
     "convert_bag": (
         *("color", "depth", "camera_info", "detections", "tolerance", "track", "keep", "seed"),
         *("cost_false_alarm", "cost_miss", "cost_unsure"),
@@ -110,7 +110,7 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for key in ("seed", "threads"):
+    for key in ("seed", "threads", "depth_scale"):
         check_ranges({key: cfg.get(key)}, command)  # where it is made of other settings
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:

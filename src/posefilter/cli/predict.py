@@ -264,16 +264,11 @@ def describe_absent(name: str, checkpoint: str | Path, job: Job) -> dict[str, An
     return {"object": name, "verdict": "absent", **empty, **files}
 
 
-def read_photograph(rgb: str, depth: str, depth_scale: Any) -> tuple[np.ndarray, np.ndarray]:
+def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Read color (H, W, 3) uint8 and depth (H, W) [m].
 
     Raises UserError where they do not fit each other.
     """
-    if not isinstance(depth_scale, int | float) or depth_scale <= 0:
-        raise UserError(
-            f"depth_scale={depth_scale}: units of the depth image in a meter, a positive number "
-            f"(e.g. 1000 for mm)"
-        )
     color, z = read_color(Path(rgb)), read_depth(Path(depth), float(depth_scale))
     if color.shape[:2] != z.shape:
         raise UserError(
@@ -285,7 +280,7 @@ def read_photograph(rgb: str, depth: str, depth_scale: Any) -> tuple[np.ndarray,
     if np.median(z[z > 0]) > 30 or np.median(z[z > 0]) < 0.05:
         raise UserError(
             f"depth_scale={depth_scale}: the median depth would be {np.median(z[z > 0]):.3g} m; "
-            f"is it {1000} or 10000?"
+            f"is it 1000 or 10000?"
         )
     return color, z
 

@@ -22,6 +22,7 @@ _FOLDERS = {
     "track": ("frames", "meshes", "data.root", "data.meshes"),
     "train": ("data.root", "data.meshes"),
 }
+_SWITCHES = {"calibrate": ("replace",), "convert_bag": ("track", "keep")}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -48,6 +49,9 @@ def check_files(command: str, cfg: DictConfig) -> None:
         _check_video(cfg)
     if command == "train":
         _check_loggers(cfg.logger)
+    for key in _SWITCHES.get(command, ()):
+        if not isinstance(cfg[key], bool):  # a text such as "no" would count as true
+            raise UserError(f"{key}={cfg[key]}: choose true or false")
     if command == "convert_bag":
         _check_bag(cfg)
     if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
@@ -85,9 +89,6 @@ def _check_bag(cfg: DictConfig) -> None:
             raise UserError(f"{key}: is missing; type convert_bag in.mcap out.mcap checkpoint=...")
     if not Path(str(cfg.bag)).exists():
         raise UserError(f"bag={cfg.bag}: no such file")
-    for key in ("track", "keep"):
-        if not isinstance(cfg[key], bool):
-            raise UserError(f"{key}={cfg[key]}: choose true or false")
     find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
     for one in find_all:
         find_weights(one)
@@ -110,6 +111,10 @@ def _check_video(cfg: DictConfig) -> None:
     data = cfg.get("data")
     if bool(cfg.frames) == bool(data):
         raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
+    if cfg.frames and cfg.scene is not None:
+        raise UserError(f"scene={cfg.scene}: is one of a dataset; frames=DIR is one video")
+    if data and cfg.intrinsics is not None:
+        raise UserError("intrinsics: are of frames=DIR; a dataset brings its own, leave them out")
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
     if data and data.root is None:

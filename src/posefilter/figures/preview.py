@@ -16,20 +16,23 @@ _DEPTH = colormaps["viridis"]
 _UNKNOWN = (40, 40, 40)
 
 
-def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray:
+def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray | None:
     """Return `count` frames, spread evenly over the dataset, each with its depth below it.  ->
     picture.
 
-    Frames that cannot be read are left out; raises IndexError where that leaves none.
+    Frames that cannot be read are left out; None where that leaves none, or none shows the object.
     """
     found: list[tuple[str, Sample]] = []
     records = reader.records()
-    for i in np.unique(np.linspace(0, len(records) - 1, count).round().astype(int)):
+    spread = np.linspace(0, len(records) - 1, min(count, len(records)))
+    for i in np.unique(spread.round().astype(int)):
         try:
             found.append((records[i].name, reader.read(int(i))))
         except BadData:
             continue
-    known = np.concatenate([sample.depth[sample.depth > 0] for _, sample in found] or [np.ones(1)])
+    if not found:
+        return None
+    known = np.concatenate([sample.depth[sample.depth > 0] for _, sample in found])
     near, far = np.quantile(known, [0.01, 0.99])
     tiles = [draw_frame(sample, name, float(near), float(far)) for name, sample in found]
     if len(tiles) == 1:  # the rows above and below need the width of two
