@@ -202,6 +202,10 @@ def plan() -> list[Run]:
         ("tuna", "007_tuna_fish_can", 2000),
         ("sugar", sugar, 2000),
         ("mustard", mustard, 2000),
+        ("cracker", "003_cracker_box", 4000),
+        ("chef", chef, 1600),
+        ("gelatin", gelatin, 1600),
+        ("foam", foam, 1600),
     ]
     judged += [shipped(f"{name}_u", *rest)._replace(scenes=THIRD) for name, *rest in third]
     return [*map(_without_surface, earlier), *judged]
