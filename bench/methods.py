@@ -70,7 +70,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ),
     ]
     lines += [
-        ablation("resampling", "filter/resample=none,systematic,guided", MEMORISED, model)
+        ablation("resampling", "filter/resample=none,systematic,auxiliary", MEMORISED, model)
         for model in MODELS
     ]
     lines += [

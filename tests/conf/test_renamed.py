@@ -17,6 +17,7 @@ RENAMED = {
     "filter/reweight=tempered,sequential": "filter/reweight=likelihood_ratio,sequential_bayes",
     "filter/resample=transport": "filter/resample=optimal_transport_sampled",
     "filter/resample=ensemble": "filter/resample=optimal_transport",
+    "filter/resample=guided": "filter/resample=auxiliary",
     "propose=still": "filter/propagate=identity",
     "schedule=pixels": "filter/schedule=pixels",
     "resample=never": "filter/resample=none",

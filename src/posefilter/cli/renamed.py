@@ -82,6 +82,7 @@ _CHOICES = {
         "never": "none",
         "transport": "optimal_transport_sampled",
         "ensemble": "optimal_transport",
+        "guided": "auxiliary",
     },
     "filter/reweight": {
         "annealed": "current_likelihood",
@@ -140,6 +141,7 @@ _CHOICES = {
 }
 # classes, by their place below posefilter
 CLASSES = {
+    "filters.guided.Guided": "filters.auxiliary.AuxiliaryResampling",
     "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
     "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
 }

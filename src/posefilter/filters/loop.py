@@ -31,7 +31,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.guided import bind_to_scene
+from posefilter.filters.auxiliary import bind_to_scene
 from posefilter.protocols import (
     Estimate,
     Initialize,
