@@ -189,7 +189,10 @@ class Propagate(Protocol):
 
 
 class Estimate(Protocol):
-    """Choose one pose of the weighted particles."""
+    """Choose one pose of the weighted particles.
+
+    An attribute `score_is` says in words what its score is; `pose.json` repeats it.
+    """
 
     def __call__(
         self,

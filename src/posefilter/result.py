@@ -33,8 +33,10 @@ class Result:
         pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
             OpenCV's (x right, y down, z ahead), the object's that of its mesh file.  It is the best
             guess, also where the object is not there: see `verdict`.
-        score: The estimate's log-likelihood.  It ranks poses of one image; between images its level
-            is arbitrary, so it is no measure of confidence: `probability` is.
+        score: By the shipped settings the estimate's log-likelihood; other choices of
+            `filter/estimate` and `filter/refine` define their own, which `pose.json` writes as
+            `score_is`.  It ranks poses of one image; between images its level is arbitrary, so it
+            is no measure of confidence: `probability` is.
         probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
             object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
             not calibrated; `calibration_note` says why.

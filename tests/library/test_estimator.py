@@ -71,6 +71,7 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert result.verdict in (None, "found")
     assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
     assert np.allclose(told["belief"]["covariance"], result.covariance)
+    assert told["score_is"] == estimator.methods[0].filter.score_is
     assert told["warnings"] == [] == list(result.warnings)
     sure = told["belief"]["uncertainty"]
     assert sure["translation_mm"] == 1000 * result.belief.uncertainty().translation

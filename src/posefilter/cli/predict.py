@@ -28,7 +28,7 @@ from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
-from posefilter.metrics.bop_results import PoseRow, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, Run, collect_results
 from posefilter.weights import expand_weights, is_several
 
@@ -80,7 +80,7 @@ def predict_one(job: Job) -> list[Result]:
     save_image(result.draw_band(rgb, K, mesh), folder / "band.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     result.belief.save(folder / "belief.npz")
-    answer = describe(result, cfg.checkpoint, job)
+    answer = describe(result, method.filter.score_is, cfg.checkpoint, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
         record_view(run, mesh if mesh is not None else method.model.hull, folder / VIEW)
@@ -126,11 +126,13 @@ def predict_several(job: Job) -> list[Result]:
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
     own = dict(zip(estimator.objects, expand_weights(cfg.checkpoint), strict=True))
+    scores = {one.model.name: one.filter.score_is for one in estimator.methods}
     answers = []
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
         result.belief.save(file)
-        answers.append({**describe(result, own[result.object], job), "belief_file": str(file)})
+        answer = describe(result, scores[result.object], own[result.object], job)
+        answers.append({**answer, "belief_file": str(file)})
         if cfg.console != JSON:
             print_result(result)
     missing = [name for name in absent if name not in {one.object for one in results}]
@@ -152,7 +154,7 @@ def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow
     for one in results:
         known = one.object in CLASSES
         number = ycbvideo_index(one.object) if known else objects.index(one.object) + 1
-        score = one.score if one.probability is None else one.probability
+        score = choose_score(one.probability, one.score)
         rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
     return rows
 
@@ -212,7 +214,7 @@ def describe_uncertainty(result: Result) -> dict[str, Any]:
     }
 
 
-def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]:
+def describe(result: Result, score_is: str, checkpoint: str | Path, job: Job) -> dict[str, Any]:
     """Return pose.json, or an entry of poses.json."""
     belief, pose = result.belief, result.pose
     absent = result.verdict == "absent"
@@ -228,7 +230,7 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
         "rotation": None if absent else pose[:3, :3].tolist(),
         "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
         "score": result.score,
-        "score_is": "log-likelihood up to a constant of the method; not a probability",
+        "score_is": score_is,
         "warnings": list(result.warnings),
         "apparent_size": None if math.isnan(result.apparent_size) else result.apparent_size,
         "belief": {

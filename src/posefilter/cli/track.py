@@ -27,7 +27,7 @@ from posefilter.figures.recording import check_viewer
 from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
 from posefilter.meshes.store import MeshStore
-from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, choose_score, to_native, write_poses_csv
 from posefilter.tracking.motion import RandomWalk
 from posefilter.tracking.records import (
     TrackRow,
@@ -276,8 +276,8 @@ def _is_scene(group: str, scene: Any) -> bool:
 def to_pose_row(row: TrackRow, native_from_mesh: Any) -> PoseRow:
     """Return a row of the results file, in the dataset's own object frame."""
     pose = to_native(row.result.pose, native_from_mesh(row.result.object))
-    score, seconds = row.result.score, row.result.seconds
-    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, seconds)
+    score = choose_score(row.result.probability, row.result.score)
+    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, row.result.seconds)
 
 
 def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:

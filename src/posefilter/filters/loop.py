@@ -93,6 +93,14 @@ class ParticleFilter(nn.Module):
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
         self.estimate, self.refine = estimate, refine
 
+    @property
+    def score_is(self) -> str:
+        """What the belief's score is, in words: as the refinement says, or else the estimate."""
+        for component in (self.refine, self.estimate):
+            if said := getattr(component, "score_is", ""):
+                return str(said)
+        return f"as {type(self.estimate).__name__} defines it"
+
     def forward(self, batch: Batch, method: Method, generator: Generator) -> Trace:
         """Run the filter on B images at once, each independent of the others.
 
