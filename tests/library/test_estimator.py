@@ -69,7 +69,10 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["probability"] == result.probability
     assert told["verdict"] == result.verdict
     assert result.verdict in (None, "found")
-    assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
+    own = result.belief
+    assert told["belief"]["weight_entropy"] == pytest.approx(own.weight_entropy)
+    assert told["belief"]["differential_entropy"] == pytest.approx(own.differential_entropy)
+    assert told["belief"]["entropy"] == told["belief"]["weight_entropy"]  # the earlier name stays
     assert np.allclose(told["belief"]["covariance"], result.covariance)
     assert told["score_is"] == estimator.methods[0].filter.score_is
     assert told["warnings"] == [] == list(result.warnings)

@@ -129,12 +129,18 @@ class Belief:
         return tuple(modes)
 
     @property
-    def entropy(self) -> float:
+    def weight_entropy(self) -> float:
         """The entropy of the weights [nat]: 0 where one particle has them all, log N where all are
-        alike.  It says nothing of where the particles are: see `differential_entropy`.
+        alike, as after resampling.  It is no uncertainty of the pose, since it does not depend on
+        where the particles are: see `differential_entropy`.
         """
         weights = self._tensors[1]
         return -float(torch.special.xlogy(weights, weights).sum())
+
+    @property
+    def entropy(self) -> float:
+        """The earlier name of `weight_entropy`."""
+        return self.weight_entropy
 
     @property
     def effective_samples(self) -> float:

@@ -236,7 +236,9 @@ def describe(result: Result, score_is: str, checkpoint: str | Path, job: Job) ->
         "belief": {
             "particles": len(belief.weights),
             "effective_particles": belief.effective_samples,
-            "entropy": belief.entropy,
+            "weight_entropy": belief.weight_entropy,
+            "differential_entropy": belief.differential_entropy,
+            "entropy": belief.weight_entropy,  # by its earlier name
             "mean": belief.mean.tolist(),
             "covariance": belief.covariance.tolist(),
             "covariance_is": _COVARIANCE,
