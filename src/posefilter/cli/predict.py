@@ -79,8 +79,9 @@ def predict_one(job: Job) -> list[Result]:
     save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
     save_image(result.draw_band(rgb, K, mesh), folder / "band.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
-    result.belief.save(folder / "belief.npz")
-    answer = describe(result, method.filter.score_is, cfg.checkpoint, job)
+    belief_file = folder / "belief.npz"
+    result.belief.save(belief_file)
+    answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
         record_view(run, mesh if mesh is not None else method.model.hull, folder / VIEW)
@@ -131,12 +132,12 @@ def predict_several(job: Job) -> list[Result]:
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
         result.belief.save(file)
-        answer = describe(result, scores[result.object], own[result.object], job)
-        answers.append({**answer, "belief_file": str(file)})
+        name = result.object
+        answers.append(describe(result, scores[name], own[name], file, job))
         if cfg.console != JSON:
             print_result(result)
     missing = [name for name in absent if name not in {one.object for one in results}]
-    answers += [describe_absent(name, own[name], job) for name in missing]
+    answers += [describe_absent(one, scores[one], costs, own[one], job) for one in missing]
     write_json(folder / "poses.json", answers)
     write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects))
     files = {name: folder / name for name in ("poses.json", "poses.csv", "overlay.png", "beliefs")}
@@ -214,58 +215,85 @@ def describe_uncertainty(result: Result) -> dict[str, Any]:
     }
 
 
-def describe(result: Result, score_is: str, checkpoint: str | Path, job: Job) -> dict[str, Any]:
+def describe(
+    result: Result, score_is: str, checkpoint: str | Path, belief_file: Path, job: Job
+) -> dict[str, Any]:
     """Return pose.json, or an entry of poses.json."""
-    belief, pose = result.belief, result.pose
-    absent = result.verdict == "absent"
+    pose, absent = result.pose, result.verdict == "absent"
     return {
-        "object": result.object,
+        **describe_absent(result.object, score_is, result.costs, checkpoint, job),
         "instance": result.instance,
         "verdict": result.verdict,
         "probability": result.probability,
         "presence": result.presence,
         "probability_is": result.calibration_note or _PROBABILITY,
-        "costs": asdict(result.costs),
         "camera_from_object": None if absent else pose.tolist(),
         "rotation": None if absent else pose[:3, :3].tolist(),
         "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
         "score": result.score,
-        "score_is": score_is,
         "warnings": list(result.warnings),
         "apparent_size": None if math.isnan(result.apparent_size) else result.apparent_size,
-        "belief": {
-            "particles": len(belief.weights),
-            "effective_particles": belief.effective_samples,
-            "weight_entropy": belief.weight_entropy,
-            "differential_entropy": belief.differential_entropy,
-            "entropy": belief.weight_entropy,  # by its earlier name
-            "mean": belief.mean.tolist(),
-            "covariance": belief.covariance.tolist(),
-            "covariance_is": _COVARIANCE,
-            "uncertainty": describe_uncertainty(result),
-            "modes": [
-                {
-                    "camera_from_object": mode.pose.tolist(),
-                    "mass": mode.mass,
-                    "equivalent_to": mode.equivalent,
-                }
-                for mode in belief.modes
-            ],
-        },
+        "belief": describe_belief(result),
+        "belief_file": str(belief_file),
         "visible_pixels": None if result.mask is None else int(result.mask.sum()),
         "seconds": result.seconds,
+    }
+
+
+def describe_belief(result: Result) -> dict[str, Any]:
+    """Return what the particles come to."""
+    belief = result.belief
+    return {
+        "particles": len(belief.weights),
+        "effective_particles": belief.effective_samples,
+        "weight_entropy": belief.weight_entropy,
+        "differential_entropy": belief.differential_entropy,
+        "entropy": belief.weight_entropy,  # by its earlier name
+        "mean": belief.mean.tolist(),
+        "covariance": belief.covariance.tolist(),
+        "covariance_is": _COVARIANCE,
+        "uncertainty": describe_uncertainty(result),
+        "modes": [
+            {
+                "camera_from_object": mode.pose.tolist(),
+                "mass": mode.mass,
+                "equivalent_to": mode.equivalent,
+            }
+            for mode in belief.modes
+        ],
+    }
+
+
+def describe_absent(
+    name: str, score_is: str, costs: Costs, checkpoint: str | Path, job: Job
+) -> dict[str, Any]:
+    """Return the entry of poses.json of an object of which nothing is found: every key, null where
+    there is nothing to say.
+    """
+    return {
+        "object": name,
+        "instance": None,
+        "verdict": "absent",
+        "probability": None,
+        "presence": None,
+        "probability_is": _PROBABILITY,
+        "costs": asdict(costs),
+        "camera_from_object": None,
+        "rotation": None,
+        "translation_mm": None,
+        "score": None,
+        "score_is": score_is,
+        "warnings": [],
+        "apparent_size": None,
+        "belief": None,
+        "belief_file": None,
+        "visible_pixels": None,
+        "seconds": None,
         "frame": _FRAME,
         "checkpoint": str(checkpoint),
         "rgb": str(job.cfg.rgb),
         "depth": str(job.cfg.depth),
     }
-
-
-def describe_absent(name: str, checkpoint: str | Path, job: Job) -> dict[str, Any]:
-    """Return the entry of poses.json of an object that is not in the image."""
-    empty = dict.fromkeys(("probability", "presence", "camera_from_object", "instance"))
-    files = {"checkpoint": str(checkpoint), "rgb": str(job.cfg.rgb), "depth": str(job.cfg.depth)}
-    return {"object": name, "verdict": "absent", **empty, **files}
 
 
 def read_photograph(rgb: str, depth: str, depth_scale: Any) -> tuple[np.ndarray, np.ndarray]:
