@@ -16,6 +16,7 @@ from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.results import write_json
+from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.verdicts import Costs
 from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import NotThere, UserError
@@ -26,7 +27,6 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
-from posefilter.meshes.store import MeshStore
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, Run, collect_results
@@ -70,21 +70,20 @@ def predict_one(job: Job) -> list[Result]:
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
-    mesh = store.load(method.model.name) if store else None
+    shape = load_shape(open_shapes(cfg, [method.model.name]), method.model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run], costs)
     folder.mkdir(parents=True, exist_ok=True)
-    save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
-    save_image(result.draw_band(rgb, K, mesh), folder / "band.png")
+    save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
+    save_image(result.draw_band(rgb, K, shape), folder / "band.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     belief_file = folder / "belief.npz"
     result.belief.save(belief_file)
     answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
-        record_view(run, mesh if mesh is not None else method.model.hull, folder / VIEW)
+        record_view(run, shape, folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
     files = {
@@ -115,14 +114,14 @@ def predict_several(job: Job) -> list[Result]:
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)), costs=costs)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
+    store = open_shapes(cfg, estimator.objects)
     if cfg.instances is None:
         (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
     else:
         results = estimator.predict(rgb, depth, K, instances=cfg.instances, seed=cfg.seed)
     seen = [one for one in results if one.verdict != "absent"]
     absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
-    drawn = [mark_result(one, store.load(one.object) if store else one.model.hull) for one in seen]
+    drawn = [mark_result(one, load_shape(store, one.model)) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
