@@ -193,7 +193,7 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(tensors, self.model, rgb, intrinsics)
+        return draw_belief(rgb, intrinsics, tensors, self.model)
 
     def draw_band(
         self,

@@ -271,7 +271,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
             image, camera, torch.from_numpy(result.pose), result.model.hull
         ),
         lambda image, camera: posefilter.figures.draw_belief(
-            result.belief, result.model, image, camera
+            image, camera, result.belief, result.model
         ),
     ):
         plain = draw(rgb, K)
