@@ -136,7 +136,8 @@ class Result:
         value = self.surface if self.conformal.by == "surface" else self.probability
         assert value is not None  # where there are sets there is a probability
         limit = self.conformal.find_limit(level, value)
-        return self.belief.level_set(level, -self.belief.differential_entropy - limit)
+        threshold = -self.belief.differential_entropy - limit
+        return self.belief.highest_density_region(level, threshold)
 
     def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is
