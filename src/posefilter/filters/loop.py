@@ -61,7 +61,7 @@ class ParticleFilter(nn.Module):
         resample: Draws ancestors.
         propagate: Moves the resampled states.
         estimate: Chooses one pose of the last particles.
-        refine: Improves the estimate.
+        refine: Improves the estimate, or replaces the particles.
         first_particles: Number of particles at the first step; `particles` if None.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Refinement of the estimate: rescoring particles, mean shift, gradient ascent."""
+"""Refinements of the estimate: rescoring particles, mean shift, gradient ascent; particles stay."""
 
 from collections.abc import Iterable
 from typing import ClassVar
