@@ -70,7 +70,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ),
     ]
     lines += [
-        ablation("resampling", "filter/resample=none,systematic,guided", MEMORISED, model)
+        ablation("resampling", "filter/resample=none,systematic,auxiliary", MEMORISED, model)
         for model in MODELS
     ]
     lines += [
@@ -97,7 +97,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
     # does the gradient through the place harm where nothing multiplies it, and whose?
     short = (
         "model=patch_pf experiment=memorize sweep=ablation "
-        "ablation=c5_displacement_loss,c6_position model/train_rollout=truncated"
+        "ablation=c5_displacement_loss,c6_position model/train_rollout=short"
     )
     lines += [
         Line(
@@ -106,7 +106,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ),
         # two steps alone, from where the paper's particles start
         Line(
-            "truncated_start",
+            "short_start",
             f"{short} model.train_filter.initialize.object_fraction=0.0 loss/schedule=none "
             "seed=0,1,2",
         ),

@@ -165,7 +165,7 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     sample, K = one.sample, one.sample.intrinsics
     write(
         out / "belief.jpg",
-        draw_belief(one.trace.belief, method.model, sample.rgb, K, sample.camera_from_object),
+        draw_belief(sample.rgb, K, one.trace.belief, method.model, sample.camera_from_object),
     )
     write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
     searching = method_of(kept, SEARCH)

@@ -189,7 +189,10 @@ class Propagate(Protocol):
 
 
 class Estimate(Protocol):
-    """Choose one pose of the weighted particles."""
+    """Choose one pose of the weighted particles.
+
+    An attribute `score_is` says in words what its score is; `pose.json` repeats it.
+    """
 
     def __call__(
         self,
@@ -204,12 +207,18 @@ class Estimate(Protocol):
 
 
 class Refine(Protocol):
-    """Improve an estimate."""
+    """Work on a belief after the last step: on its estimate, or on its particles.
+
+    Some replace the estimate `best` and its `score` by better ones (rescoring, mean shift, gradient
+    ascent) and leave the particles. Others replace the particles and weights (importance sampling,
+    resample-move) and leave the estimate. One that scores the estimate anew says in `score_is` what
+    the score then is.
+    """
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
     ) -> Belief:
-        """Return the belief with its `best` (and `score`) improved."""
+        """Return the belief with another estimate, or with other particles."""
         ...
 
 

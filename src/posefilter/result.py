@@ -33,8 +33,10 @@ class Result:
         pose: The estimate (4, 4), float64: camera_from_object in meters.  The camera's frame is
             OpenCV's (x right, y down, z ahead), the object's that of its mesh file.  It is the best
             guess, also where the object is not there: see `verdict`.
-        score: The estimate's log-likelihood.  It ranks poses of one image; between images its level
-            is arbitrary, so it is no measure of confidence: `probability` is.
+        score: By the shipped settings the estimate's log-likelihood; other choices of
+            `filter/estimate` and `filter/refine` define their own, which `pose.json` writes as
+            `score_is`.  It ranks poses of one image; between images its level is arbitrary, so it
+            is no measure of confidence: `probability` is.
         probability: That the object is there and the pose within 0.1 diameters (ADD, up to the
             object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
             not calibrated; `calibration_note` says why.
@@ -134,7 +136,8 @@ class Result:
         value = self.surface if self.conformal.by == "surface" else self.probability
         assert value is not None  # where there are sets there is a probability
         limit = self.conformal.find_limit(level, value)
-        return self.belief.level_set(level, -self.belief.differential_entropy - limit)
+        threshold = -self.belief.differential_entropy - limit
+        return self.belief.highest_density_region(level, threshold)
 
     def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is
@@ -191,7 +194,7 @@ class Result:
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(tensors, self.model, rgb, intrinsics)
+        return draw_belief(rgb, intrinsics, tensors, self.model)
 
     def draw_band(
         self,

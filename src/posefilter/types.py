@@ -98,8 +98,8 @@ class Belief(NamedTuple):
     poses: Tensor  # (B, N, 4, 4) camera_from_object
     log_weights: Tensor  # (B, N), normalized
     best: Tensor  # (B, 4, 4) the estimate
-    # (B,) log-likelihood of the estimate, up to a constant of each image: it ranks poses of one
-    # image, and is no confidence
+    # (B,) as ParticleFilter.score_is says, most often the log-likelihood of the estimate up to a
+    # constant of each image: it ranks poses of one image, and is no confidence
     score: Tensor
 
 

@@ -14,6 +14,7 @@ from posefilter.geometry.rotation import random_rotation
 from posefilter.metrics.bop_results import (
     HEADER,
     PoseRow,
+    choose_score,
     read_poses_csv,
     to_mesh,
     to_native,
@@ -56,6 +57,12 @@ def test_file_is_as_bop_wants_it(tmp_path: Path) -> None:
     assert [float(x) for x in cells[4].split(" ")] == [0, -1, 0, 1, 0, 0, 0, 0, 1]
     assert [float(x) for x in cells[5].split(" ")] == [100, -20, 755]
     assert cells[6] == "-1.0"
+
+
+def test_a_score_is_the_probability_where_there_is_one() -> None:
+    assert choose_score(0.25, 7.5) == 0.25
+    assert choose_score(0.0, 7.5) == 0
+    assert choose_score(None, 7.5) == choose_score(np.nan, 7.5) == 7.5
 
 
 def test_header_may_be_missing_and_numbers_plain(tmp_path: Path) -> None:

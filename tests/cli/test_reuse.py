@@ -20,15 +20,15 @@ CONF = Path(__file__).parents[2] / "conf"
         ([], ["trainer.max_steps=7"], False),
         ([], ["data.limit_train=100"], False),
         (["model=patch_pf"], ["filter.particles=50"], False),
-        (["model=patch_pf", "model/train_rollout=truncated"], ["filter/refine=mean_shift"], True),
-        (["model=patch_pf", "model/train_rollout=truncated"], ["filter.particles=50"], False),
+        (["model=patch_pf", "model/train_rollout=short"], ["filter/refine=mean_shift"], True),
+        (["model=patch_pf", "model/train_rollout=short"], ["filter.particles=50"], False),
     ],
     ids=lambda value: ",".join(value) if isinstance(value, list) else None,
 )
 def test_training_is_shared_where_no_setting_of_it_differs(
     common: list[str], changed: list[str], same: bool, tmp_path: Path
 ) -> None:
-    """pose_pf scores candidates and rolls out no filter; a truncated roll-out has as many
+    """pose_pf scores candidates and rolls out no filter; a short roll-out has as many
     particles.
     """
     changed = [f"model.{c}" if c.startswith("train_pixels") else c for c in changed]

@@ -103,7 +103,7 @@ REMEDIES = [
     "loss/schedule=three_stages",
     "model/train_rollout=full",
     "filter/resample=none",
-    "filter/resample=guided",
+    "filter/resample=auxiliary",
     "filter/initialize=from_relevance",
     "filter/initialize=informed",
     "filter/propagate=learned_and_gaussian",
@@ -174,7 +174,7 @@ def test_the_memorization_test_shows_the_images_that_it_learned(tmp_path: Path) 
 
 SEVERAL = {  # ablations that are more than one change
     "s9_displacement_loss_and_position": 2,
-    "m8_truncated": 2,
+    "m8_short": 2,
     "pose_c11_surface_point": 2,
     "pose_c15_noise": 2,
     "pose_m14_surface_point": 3,

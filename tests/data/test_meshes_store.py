@@ -76,8 +76,9 @@ def test_units_are_not_guessed(tmp_path: Path) -> None:
     _box(tmp_path / "tiny.obj", (1e-4, 2e-4, 3e-4))
     store = MeshStore(tmp_path)
     assert "millimeters" in _fails(store, "mm")
-    assert "data.mesh_scale=0.001 (generate, check_data, predict: mesh_scale=0.001)" in _fails(
-        store, "mm"
+    assert (
+        "data.mesh_scale=0.001 (generate, check_data, predict, track: mesh_scale=0.001)"
+        in _fails(store, "mm")
     )
     assert "data.mesh_scale=1000" in _fails(store, "tiny")
     twice = MeshStore(tmp_path, scale=1e-6)

@@ -198,7 +198,7 @@ def test_the_heavier_mode_covers_more_of_the_map() -> None:
 
 def test_figure_shows_the_map_the_photograph_and_six_marginals() -> None:
     belief, a, _ = two_modes()
-    picture = draw_belief(belief, model(), RGB, K, a.numpy())
+    picture = draw_belief(RGB, K, belief, model(), a.numpy())
     assert picture.shape[1] == WIDTH
     blue = (np.abs(picture.astype(int) - (122, 153, 196)).max(-1) < 3).any(0)
     columns = np.nonzero(np.diff(blue.astype(int)) == 1)[0]
@@ -285,4 +285,4 @@ def test_a_batch_of_several_is_refused() -> None:
     belief, _, _ = two_modes()
     several = Belief(*(torch.cat([x, x]) for x in belief))
     with pytest.raises(ValueError, match="one image"):
-        draw_belief(several, model(), RGB, K)
+        draw_belief(RGB, K, several, model())

@@ -1,14 +1,21 @@
 """Overlays: what is drawn lies where the object is."""
 
+import inspect
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import distance_transform_edt
 
+from posefilter.figures.band import draw_band
+from posefilter.figures.belief import draw_belief
 from posefilter.figures.canvas import AXES, ESTIMATE, TRUTH, View, close_up, full_view
+from posefilter.figures.detections import draw_detections
 from posefilter.figures.overlay import (
     draw_overlay,
+    draw_poses,
     outline_object,
     render_silhouette,
     trace_outline,
@@ -162,3 +169,10 @@ def test_a_coarse_outline_misses_the_fine_one_by_its_coarseness_at_most(carton: 
     # no corner is lost, and nothing is shifted
     assert (inside[0] ^ inside[1]).sum() < 0.03 * inside[0].sum()
     assert sum(map(len, coarse)) < 40  # few and straight lines
+
+
+@pytest.mark.parametrize(
+    "draw", [draw_overlay, draw_poses, draw_belief, draw_band, draw_detections]
+)
+def test_pictures_take_the_image_and_its_intrinsics_first(draw: Callable[..., np.ndarray]) -> None:
+    assert list(inspect.signature(draw).parameters)[:2] == ["rgb", "intrinsics"]

@@ -8,8 +8,8 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
+from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.estimate import Mean
-from posefilter.filters.guided import Guided
 from posefilter.filters.loop import make_particles
 from posefilter.filters.modes import find_modes, find_pose_modes
 from posefilter.filters.refine import Gradient, MeanShift, Rescore
@@ -250,22 +250,22 @@ def test_only_some_hundreds_of_partners_are_compared() -> None:
     assert 0.2 < float(steps[..., 0].abs().max()) < 1
 
 
-def test_a_guided_draw_by_hand() -> None:
+def test_an_auxiliary_draw_by_hand() -> None:
     """Relevances of 1 and 0.01, of which the floor makes 0.25: with even weights four of five
     children are of the first, each with a quarter of the weight that one of the second has.
     """
     particles = make_particles(torch.tensor([[[0.0, 0.0], [1.0, 0.0]]]), 0)
     scene = Relevance(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
-    draw = Guided(Systematic(), floor=0.25).bind(scene, 1, 2)
+    draw = AuxiliaryResampling(Systematic(), floor=0.25).bind(scene, 1, 2)
     new = draw(particles, 10, PIXELS, Generator().manual_seed(0))
     assert int((new.ancestors == 0).sum()) == 8
     first, last = new.log_weights[0, [0, -1]].exp().tolist()
     assert last / first == pytest.approx(4)
     assert float(new.log_weights.exp().sum()) == pytest.approx(1)
-    assert Guided(Systematic(), floor=1.0).floor == 1
+    assert AuxiliaryResampling(Systematic(), floor=1.0).floor == 1
     for floor in (0.0, 1.1, math.nan):
         with pytest.raises(UserError, match="floor="):
-            Guided(Systematic(), floor=floor)
+            AuxiliaryResampling(Systematic(), floor=floor)
 
 
 class Relevance:

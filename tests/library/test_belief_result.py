@@ -100,7 +100,7 @@ def test_order_of_particles_and_splitting_one_change_nothing() -> None:
         assert np.allclose(other.mean, belief.mean)
         assert np.allclose(other.covariance, belief.covariance)
         assert [m.mass for m in other.modes] == pytest.approx([m.mass for m in belief.modes])
-    assert shuffled.entropy == pytest.approx(belief.entropy)
+    assert shuffled.weight_entropy == pytest.approx(belief.weight_entropy)
     assert shuffled.effective_samples == pytest.approx(belief.effective_samples)
 
 
@@ -135,8 +135,18 @@ def test_weight_that_shifts_moves_the_mean() -> None:
 def test_entropy_and_effective_samples_know_their_ends() -> None:
     poses = np.repeat(some_pose().numpy()[None], 8, 0)
     alike, sure = belief_of(poses), belief_of(poses, np.eye(8)[0])
-    assert (alike.entropy, alike.effective_samples) == pytest.approx((np.log(8), 8))
-    assert (sure.entropy, sure.effective_samples) == pytest.approx((0, 1))
+    assert (alike.weight_entropy, alike.effective_samples) == pytest.approx((np.log(8), 8))
+    assert (sure.weight_entropy, sure.effective_samples) == pytest.approx((0, 1))
+
+
+def test_the_density_knows_how_far_particles_are_and_the_weights_do_not() -> None:
+    near, far = (
+        belief_of(spread_about(some_pose(), size * known_covariance(), 200)) for size in (0.01, 1)
+    )
+    assert near.weight_entropy == far.weight_entropy == near.entropy
+    # a tenth of the width in each of six axes
+    gap = far.differential_entropy - near.differential_entropy
+    assert gap == pytest.approx(6 * np.log(10), abs=1)
 
 
 def test_covariance_about_another_pose_holds_its_offset() -> None:

@@ -53,6 +53,10 @@ def test_credible_sets_hold_their_share_of_what_the_belief_was_drawn_from() -> N
         one = belief.credible_set(level)
         assert one.weights.sum() == pytest.approx(level, abs=0.03)
         assert one.contains(fresh).tolist() == inside.tolist()
+        assert one.coverage == one.level == level
+        assert one.min_log_density == one.least
+        again = belief.highest_density_region(one.coverage, one.min_log_density)
+        assert np.array_equal(again.samples, one.samples)
     assert not belief.credible_set(0.999).contains(move_far(middle().numpy()))
     assert belief.credible_set(1.0).weights.sum() == pytest.approx(1)
     with pytest.raises(UserError, match=r"1\.5"):

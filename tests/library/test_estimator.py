@@ -69,8 +69,13 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["probability"] == result.probability
     assert told["verdict"] == result.verdict
     assert result.verdict in (None, "found")
-    assert told["belief"]["entropy"] == pytest.approx(result.belief.entropy)
+    own = result.belief
+    assert told["belief"]["weight_entropy"] == pytest.approx(own.weight_entropy)
+    assert told["belief"]["differential_entropy"] == pytest.approx(own.differential_entropy)
+    assert told["belief"]["entropy"] == told["belief"]["weight_entropy"]  # the earlier name stays
     assert np.allclose(told["belief"]["covariance"], result.covariance)
+    assert told["belief_file"] == str(tmp_path / "belief.npz")
+    assert told["score_is"] == estimator.methods[0].filter.score_is
     assert told["warnings"] == [] == list(result.warnings)
     sure = told["belief"]["uncertainty"]
     assert sure["translation_mm"] == 1000 * result.belief.uncertainty().translation
@@ -142,6 +147,8 @@ def test_instances_are_listed_once_each_and_absent_ones_are_named(
     assert len(rows) == sum(one["camera_from_object"] is not None for one in told)
     assert rows[0].obj_id == 2  # of YCB-Video's classes
     assert np.allclose(rows[0].camera_from_native, found)
+    assert len({tuple(one) for one in told}) == 1  # of all entries, also where nothing is found
+    assert told[0]["costs"] == told[-1]["costs"]
     for one in told:
         if one["camera_from_object"] is not None:
             assert one["visible_pixels"] > 0
@@ -264,7 +271,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
             image, camera, torch.from_numpy(result.pose), result.model.hull
         ),
         lambda image, camera: posefilter.figures.draw_belief(
-            result.belief, result.model, image, camera
+            image, camera, result.belief, result.model
         ),
     ):
         plain = draw(rgb, K)

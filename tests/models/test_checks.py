@@ -52,7 +52,7 @@ def test_agreement_is_refused_where_no_particle_knows_its_surface_point_of_the_o
 
 
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
-@pytest.mark.parametrize("train_rollout", ["full", "truncated"])
+@pytest.mark.parametrize("train_rollout", ["full", "short"])
 def test_agreement_serves_both_pose_methods_before_they_know_their_object(
     model: str, train_rollout: str, tmp_path: Path
 ) -> None:
@@ -118,7 +118,7 @@ def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
 
 WIDE = ["filter.particles=8", "filter.first_particles=20", "filter.steps=2"]
 LEGAL = [
-    "model/train_rollout=truncated filter.first_particles=20 filter.steps=2",
+    "model/train_rollout=short filter.first_particles=20 filter.steps=2",
     "model/train_rollout=full filter.first_particles=null filter.steps=2",
     "model/train_rollout=full filter.first_particles=8 filter.steps=2",
     # one cloud is of one size, whatever it is
@@ -136,7 +136,7 @@ def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_
         refusal,
         "filter.first_particles=20",
         "filter.first_particles=null",
-        "model/train_rollout=truncated",
+        "model/train_rollout=short",
     )
     with torch.no_grad():  # a wide search is fine where nothing is taught
         trace = method.eval().predict_step(batch, 0)

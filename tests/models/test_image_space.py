@@ -14,8 +14,8 @@ from toy import H, W, scenes, square
 
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
+from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.estimate import Argmax
-from posefilter.filters.guided import Guided
 from posefilter.filters.initialize import FromRelevance, Informed, UniformPixels
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import LearnedDisplacement
@@ -233,7 +233,7 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
 
     uniform = share(UniformPixels(), NoResampling())
     assert share(FromRelevance(), NoResampling())[0] > uniform[0] + 0.3
-    assert share(UniformPixels(), Guided(Systematic()))[1] > uniform[1]
+    assert share(UniformPixels(), AuxiliaryResampling(Systematic()))[1] > uniform[1]
     with pytest.raises(UserError, match="relevance"):
         paper(PatchPF, 3, filter=run_filter(8, 2, FromRelevance()))
 

@@ -345,7 +345,7 @@ def test_plain_is_for_machines(
     [
         ("filter/initialize=from_depth", "filter/initialize=from_depth.*patch_pf"),
         ("filter/initialize=from_relevance model/encoder=pyramid", "from_relevance.*patch_pf"),
-        ("filter/resample=guided model/encoder=none", "filter/resample=guided"),
+        ("filter/resample=auxiliary model/encoder=none", "filter/resample=auxiliary"),
         ("filter/refine=rescore", "refine.*patch_pf"),
     ],
 )

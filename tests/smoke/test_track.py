@@ -7,6 +7,8 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +16,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from posefilter.cli.command import compose_job, run_command
-from posefilter.cli.track import make_settings
+from posefilter.cli.track import make_settings, to_pose_row
 from posefilter.data.sequences import VideoFrame
 from posefilter.locks import LOCK, hold
+from posefilter.tracking.records import TrackRow
 from posefilter.tracking.settings import TrackerSettings
 
 HOME = Path(__file__).parents[2]
@@ -40,6 +43,17 @@ def folder(tmp_path: Path) -> Path:
         cv2.imwrite(str(tmp_path / "video" / "rgb" / name), rgb * shown)
         cv2.imwrite(str(tmp_path / "video" / "depth" / name), depth * shown)
     return tmp_path / "video"
+
+
+@pytest.mark.parametrize(("probability", "score"), [(0.25, 0.25), (None, 7.5)])
+def test_a_row_is_scored_as_predict_and_evaluate_score(
+    probability: float | None, score: float
+) -> None:
+    result: Any = SimpleNamespace(
+        object="a", pose=np.eye(4), score=7.5, probability=probability, seconds=0.1
+    )
+    row = TrackRow("video", "8", 0, 8, 1, result, None, np.nan, np.nan)
+    assert to_pose_row(row, lambda _: np.eye(4)).score == score
 
 
 def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.belief.sets import PoseSet, find_least
+from posefilter.belief.sets import PoseSet, find_threshold
 from posefilter.belief.storage import read_arrays, write_arrays
 from posefilter.belief.summaries import (
     AXES,
@@ -129,12 +129,18 @@ class Belief:
         return tuple(modes)
 
     @property
-    def entropy(self) -> float:
+    def weight_entropy(self) -> float:
         """The entropy of the weights [nat]: 0 where one particle has them all, log N where all are
-        alike.  It says nothing of where the particles are: see `differential_entropy`.
+        alike, as after resampling.  It is no uncertainty of the pose, since it does not depend on
+        where the particles are: see `differential_entropy`.
         """
         weights = self._tensors[1]
         return -float(torch.special.xlogy(weights, weights).sum())
+
+    @property
+    def entropy(self) -> float:
+        """The earlier name of `weight_entropy`."""
+        return self.weight_entropy
 
     @property
     def effective_samples(self) -> float:
@@ -182,15 +188,18 @@ class Belief:
         """
         check_share(level)
         weights = self._density.log_weights.exp().numpy()
-        return self.level_set(level, find_least(self._held_out, weights, level))
+        return self.highest_density_region(level, find_threshold(self._held_out, weights, level))
 
-    def level_set(self, level: float, least: float) -> PoseSet:
-        """Return the set of the poses whose log density is at least `least`; `level` is its name's.
+    def highest_density_region(self, coverage: float, min_log_density: float) -> PoseSet:
+        """Return the set of the poses whose log density is at least a threshold.
 
-        Minus infinity gives the set of all poses.
+        Args:
+            coverage: What the set is made for, which it states and does not compute.
+            min_log_density: The threshold [nat]; minus infinity gives the set of all poses.
         """
-        inside = self._density.chosen.numpy()[self._held_out >= least]
-        return PoseSet(level, least, self.samples[inside], self.weights[inside], self.log_density)
+        inside = self._density.chosen.numpy()[self._held_out >= min_log_density]
+        samples, weights = self.samples[inside], self.weights[inside]
+        return PoseSet(coverage, min_log_density, samples, weights, self.log_density)
 
     def contains(self, poses: np.ndarray, level: float = 0.9) -> np.ndarray:
         """Tell which poses are in the credible set of a level.  (*, 4, 4) -> (*) bool."""

@@ -1,4 +1,4 @@
-"""Sets of poses that hold a truth with a stated probability: level sets of a belief's density."""
+"""Sets of poses that hold a truth with a stated probability: regions of highest density."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,27 +8,39 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
-    """All poses at which a belief's density is high enough.
+    """A highest-density region (Hyndman 1996): all poses at which a belief is dense enough.
 
     Attributes:
-        level: The probability that the set is made for.
-        least: The least log density of a pose in the set; minus infinity where every pose is in it.
+        coverage: The probability that the set is made to hold the truth with; what it is of, the
+            belief's mass or frames, is its maker's matter (credible or conformal).
+        min_log_density: The threshold: the least log density of a pose in the set; minus infinity
+            where every pose is in it.
         samples: The particles in it (K, 4, 4), camera_from_object [m]; of more than 2,000 particles
             a selection.
         weights: Their weights (K,) in the belief.
         log_density: The belief's log density at poses; see `Belief.log_density`.
     """
 
-    level: float
-    least: float
+    coverage: float
+    min_log_density: float
     samples: np.ndarray
     weights: np.ndarray
     log_density: Callable[[np.ndarray], np.ndarray]
 
     @property
+    def level(self) -> float:
+        """The earlier name of `coverage`."""
+        return self.coverage
+
+    @property
+    def least(self) -> float:
+        """The earlier name of `min_log_density`."""
+        return self.min_log_density
+
+    @property
     def is_everything(self) -> bool:
         """Whether every pose is in the set."""
-        return self.least == -np.inf
+        return self.min_log_density == -np.inf
 
     def contains(self, poses: np.ndarray) -> np.ndarray:
         """Tell which poses are in the set.
@@ -39,14 +51,14 @@ class PoseSet:
         Returns:
             (*) bool.
         """
-        return np.asarray(self.log_density(poses) >= self.least)
+        return np.asarray(self.log_density(poses) >= self.min_log_density)
 
 
-def find_least(values: np.ndarray, weights: np.ndarray, level: float) -> float:
-    """Return the largest number such that `level` of the weight has values of at least that.
+def find_threshold(values: np.ndarray, weights: np.ndarray, coverage: float) -> float:
+    """Return the largest number such that `coverage` of the weight has values of at least that.
 
     (N,), (N,) that sum to 1 -> a value.
     """
     order = np.argsort(-values, kind="stable")
     mass = np.cumsum(weights[order])
-    return float(values[order][min(int(np.searchsorted(mass, level - 1e-9)), len(values) - 1)])
+    return float(values[order][min(int(np.searchsorted(mass, coverage - 1e-9)), len(values) - 1)])

@@ -100,7 +100,7 @@ def particles(o: Occasion) -> Drawn:
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
     return draw_belief(
-        o.trace.belief, o.method.model, o.one.rgb, o.one.intrinsics, o.one.truth, o.title("Belief")
+        o.one.rgb, o.one.intrinsics, o.trace.belief, o.method.model, o.one.truth, o.title("Belief")
     )
 
 

@@ -11,7 +11,7 @@ from lightning import LightningModule, Trainer
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.data.frames import FrameRecord
 from posefilter.files import open_whole
-from posefilter.metrics.bop_results import PoseRow, to_native
+from posefilter.metrics.bop_results import PoseRow, choose_score, to_native
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, Trace
 
@@ -89,7 +89,7 @@ def to_rows(
 ) -> list[PoseRow]:
     """Return the estimates as lines of a results file.
 
-    The score is the probability where there is one, else the log-likelihood.
+    The score is as `choose_score` has it.
     Estimates that are not finite are left out, and so count as missed.
 
     Args:
@@ -105,8 +105,7 @@ def to_rows(
         record = records[outcome.frame_id]
         pose = to_native(outcome.estimate, native_from_mesh(record.object))
         seconds = outcome.seconds if math.isfinite(outcome.seconds) else -1.0
-        known = math.isfinite(outcome.probability)
-        score = outcome.probability if known else outcome.score
+        score = choose_score(outcome.probability, outcome.score)
         rows.append(PoseRow(record.scene_id, record.im_id, record.obj_id, score, pose, seconds))
     return rows
 

@@ -103,17 +103,17 @@ ABLATIONS = (
         ("filter/initialize=informed",),
     ),
     Ablation(
-        "c8_truncated",
+        "c8_short",
         "Also training roll-outs of two steps.",
         "c7_informed",
-        ("model/train_rollout=truncated",),
+        ("model/train_rollout=short",),
     ),
     Ablation(
-        "c9_context", "Also features of the whole image.", "c8_truncated", ("model/encoder=unet",)
+        "c9_context", "Also features of the whole image.", "c8_short", ("model/encoder=unet",)
     ),
     Ablation(
         "c10_resample",
-        "Also resampling by likelihood (in tests; the truncated training has none).",
+        "Also resampling by likelihood (in tests; the short roll-out of training has none).",
         "c9_context",
         ("filter/resample=systematic",),
     ),
@@ -214,7 +214,7 @@ ABLATIONS = (
         ("model.train_filter.initialize.object_fraction=0.0",),
     ),
     Ablation(
-        "m8_truncated",
+        "m8_short",
         "Working, with full training roll-outs of particles half of which start on or around the "
         "object.",
         "working",
@@ -228,7 +228,7 @@ ABLATIONS = (
     ),
     Ablation(
         "m10_resample",
-        "Working, without resampling (in tests; the truncated training has none).",
+        "Working, without resampling (in tests; the short roll-out of training has none).",
         "working",
         ("filter/resample=none",),
     ),

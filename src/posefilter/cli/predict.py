@@ -16,6 +16,7 @@ from posefilter.cli.console import JSON, ended
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.results import write_json
+from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.verdicts import Costs
 from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import NotThere, UserError
@@ -26,9 +27,8 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
-from posefilter.meshes.store import MeshStore
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
-from posefilter.metrics.bop_results import PoseRow, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, Run, collect_results
 from posefilter.weights import expand_weights, is_several
 
@@ -70,20 +70,20 @@ def predict_one(job: Job) -> list[Result]:
     estimator = Estimator([method])
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
-    mesh = store.load(method.model.name) if store else None
+    shape = load_shape(open_shapes(cfg, [method.model.name]), method.model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run], costs)
     folder.mkdir(parents=True, exist_ok=True)
-    save_image(result.draw_overlay(rgb, K, mesh), folder / "overlay.png")
-    save_image(result.draw_band(rgb, K, mesh), folder / "band.png")
+    save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
+    save_image(result.draw_band(rgb, K, shape), folder / "band.png")
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
-    result.belief.save(folder / "belief.npz")
-    answer = describe(result, cfg.checkpoint, job)
+    belief_file = folder / "belief.npz"
+    result.belief.save(belief_file)
+    answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
     if cfg.view:
-        record_view(run, mesh if mesh is not None else method.model.hull, folder / VIEW)
+        record_view(run, shape, folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
     files = {
@@ -114,27 +114,29 @@ def predict_several(job: Job) -> list[Result]:
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)), costs=costs)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
+    store = open_shapes(cfg, estimator.objects)
     if cfg.instances is None:
         (results,) = estimator.predict_batch(rgb[None], depth[None], K, seed=cfg.seed)
     else:
         results = estimator.predict(rgb, depth, K, instances=cfg.instances, seed=cfg.seed)
     seen = [one for one in results if one.verdict != "absent"]
     absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
-    drawn = [mark_result(one, store.load(one.object) if store else one.model.hull) for one in seen]
+    drawn = [mark_result(one, load_shape(store, one.model)) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
     own = dict(zip(estimator.objects, expand_weights(cfg.checkpoint), strict=True))
+    scores = {one.model.name: one.filter.score_is for one in estimator.methods}
     answers = []
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
         result.belief.save(file)
-        answers.append({**describe(result, own[result.object], job), "belief_file": str(file)})
+        name = result.object
+        answers.append(describe(result, scores[name], own[name], file, job))
         if cfg.console != JSON:
             print_result(result)
     missing = [name for name in absent if name not in {one.object for one in results}]
-    answers += [describe_absent(name, own[name], job) for name in missing]
+    answers += [describe_absent(one, scores[one], costs, own[one], job) for one in missing]
     write_json(folder / "poses.json", answers)
     write_poses_csv(folder / "poses.csv", list_rows(seen, estimator.objects))
     files = {name: folder / name for name in ("poses.json", "poses.csv", "overlay.png", "beliefs")}
@@ -152,7 +154,7 @@ def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow
     for one in results:
         known = one.object in CLASSES
         number = ycbvideo_index(one.object) if known else objects.index(one.object) + 1
-        score = one.score if one.probability is None else one.probability
+        score = choose_score(one.probability, one.score)
         rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
     return rows
 
@@ -212,44 +214,80 @@ def describe_uncertainty(result: Result) -> dict[str, Any]:
     }
 
 
-def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]:
+def describe(
+    result: Result, score_is: str, checkpoint: str | Path, belief_file: Path, job: Job
+) -> dict[str, Any]:
     """Return pose.json, or an entry of poses.json."""
-    belief, pose = result.belief, result.pose
-    absent = result.verdict == "absent"
+    pose, absent = result.pose, result.verdict == "absent"
     return {
-        "object": result.object,
+        **describe_absent(result.object, score_is, result.costs, checkpoint, job),
         "instance": result.instance,
         "verdict": result.verdict,
         "probability": result.probability,
         "presence": result.presence,
         "probability_is": result.calibration_note or _PROBABILITY,
-        "costs": asdict(result.costs),
         "camera_from_object": None if absent else pose.tolist(),
         "rotation": None if absent else pose[:3, :3].tolist(),
         "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
         "score": result.score,
-        "score_is": "log-likelihood up to a constant of the method; not a probability",
         "warnings": list(result.warnings),
         "apparent_size": None if math.isnan(result.apparent_size) else result.apparent_size,
-        "belief": {
-            "particles": len(belief.weights),
-            "effective_particles": belief.effective_samples,
-            "entropy": belief.entropy,
-            "mean": belief.mean.tolist(),
-            "covariance": belief.covariance.tolist(),
-            "covariance_is": _COVARIANCE,
-            "uncertainty": describe_uncertainty(result),
-            "modes": [
-                {
-                    "camera_from_object": mode.pose.tolist(),
-                    "mass": mode.mass,
-                    "equivalent_to": mode.equivalent,
-                }
-                for mode in belief.modes
-            ],
-        },
+        "belief": describe_belief(result),
+        "belief_file": str(belief_file),
         "visible_pixels": None if result.mask is None else int(result.mask.sum()),
         "seconds": result.seconds,
+    }
+
+
+def describe_belief(result: Result) -> dict[str, Any]:
+    """Return what the particles come to."""
+    belief = result.belief
+    return {
+        "particles": len(belief.weights),
+        "effective_particles": belief.effective_samples,
+        "weight_entropy": belief.weight_entropy,
+        "differential_entropy": belief.differential_entropy,
+        "entropy": belief.weight_entropy,  # by its earlier name
+        "mean": belief.mean.tolist(),
+        "covariance": belief.covariance.tolist(),
+        "covariance_is": _COVARIANCE,
+        "uncertainty": describe_uncertainty(result),
+        "modes": [
+            {
+                "camera_from_object": mode.pose.tolist(),
+                "mass": mode.mass,
+                "equivalent_to": mode.equivalent,
+            }
+            for mode in belief.modes
+        ],
+    }
+
+
+def describe_absent(
+    name: str, score_is: str, costs: Costs, checkpoint: str | Path, job: Job
+) -> dict[str, Any]:
+    """Return the entry of poses.json of an object of which nothing is found: every key, null where
+    there is nothing to say.
+    """
+    return {
+        "object": name,
+        "instance": None,
+        "verdict": "absent",
+        "probability": None,
+        "presence": None,
+        "probability_is": _PROBABILITY,
+        "costs": asdict(costs),
+        "camera_from_object": None,
+        "rotation": None,
+        "translation_mm": None,
+        "score": None,
+        "score_is": score_is,
+        "warnings": [],
+        "apparent_size": None,
+        "belief": None,
+        "belief_file": None,
+        "visible_pixels": None,
+        "seconds": None,
         "frame": _FRAME,
         "checkpoint": str(checkpoint),
         "rgb": str(job.cfg.rgb),
@@ -257,19 +295,12 @@ def describe(result: Result, checkpoint: str | Path, job: Job) -> dict[str, Any]
     }
 
 
-def describe_absent(name: str, checkpoint: str | Path, job: Job) -> dict[str, Any]:
-    """Return the entry of poses.json of an object that is not in the image."""
-    empty = dict.fromkeys(("probability", "presence", "camera_from_object", "instance"))
-    files = {"checkpoint": str(checkpoint), "rgb": str(job.cfg.rgb), "depth": str(job.cfg.depth)}
-    return {"object": name, "verdict": "absent", **empty, **files}
-
-
 def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Read color (H, W, 3) uint8 and depth (H, W) [m].
 
     Raises UserError where they do not fit each other.
     """
-    color, z = read_color(Path(rgb)), read_depth(Path(depth), float(depth_scale))
+    color, z = read_color(Path(rgb)), read_depth(Path(depth), depth_scale)
     if color.shape[:2] != z.shape:
         raise UserError(
             f"depth={depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image has "

@@ -83,6 +83,7 @@ _CHOICES = {
         "never": "none",
         "transport": "optimal_transport_sampled",
         "ensemble": "optimal_transport",
+        "guided": "auxiliary",
     },
     "filter/reweight": {
         "annealed": "current_likelihood",
@@ -95,7 +96,7 @@ _CHOICES = {
         "resnet18": "resnet model.encoder.trunk.kind=resnet18",
         "resnet34": "resnet model.encoder.trunk.kind=resnet34",
     },
-    "model/train_rollout": {"same": "full", "short": "truncated"},
+    "model/train_rollout": {"same": "full", "truncated": "short"},
     "loss/aux/displacement": {
         "center": "towards model.aux_losses.displacement.loss.label.target=center"
     },
@@ -126,7 +127,7 @@ _CHOICES = {
         "c1_normalisation": "c1_normalization",
         "c5_lesson": "c5_displacement_loss",
         "c6_place": "c6_position",
-        "c8_short": "c8_truncated",
+        "c8_truncated": "c8_short",
         "pose_c11_own_point": "pose_c11_surface_point",
         "pose_m14_own_point": "pose_m14_surface_point",
         "pose_c16_held": "pose_c16_gated",
@@ -134,13 +135,14 @@ _CHOICES = {
         "m1_normalisation": "m1_normalization",
         "m5_lesson": "m5_displacement_loss",
         "m6_place": "m6_position",
-        "m8_short": "m8_truncated",
+        "m8_truncated": "m8_short",
         "m12_held": "m12_gated",
         "m13_rate": "m13_scheduler",
     },
 }
 # classes, by their place below posefilter
 CLASSES = {
+    "filters.guided.Guided": "filters.auxiliary.AuxiliaryResampling",
     "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
     "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
 }

@@ -17,6 +17,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_intrinsics
 from posefilter.cli.results import write_json
+from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import FolderVideo, SceneVideo, Video, VideoFrame, list_groups
 from posefilter.errors import UserError
@@ -26,8 +27,7 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import check_viewer
 from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
-from posefilter.meshes.store import MeshStore
-from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
+from posefilter.metrics.bop_results import PoseRow, choose_score, to_native, write_poses_csv
 from posefilter.tracking.motion import RandomWalk
 from posefilter.tracking.records import (
     TrackRow,
@@ -61,10 +61,8 @@ def track(job: Job) -> None:
     settings = make_settings(cfg.tracker)
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     videos, native = open_videos(cfg, estimator.objects)
-    store = MeshStore(cfg.meshes, scale=cfg.mesh_scale) if cfg.meshes else None
-    shapes: dict[str, Shape] = {
-        model.name: store.load(model.name) if store else model.hull for model in estimator.models
-    }
+    store = open_shapes(cfg, estimator.objects)
+    shapes = {model.name: load_shape(store, model) for model in estimator.models}
     folder.mkdir(parents=True, exist_ok=True)
     rows: list[TrackRow] = []
     broken: UserError | KeyboardInterrupt | None = None
@@ -275,8 +273,8 @@ def _is_scene(group: str, scene: Any) -> bool:
 def to_pose_row(row: TrackRow, native_from_mesh: Any) -> PoseRow:
     """Return a row of the results file, in the dataset's own object frame."""
     pose = to_native(row.result.pose, native_from_mesh(row.result.object))
-    score, seconds = row.result.score, row.result.seconds
-    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, seconds)
+    score = choose_score(row.result.probability, row.result.score)
+    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, row.result.seconds)
 
 
 def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:

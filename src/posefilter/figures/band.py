@@ -72,7 +72,7 @@ def find_band(cover: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
 
 def draw_band(
     rgb: Any,
-    K: Any,
+    intrinsics: Any,
     poses: np.ndarray,
     weights: np.ndarray,
     shape: Shape,
@@ -85,7 +85,7 @@ def draw_band(
 
     Args:
         rgb: One image, in any form that `Estimator.predict` takes.
-        K: (3, 3) [px].
+        intrinsics: Its camera matrix (3, 3) [px].
         poses: (N, 4, 4) camera_from_object [m].
         weights: (N,) that sum to 1.
         shape: A mesh, or the vertices of a convex hull.
@@ -100,7 +100,7 @@ def draw_band(
     Raises:
         UserError: The image or the camera matrix is not as it should be.
     """
-    rgb, K = to_picture(rgb), to_camera(K)
+    rgb, K = to_picture(rgb), to_camera(intrinsics)
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     picture = view.show(rgb)
     cover = measure_cover(poses, weights, shape, K, view)

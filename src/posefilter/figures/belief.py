@@ -53,10 +53,10 @@ class Mark(NamedTuple):
 
 
 def draw_belief(
+    rgb: Any,
+    intrinsics: Any,
     belief: Belief | BeliefTensors,
     model: ObjectModel,
-    rgb: Any,
-    K: Any,
     truth: Any = None,
     title: str = "",
     axis: int | None = None,
@@ -64,12 +64,12 @@ def draw_belief(
     """Draw the belief of one image: its rotations on a map, its centers on the photograph, and six
     marginals.
 
-    belief: a result's, whose heaviest mode is then the estimate, or a filter's tensors of one
-    image, with their leading dimension of 1 or without; rgb: one image in any form that
-    `Estimator.predict` takes; K (3, 3) [px]; truth (4, 4); axis: the object's axis on the map (its
+    rgb: one image in any form that `Estimator.predict` takes; intrinsics (3, 3) [px]; belief: a
+    result's, whose heaviest mode is then the estimate, or a filter's tensors of one image, with
+    their leading dimension of 1 or without; truth (4, 4); axis: the object's axis on the map (its
     longest, if None). Raises UserError where one is not as it should be.
     """
-    rgb, K = to_picture(rgb), to_camera(K)
+    rgb, K = to_picture(rgb), to_camera(intrinsics)
     poses, weights, best = select_single(belief)
     true = None if truth is None else torch.from_numpy(to_pose(truth))
     axis = find_longest_axis(model) if axis is None else axis

@@ -28,7 +28,7 @@ class Drawn(NamedTuple):
 
 def draw_detections(
     rgb: np.ndarray,
-    K: np.ndarray,
+    intrinsics: np.ndarray,
     detections: Sequence[Drawn],
     absent: Sequence[str] = (),
     width: int = WIDTH,
@@ -38,7 +38,7 @@ def draw_detections(
 
     Args:
         rgb: (H, W, 3) uint8.
-        K: (3, 3) [px].
+        intrinsics: Its camera matrix (3, 3) [px].
         detections: What is drawn.
         absent: Names that the legend says are not in the image.
         width: Of the result at least [px].
@@ -48,7 +48,7 @@ def draw_detections(
         The picture (h, w, 3) uint8, with the legend below.
     """
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
-    picture, shown = view.show(rgb), view.camera(K)
+    picture, shown = view.show(rgb), view.camera(intrinsics)
     colors = pick_colors(len(detections))
     for i in sorted(range(len(detections)), key=lambda i: -detections[i].pose[2, 3]):
         one, pose = detections[i], np.asarray(detections[i].pose, np.float64)

@@ -33,7 +33,7 @@ _NEAR = 0.01  # [m]; what is nearer to the camera's plane is not drawn
 
 def draw_overlay(
     rgb: Any,
-    K: Any,
+    intrinsics: Any,
     pose: Any,
     shape: Shape,
     color: Color = ESTIMATE,
@@ -46,15 +46,15 @@ def draw_overlay(
     """Draw where a pose puts the object, and where the truth does; caption and legend are on a row
     below the photograph.
 
-    rgb: one image in any form that `Estimator.predict` takes; K (3, 3) [px]; pose, truth: (4, 4)
-    camera_from_object [m], None where there is none; width: of the result at least [px]; dashed:
-    the pose is not sure. -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W). Raises
-    UserError where one is not as it should be.
+    rgb: one image in any form that `Estimator.predict` takes; intrinsics (3, 3) [px]; pose, truth:
+    (4, 4) camera_from_object [m], None where there is none; width: of the result at least [px];
+    dashed: the pose is not sure. -> (s H + row, s W, 3) uint8, enlarged by s = max(1, width / W).
+    Raises UserError where one is not as it should be.
     """
     rgb = to_picture(rgb)
     view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
     drawn = np.full((4, 4), np.nan) if pose is None else pose  # which draws nothing
-    picture = draw_poses(rgb, K, drawn, shape, view, color, truth, dashed=dashed)
+    picture = draw_poses(rgb, intrinsics, drawn, shape, view, color, truth, dashed=dashed)
     entries = [] if pose is None else [(label, color), *list_axes()]
     return np.concatenate(
         [
@@ -70,7 +70,7 @@ def draw_overlay(
 
 def draw_poses(
     rgb: Any,
-    K: Any,
+    intrinsics: Any,
     pose: Any,
     shape: Shape,
     view: View | None = None,
@@ -88,7 +88,7 @@ def draw_poses(
     rgb = to_picture(rgb)
     view = view or full_view(rgb.shape[0], rgb.shape[1], max(WIDTH, rgb.shape[1]))
     picture = view.show(rgb)
-    shown = view.camera(to_camera(K))
+    shown = view.camera(to_camera(intrinsics))
     if truth is not None:
         draw_pose(picture, shown, to_pose(truth), shape, TRUTH, coarse=coarse)
     draw_pose(picture, shown, to_pose(pose), shape, color, coarse=coarse, dashed=dashed)

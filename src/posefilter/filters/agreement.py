@@ -50,6 +50,10 @@ class Agreement:
     """
 
     requires: ClassVar[Capabilities] = ("pose", "surface_points")
+    score_is: ClassVar[str] = (
+        "share of the particles' likelihood whose surface points agree with the estimate, times "
+        "the highest likelihood of a particle; no probability"
+    )
 
     def __init__(
         self,

@@ -3,12 +3,19 @@
 The belief always holds all particles with their weights.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Generator, Tensor
 
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene, Space
 from posefilter.types import Belief, ParticleOutput, Particles
+
+_KERNEL_MASS = (
+    "log of the weight of all particles, each by its kernel at the estimate: at most 0; no "
+    "probability"
+)
 
 
 def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor) -> Belief:
@@ -23,6 +30,10 @@ class Argmax:
 
     The score is its log-likelihood.
     """
+
+    score_is: ClassVar[str] = (
+        "log-likelihood of the estimate, up to a constant of the image; no probability"
+    )
 
     def __call__(
         self,
@@ -43,6 +54,11 @@ class Mean:
     the object's frame. Between two distant modes the mean is a pose of low probability: see
     DensestMode.
     """
+
+    score_is: ClassVar[str] = (
+        "weighted mean of the particles' log-likelihoods, up to a constant of the image; no "
+        "probability"
+    )
 
     def __call__(
         self,
@@ -98,6 +114,8 @@ class DensestMode:
             [px]).
     """
 
+    score_is: ClassVar[str] = _KERNEL_MASS
+
     def __init__(self, bandwidth: float) -> None:
         self.bandwidth = bandwidth
 
@@ -120,12 +138,14 @@ class DensestPose:
     """The particle's pose of highest kernel density among poses, for particles of any space.
 
     Particles that are pixels can predict one pose from distant positions; this estimate compares
-    the predicted poses, not the pixels.
+    the predicted poses, not the pixels. The score is the log of the kernel mass.
 
     Args:
         bandwidth: Of the Gaussian kernel [m].
         radius: Distance at which a rotation counts as the shift that it causes [m].
     """
+
+    score_is: ClassVar[str] = _KERNEL_MASS
 
     def __init__(self, bandwidth: float, radius: float = 0.1) -> None:
         self.bandwidth, self.space = bandwidth, PoseSpace((0.0, 0.0, 0.0), radius)

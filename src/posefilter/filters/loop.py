@@ -31,7 +31,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.guided import bind_to_scene
+from posefilter.filters.auxiliary import bind_to_scene
 from posefilter.protocols import (
     Estimate,
     Initialize,
@@ -61,7 +61,7 @@ class ParticleFilter(nn.Module):
         resample: Draws ancestors.
         propagate: Moves the resampled states.
         estimate: Chooses one pose of the last particles.
-        refine: Improves the estimate.
+        refine: Improves the estimate, or replaces the particles.
         first_particles: Number of particles at the first step; `particles` if None.
 
     Raises:
@@ -92,6 +92,14 @@ class ParticleFilter(nn.Module):
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
         self.estimate, self.refine = estimate, refine
+
+    @property
+    def score_is(self) -> str:
+        """What the belief's score is, in words: as the refinement says, or else the estimate."""
+        for component in (self.refine, self.estimate):
+            if said := getattr(component, "score_is", ""):
+                return str(said)
+        return f"as {type(self.estimate).__name__} defines it"
 
     def forward(self, batch: Batch, method: Method, generator: Generator) -> Trace:
         """Run the filter on B images at once, each independent of the others.

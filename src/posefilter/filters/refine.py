@@ -1,4 +1,4 @@
-"""Refinement of the estimate: rescoring particles, mean shift, gradient ascent."""
+"""Refinements of the estimate: rescoring particles, mean shift, gradient ascent; particles stay."""
 
 from collections.abc import Iterable
 from typing import ClassVar
@@ -10,6 +10,11 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Method, Refine, Scene, ScoresPoses
 from posefilter.types import Belief
+
+_RESCORED = (
+    "log-likelihood of the refined estimate, up to a constant of the image and of its image "
+    "points; no probability"
+)
 
 
 class NoRefine:
@@ -27,6 +32,12 @@ class Chain:
 
     def __init__(self, components: Iterable[Refine]) -> None:
         self.components = list(components)
+
+    @property
+    def score_is(self) -> str:
+        """What the last refinement that scores anew says; empty where none does."""
+        said = [getattr(one, "score_is", "") for one in self.components]
+        return next(filter(None, reversed(said)), "")
 
     def __call__(
         self, belief: Belief, scene: Scene, method: Method, generator: Generator
@@ -72,6 +83,7 @@ class Rescore:
     """
 
     requires: ClassVar[Capabilities] = ("score_poses",)
+    score_is: ClassVar[str] = _RESCORED
 
     def __init__(self, top_k: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
         self.top_k, self.pixels, self.sigma = top_k, pixels, sigma
@@ -106,6 +118,7 @@ class MeanShift:
     """
 
     requires: ClassVar[Capabilities] = ("score_poses",)
+    score_is: ClassVar[str] = _RESCORED
 
     def __init__(
         self,
@@ -163,6 +176,7 @@ class Gradient:
     """
 
     requires: ClassVar[Capabilities] = ("score_poses",)
+    score_is: ClassVar[str] = _RESCORED
 
     def __init__(
         self,

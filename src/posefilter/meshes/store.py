@@ -80,7 +80,8 @@ class MeshStore:
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UserError(
                 f"no mesh named '{name}' in {self.root}; there are {', '.join(self.names())}; "
-                f"other meshes: data.meshes=DIR (generate, check_data, predict: meshes=DIR){hint}"
+                f"other meshes: data.meshes=DIR (generate, check_data, predict, track: "
+                f"meshes=DIR){hint}"
             )
         if str(self.root) == BUILTIN:
             mesh = builtin.build(name)
@@ -199,5 +200,5 @@ def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     value = f"{scale * factor:g}"
     raise UserError(
         f"{path}: {across:.3g} m across: the mesh is probably in {unit}; give "
-        f"data.mesh_scale={value} (generate, check_data, predict: mesh_scale={value})"
+        f"data.mesh_scale={value} (generate, check_data, predict, track: mesh_scale={value})"
     )

@@ -3,6 +3,7 @@ estimate (<https://bop.felk.cvut.cz/challenges>, "Formats").
 """
 
 import csv
+import math
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -25,6 +26,17 @@ class PoseRow(NamedTuple):
     score: float
     camera_from_native: np.ndarray  # (4, 4) float64 [m]
     seconds: float  # -1 where unknown, as BOP has it
+
+
+def choose_score(probability: float | None, score: float) -> float:
+    """Return the score of a line: the calibrated probability that the object is there and the pose
+    right; where there is none (None or NaN), the estimator's own score.
+
+    A file of calibrated methods alone, or of one method that is not, ranks across images and
+    objects as BOP has it; scores of methods that are not calibrated compare in one image only.
+    """
+    known = probability is not None and math.isfinite(probability)
+    return float(probability if known else score)  # type: ignore[arg-type]
 
 
 def to_native(camera_from_object: np.ndarray, native_from_mesh: np.ndarray) -> np.ndarray:

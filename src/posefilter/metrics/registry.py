@@ -155,7 +155,7 @@ _METRICS = (
     ),
     MetricInfo(
         "belief/entropy",
-        "entropy",
+        "entropy of the weights",
         "nat",
         ".2f",
         meaning="of the weights: 0 where one particle has all the weight",

@@ -15,19 +15,19 @@ TAUS = tuple(0.05 * i for i in range(1, 11))  # diameters by which a pixel may b
 VSD_THRESHOLDS = TAUS  # shares of the pixels, below which an error counts as correct
 
 
-def to_distance(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
+def to_distance(depth: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
     """Return the distance of each pixel's point from the camera's center.
 
     Args:
         depth: (H, W) z-depth [m], 0 where unknown.
-        K: (3, 3) camera matrix [px].
+        intrinsics: (3, 3) camera matrix [px].
 
     Returns:
         (H, W) float64 [m], 0 where unknown.
     """
     height, width = depth.shape
-    x = (np.arange(width) - K[0, 2]) / K[0, 0]
-    y = (np.arange(height) - K[1, 2]) / K[1, 1]
+    x = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (np.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
     return depth * np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)
 
 
@@ -35,7 +35,7 @@ def vsd(
     estimate: np.ndarray,
     truth: np.ndarray,
     measured: np.ndarray,
-    K: np.ndarray,
+    intrinsics: np.ndarray,
     diameter: float,
     taus: Sequence[float] = TAUS,
     delta: float = DELTA,
@@ -46,7 +46,7 @@ def vsd(
         estimate: (H, W) depth of the object alone, rendered at the estimated pose [m], 0 elsewhere.
         truth: The same at the true pose.
         measured: (H, W) depth of the image [m], 0 where unknown.
-        K: (3, 3) camera matrix [px].
+        intrinsics: (3, 3) camera matrix [px].
         diameter: The object's diameter [m].
         taus: Misalignments of a pixel that count as wrong, in diameters.
         delta: Tolerance of visibility [m].
@@ -54,7 +54,7 @@ def vsd(
     Returns:
         (T,) in [0, 1], for each of `taus`; 1 where nothing is visible of either.
     """
-    there, guess, seen = (to_distance(d, K) for d in (truth, estimate, measured))
+    there, guess, seen = (to_distance(d, intrinsics) for d in (truth, estimate, measured))
     visible = _is_visible(there, seen, delta)
     claimed = _is_visible(guess, seen, delta) | (visible & (guess > 0))
     both, either = visible & claimed, int((visible | claimed).sum())

@@ -316,7 +316,7 @@ class PoseEstimator(Module):
             raise FloatingPointError(
                 f"the gradient of {', '.join(skipped)} was not finite in {_PATIENCE} steps in a "
                 "row: in a roll-out it can grow with each step; choose model.detach_position=true "
-                "or model/train_rollout=truncated (image space), or fewer filter.steps"
+                "or model/train_rollout=short (image space), or fewer filter.steps"
             )
 
     # -- validation and test ----------------------------------------------------------------------

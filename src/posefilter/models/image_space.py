@@ -313,7 +313,7 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
         raise UserError(
             f"{name}.first_particles={rolled.first_particles}: a training needs as many as "
             f"{name}.particles={rolled.particles}; choose {name}.first_particles=null or "
-            f"model/train_rollout=truncated (evaluate.py takes any)"
+            f"model/train_rollout=short (evaluate.py takes any)"
         )
 
 

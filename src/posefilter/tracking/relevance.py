@@ -5,7 +5,7 @@ from torch import Tensor
 
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_depth
-from posefilter.filters.guided import gather_relevance
+from posefilter.filters.auxiliary import gather_relevance
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
 from posefilter.models.base import PoseEstimator

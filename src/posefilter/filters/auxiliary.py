@@ -1,4 +1,4 @@
-"""Resampling guided by a predicted relevance map (the paper, section 6, idea 4)."""
+"""Auxiliary resampling by a predicted relevance map (the paper, section 6, idea 4)."""
 
 from typing import ClassVar
 
@@ -31,17 +31,20 @@ def gather_relevance(relevance: Tensor, state: Tensor, height: int, width: int) 
 
 
 def bind_to_scene(resample: Resample, scene: Scene, batch: Batch) -> Resample:
-    """Return the resampler bound to these images if it is Guided, else the resampler itself."""
-    return resample.bind(scene, *batch.rgb.shape[-2:]) if isinstance(resample, Guided) else resample
+    """Return the resampler bound to these images if it is auxiliary, else as it is."""
+    if isinstance(resample, AuxiliaryResampling):
+        return resample.bind(scene, *batch.rgb.shape[-2:])
+    return resample
 
 
-class Guided:
+class AuxiliaryResampling:
     """Draw ancestors by weight x relevance, and correct the weights by 1 / relevance.
 
-    The first stage of an auxiliary particle filter (Pitt and Shephard 1999). The weighted
-    distribution is unchanged: relevant regions get more children, each of less weight. This holds
-    where weights are carried on (filter/reweight=likelihood_ratio, sequential_bayes). The choice
-    current_likelihood discards them, so there it only concentrates the search.
+    The first stage of an auxiliary particle filter (Pitt and Shephard 1999), with the relevance as
+    its auxiliary function. The weighted distribution is unchanged: relevant regions get more
+    children, each of less weight. This holds where weights are carried on
+    (filter/reweight=likelihood_ratio, sequential_bayes). The choice current_likelihood discards
+    them, so there it only concentrates the search.
 
     Args:
         resampler: The scheme that draws the ancestors.
@@ -72,9 +75,8 @@ class Guided:
         """
         if not isinstance(scene, HasRelevance):
             raise UserError(
-                "filter/resample=guided: the method makes no map of relevance; choose an encoder "
-                "that "
-                "does, such as unet"
+                "filter/resample=auxiliary: the method makes no map of relevance; choose an "
+                "encoder that does, such as unet"
             )
         relevance = scene.relevance.detach()
 
@@ -82,34 +84,34 @@ class Guided:
             particles: Particles, count: int, space: Space, generator: Generator
         ) -> Resampled:
             values = gather_relevance(relevance, particles.state, height, width)
-            preference = values.clamp_min(self.floor).log()
-            return self.draw(particles, preference, count, space, generator)
+            log_auxiliary = values.clamp_min(self.floor).log()
+            return self.draw(particles, log_auxiliary, count, space, generator)
 
         return resample
 
     def draw(
         self,
         particles: Particles,
-        preference: Tensor,
+        log_auxiliary: Tensor,
         count: int,
         space: Space,
         generator: Generator,
     ) -> Resampled:
-        """Return children drawn by weight x exp(preference).  preference (B, M)."""
-        log_weights = torch.log_softmax(particles.log_weights + preference, dim=1)
+        """Return children drawn by weight x the auxiliary function, whose log is (B, M)."""
+        log_weights = torch.log_softmax(particles.log_weights + log_auxiliary, dim=1)
         resampled = self.resampler(
             particles._replace(log_weights=log_weights), count, space, generator
         )
         if resampled.shares is not None:
             raise UserError(
-                "filter/resample=guided needs a resampler whose children have one ancestor "
+                "filter/resample=auxiliary needs a resampler whose children have one ancestor "
                 "each; choose systematic"
             )
-        log_weights = resampled.log_weights - preference.gather(1, resampled.ancestors)
+        log_weights = resampled.log_weights - log_auxiliary.gather(1, resampled.ancestors)
         return resampled._replace(log_weights=torch.log_softmax(log_weights, dim=1))
 
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
         """Raise UserError: the relevance is known only after `bind`."""
-        raise UserError("filter/resample=guided must be bound to a scene before it draws")
+        raise UserError("filter/resample=auxiliary must be bound to a scene before it draws")

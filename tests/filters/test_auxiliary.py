@@ -1,10 +1,10 @@
-"""Resampling guided by relevance moves children, not the belief."""
+"""Auxiliary weights of relevance move children, not the belief."""
 
 import pytest
 import torch
 
 from posefilter.errors import UserError
-from posefilter.filters.guided import Guided, gather_relevance
+from posefilter.filters.auxiliary import AuxiliaryResampling, gather_relevance
 from posefilter.filters.resample import Systematic
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.types import Particles
@@ -28,14 +28,14 @@ def test_sampling_takes_the_cell_under_the_particle() -> None:
     assert gather_relevance(relevance, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
 
 
-def test_guided_resampling_keeps_the_weighted_mean_and_prefers_relevant_particles() -> None:
+def test_auxiliary_resampling_keeps_the_weighted_mean_and_prefers_relevant_particles() -> None:
     particles = cloud_of(40, 0)
     relevance = torch.full((2, 1, 6, 8), 0.1)
     relevance[..., :4] = 1.0  # the left half
-    guided = Guided(Systematic()).bind(Relevant(relevance), 60, 80)
+    draw = AuxiliaryResampling(Systematic()).bind(Relevant(relevance), 60, 80)
     truth = (particles.log_weights.exp()[..., None] * particles.state).sum(1)
     g = torch.Generator().manual_seed(1)
-    resampled = guided(particles, 20000, PixelSpace(), g)
+    resampled = draw(particles, 20000, PixelSpace(), g)
     picked = particles.state.gather(1, resampled.ancestors[..., None].expand(-1, -1, 2))
     mean = (resampled.log_weights.exp()[..., None] * picked).sum(1)
     torch.testing.assert_close(mean, truth, atol=0.05, rtol=0)
@@ -48,8 +48,8 @@ def test_guided_resampling_keeps_the_weighted_mean_and_prefers_relevant_particle
     )
 
 
-def test_guided_resampling_needs_a_map() -> None:
+def test_auxiliary_resampling_needs_a_map() -> None:
     with pytest.raises(UserError, match="no map of relevance"):
-        Guided(Systematic()).bind(object(), 60, 80)
+        AuxiliaryResampling(Systematic()).bind(object(), 60, 80)
     with pytest.raises(UserError, match="bound"):
-        Guided(Systematic())(cloud_of(4, 0), 4, PixelSpace(), torch.Generator())
+        AuxiliaryResampling(Systematic())(cloud_of(4, 0), 4, PixelSpace(), torch.Generator())

@@ -1,0 +1,53 @@
+"""The meshes that a command draws: of the objects of its checkpoints, in the right unit."""
+
+import math
+from collections.abc import Sequence
+
+from omegaconf import DictConfig
+
+from posefilter.data.readers.registry import default_mesh_scale
+from posefilter.errors import UserError
+from posefilter.figures.overlay import Shape
+from posefilter.meshes.mesh import diameter
+from posefilter.meshes.store import MeshStore
+from posefilter.types import ObjectModel
+
+_SAME = 1.5  # meshes of one object in one unit differ by less
+_UNITS = (1.0, 0.001, 0.01, 0.0254, 1000.0)  # [m]
+
+
+def open_shapes(cfg: DictConfig, objects: Sequence[str]) -> MeshStore | None:
+    """Return the meshes of `meshes=`, in the unit of `mesh_scale=` or the default of datasets; None
+    where none are given.
+    """
+    if not cfg.meshes:
+        return None
+    # of names alone: only BOP's own models are named obj_*
+    scale = default_mesh_scale("bop", objects) if cfg.mesh_scale is None else cfg.mesh_scale
+    return MeshStore(cfg.meshes, scale=scale)
+
+
+def load_shape(store: MeshStore | None, model: ObjectModel) -> Shape:
+    """Return what to draw of an object: its mesh, or the checkpoint's hull where there are none.
+
+    Raises:
+        UserError: There is no mesh of its name, or it is of another size than the checkpoint's
+            object.
+    """
+    if store is None:
+        return model.hull
+    mesh = store.load(model.name)
+    ratio = diameter(mesh.vertices) / model.diameter
+    if 1 / _SAME < ratio < _SAME:
+        return mesh
+    fitting = [
+        f"mesh_scale={unit:g}"
+        for unit in _UNITS
+        if abs(math.log(ratio * unit / store.scale)) < math.log(_SAME)
+    ]
+    cause = f"give {fitting[0]}" if fitting else "is it a mesh of another object?"
+    raise UserError(
+        f"meshes={store.root}: {model.name} is {1000 * ratio * model.diameter:.3g} mm across with "
+        f"mesh_scale={store.scale:g}, and the checkpoint's object "
+        f"{1000 * model.diameter:.0f} mm; {cause}"
+    )
