@@ -93,6 +93,8 @@ def start(
         for name, stream in (("out", 1), ("err", 2)):
             file = os.open(f"{log}.{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(file, stream)
+        # what else may stand here, as pytest's capture, writes to files of its own
+        sys.stdout, sys.stderr = (os.fdopen(n, "w", 1, closefd=False) for n in (1, 2))
         if before is not None:
             before()
         return run_command(command, HOME, list(arguments))

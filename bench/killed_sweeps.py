@@ -79,7 +79,7 @@ def kill_sweep(
     data = make_data(folder / "data", folder / "log")
     common = [*SMALL, f"data.root={data}", f"model={model}", "logger=tensorboard"]
     once = ["trainer.max_steps=1", "-m", "seed=0", f"out={folder / 'warm'}"]
-    warm({"train": [*common, *once, "hydra/hydra_logging=disabled"]})
+    warm({"train": [*common, *once]})
     sweep = [*common, "-m", f"seed=range(0,{jobs // 2})", vary]
     whole, out = folder / "whole", folder / "killed"
     seconds, ended = run_until([*sweep, f"out={whole}"], math.inf, folder / "log")
