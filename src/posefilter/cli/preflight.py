@@ -55,11 +55,15 @@ def check_files(command: str, cfg: DictConfig) -> None:
     if command == "convert_bag":
         _check_bag(cfg)
     if command in ("predict", "export", "calibrate") or (command == "evaluate" and cfg.checkpoint):
-        several = command == "predict" and is_several(cfg.checkpoint)
-        for one in expand_weights(cfg.checkpoint) if several else [cfg.checkpoint]:
-            find_weights(one)
+        if command == "predict":
+            _find_all(cfg.checkpoint)
+        else:
+            find_weights(cfg.checkpoint)
     if command in ("train", "onboard") and cfg.warm_start:
-        _check_start(cfg.warm_start)
+        try:
+            _find_all(cfg.warm_start)
+        except UserError as error:
+            raise UserError(str(error).replace("checkpoint=", "warm_start=")) from error
     if command == "onboard":
         _check_mesh(cfg.mesh)
         more = cfg.settings
@@ -89,9 +93,7 @@ def _check_bag(cfg: DictConfig) -> None:
             raise UserError(f"{key}: is missing; type convert_bag in.mcap out.mcap checkpoint=...")
     if not Path(str(cfg.bag)).exists():
         raise UserError(f"bag={cfg.bag}: no such file")
-    find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
-    for one in find_all:
-        find_weights(one)
+    _find_all(cfg.checkpoint)
     if find_spec("rosbags") is None:
         raise UserError(
             "convert_bag: the package rosbags is missing; pip install 'posefilter[bags]' (in a "
@@ -105,9 +107,7 @@ def _check_video(cfg: DictConfig) -> None:
         raise UserError(f"video={cfg.video}: choose {', '.join(_VIDEOS)}")
     if cfg.on_error not in ("raise", "skip"):
         raise UserError(f"on_error={cfg.on_error}: choose raise or skip")
-    find_all = expand_weights(cfg.checkpoint) if is_several(cfg.checkpoint) else [cfg.checkpoint]
-    for one in find_all:
-        find_weights(one)
+    _find_all(cfg.checkpoint)
     data = cfg.get("data")
     if bool(cfg.frames) == bool(data):
         raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
@@ -158,9 +158,7 @@ def _select(cfg: Any, key: str) -> Any:
     return cfg
 
 
-def _check_start(weights: Any) -> None:
-    try:
-        for one in expand_weights(weights):
-            find_weights(one)
-    except UserError as error:
-        raise UserError(str(error).replace("checkpoint=", "warm_start=")) from error
+def _find_all(weights: Any) -> None:
+    """Raise UserError where a checkpoint of those that a setting stands for is not there."""
+    for one in expand_weights(weights) if is_several(weights) else [weights]:
+        find_weights(one)

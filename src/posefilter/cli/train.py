@@ -72,9 +72,10 @@ def build(job: Job) -> Run:
     method, trainer = build_method(recipe(job)), build_trainer(job)
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
-    method.set_object(data.object_model(0))
+    model = data.object_model(0)
+    method.set_object(model)
     if job.cfg.warm_start:
-        starts = read_starts(job.cfg.warm_start, data.object_model(0).name)
+        starts = read_starts(job.cfg.warm_start, model.name)
         copied, left = warm_start(method, starts)
         log.info(
             "warm start from %s (%d files): %d tensors copied, %d left as drawn",
