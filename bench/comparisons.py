@@ -33,7 +33,7 @@ MODELS = ("dense_coordinates", "keypoints", "patch_pf", "pose_pf")
 GROUPS = ("patch_pf,dense_coordinates", "keypoints", "pose_pf")
 SIZES, MOST = ("50,1000", "200", "100,400"), 1000
 SCENES = "data.generate.frames=1600 data.split={train:0.7,val:0.1,test:0.2}"
-STEPS = "trainer.max_steps=300 trainer.val_check_interval=300 scheduler.warm_up=30"
+STEPS = "trainer.max_steps=300 trainer.val_check_interval=300 scheduler.warmup_steps=30"
 # half of the preset's particles and no mean shift, for time: it changes the test alone
 SMALL = (
     "filter.particles=100 filter.first_particles=200 filter.steps=8 filter/refine=rescore "

@@ -45,10 +45,10 @@ from posefilter.filters.estimate import Argmax
 from posefilter.filters.importance import ImportanceSampling
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
-from posefilter.filters.refine import Chain, NoRefine
+from posefilter.filters.refine import Compose, NoRefine
 from posefilter.filters.resample import Islands, Systematic
 from posefilter.filters.resample_move import ResampleMove
-from posefilter.filters.reweight import Annealed, TemperedSMC
+from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose import make_pose, rotation_of
 from posefilter.geometry.rotation import angle_between, random_rotation
@@ -109,7 +109,7 @@ def make_refine(way: str, particles: int) -> Refine:
         return ImportanceSampling(particles, 3)
     if way.endswith("moved"):
         middle = ImportanceSampling(particles, 1, widening=1.5)
-        return Chain([ResampleMove(4), middle, ResampleMove(8)])
+        return Compose([ResampleMove(4), middle, ResampleMove(8)])
     return NoRefine()
 
 
@@ -133,7 +133,7 @@ def run(posterior: Posterior, particles: int, seed: int, way: str) -> tuple[Beli
         STEPS,
         initialize=start,
         schedule=Geometric(FIRST, LAST),
-        reweight=Annealed() if not way.startswith("tempered") else TemperedSMC(),
+        reweight=CurrentLikelihood() if not way.startswith("tempered") else LikelihoodRatio(),
         resample=Islands(Systematic()) if "islands" in way else Systematic(),
         propagate=Gaussian(0.5),
         estimate=Argmax(),

@@ -15,7 +15,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweight import Sequential
+from posefilter.filters.reweight import SequentialBayes
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.memory import keep_freed_memory
@@ -69,7 +69,7 @@ def run(particles: int, steps: int, seed: int) -> dict[str, Any]:
         steps,
         Around(),
         Constant(task.SHIFT),
-        Sequential(),
+        SequentialBayes(),
         Systematic(),
         Gaussian(1.0),
         Argmax(),

@@ -50,7 +50,7 @@ class PixelFilter:
         count, size = s["first_particles"], np.float32(s["network"])
         if start["kind"] == "uniform":
             return np.float32(rng.random((count, 2))) * size - np.float32(0.5)
-        weight, mix = scene["relevance"], start["uniform_fraction"]
+        weight, mix = scene["objectness"], start["uniform_fraction"]
         weight = (1 - mix) * weight / weight.sum().clip(1e-12) + max(mix, 1e-6) / weight.size
         row, column = np.divmod(draw(weight.ravel(), rng, count), weight.shape[1])
         cell = np.stack([column, row], -1) + rng.random((count, 2))

@@ -60,7 +60,7 @@ class PoseFilter:
 
     def score(self, scene, poses, sigma, points, rng):
         """Log-likelihoods (N,) at a noise level [m], from so many image points."""
-        noise = draw_points(points, self.settings["even_points"], rng)
+        noise = draw_points(points, self.settings["quasi_monte_carlo"], rng)
         given = {"poses": poses, "sigma": np.array(sigma, np.float32), "noise": noise, **scene}
         names = [one.name for one in self.measure.get_inputs()]
         return self.measure.run(None, {name: given[name] for name in names})[0]

@@ -124,12 +124,12 @@ class HasImagePatches(Protocol):
 
 
 @runtime_checkable
-class HasRelevance(Protocol):
-    """A scene with a relevance map; required by `filter/initialize=from_relevance`."""
+class HasObjectness(Protocol):
+    """A scene with an objectness map; required by `filter/initialize=from_objectness`."""
 
     @property
-    def relevance(self) -> Tensor:
-        """The relevance of each cell, (B, 1, h, w) >= 0; cells cover the image evenly."""
+    def objectness(self) -> Tensor:
+        """The objectness of each cell, (B, 1, h, w) >= 0; cells cover the image evenly."""
         ...
 
 

@@ -29,7 +29,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, move_about
@@ -79,7 +79,7 @@ class Told(PoseEstimator):
         pieces = (
             FromProposals(),
             Geometric(0.03, 0.005),
-            Annealed(),
+            CurrentLikelihood(),
             Systematic(),
             Gaussian(0.4),
             Mean(),

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from posefilter.callbacks import time_budget
 from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.errors import UserError
-from posefilter.models.schedules import warm_cosine
+from posefilter.models.schedules import warmup_cosine
 
 
 class Line(LightningModule):
@@ -33,7 +33,7 @@ class Line(LightningModule):
 
     def configure_optimizers(self) -> dict:  # type: ignore[override]
         optimizer = torch.optim.SGD(self.parameters(), lr=1.0)
-        scheduler = warm_cosine(optimizer, self.steps)
+        scheduler = warmup_cosine(optimizer, self.steps)
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
@@ -68,7 +68,7 @@ def test_a_fast_machine_sees_the_schedule_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = run(tmp_path, monkeypatch, 20, TimeBudget(100.0))
-    rise = warm_cosine(torch.optim.SGD(line.parameters(), lr=1.0), 20)
+    rise = warmup_cosine(torch.optim.SGD(line.parameters(), lr=1.0), 20)
     assert len(line.rates) == 20
     assert line.rates == pytest.approx([rise.lr_lambdas[0](step) for step in range(20)])
 

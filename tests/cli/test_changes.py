@@ -11,7 +11,10 @@ from posefilter.errors import UserError
 
 CONF = Path(__file__).parents[2] / "conf"
 TRAINED: dict[str, Any] = {
-    "filter": {"particles": 50, "refine": {"_target_": "Chain", "components": [{"a": 1}, {"b": 2}]}}
+    "filter": {
+        "particles": 50,
+        "refine": {"_target_": "Compose", "components": [{"a": 1}, {"b": 2}]},
+    }
 }
 
 
@@ -23,7 +26,7 @@ def change(typed: str, folder: Path) -> dict[str, Any]:
 
 def test_one_of_a_list_is_changed_and_the_others_stay(tmp_path: Path) -> None:
     found = change("filter.refine.components.1.b=9", tmp_path)["filter"]
-    assert found["refine"] == {"_target_": "Chain", "components": [{"a": 1}, {"b": 9}]}
+    assert found["refine"] == {"_target_": "Compose", "components": [{"a": 1}, {"b": 9}]}
     assert found["particles"] == 50
     assert TRAINED["filter"]["refine"]["components"][1] == {"b": 2}
 

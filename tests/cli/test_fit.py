@@ -70,10 +70,10 @@ def test_what_is_missing_is_what_nobody_provides() -> None:
 
 REFUSED = {
     # which refers to a setting of the methods that see patches
-    "model=pose_pf loss=bce": ("loss=bce does not fit model=pose_pf", "choose loss=contrast"),
-    "model=pose_pf loss=add": ("loss=add does not fit model=pose_pf", "choose loss=contrast"),
-    "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrast"),
-    "model=patch_pf loss=contrast": (
+    "model=pose_pf loss=bce": ("loss=bce does not fit model=pose_pf", "choose loss=contrastive"),
+    "model=pose_pf loss=add": ("loss=add does not fit model=pose_pf", "choose loss=contrastive"),
+    "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrastive"),
+    "model=patch_pf loss=contrastive": (
         "candidate poses",
         "choose loss=add, add_s, balanced_bce, bce, chamfer, chamfer_rgbd, confidence, focal or "
         "offset",

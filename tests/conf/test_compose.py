@@ -169,7 +169,7 @@ MISTAKES = {
     "data=scene": ("data=scene", "scenes"),
     "trainer.max_step=3": ("trainer.max_step", "trainer.max_steps"),
     "experiment=memorise": ("experiment=memorise", "is now experiment=memorize"),
-    "loss=add": ("loss=add", "choose loss=contrast"),
+    "loss=add": ("loss=add", "choose loss=contrastive"),
     "filter.particles=many": ("filter.particles=many: must be a whole number",),
     "filter.particles=0": ("filter.particles=0: must be a whole number, at least 1",),
     "optimizer.lr=fast": ("optimizer.lr=fast: must be a number",),

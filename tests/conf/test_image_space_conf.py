@@ -62,7 +62,7 @@ def step(method: ImageSpace) -> dict[str, torch.Tensor]:
 def test_every_legal_loss_takes_a_step(model: str, loss: str, variant: str, tmp_path: Path) -> None:
     losses = step(build(tmp_path, f"model={model}", f"variant={variant}", f"loss={loss}"))
     assert ("displacement" in losses) == (variant == "working")
-    assert ("relevance" in losses) == (variant == "working")
+    assert ("objectness" in losses) == (variant == "working")
 
 
 @pytest.mark.parametrize("model", KINDS)
@@ -104,7 +104,7 @@ REMEDIES = [
     "model/train_rollout=full",
     "filter/resample=none",
     "filter/resample=auxiliary",
-    "filter/initialize=from_relevance",
+    "filter/initialize=from_objectness",
     "filter/initialize=informed",
     "filter/propagate=learned_and_gaussian",
     "model.glimpse.size=6",

@@ -92,7 +92,7 @@ REFUSED = {
         "filter.particles": (0, 10**9),
         "filter.first_particles": (0,),
         "filter.steps": (0,),
-        "filter.schedule.start": (0, -1, math.nan),
+        "filter.schedule.initial_sigma": (0, -1, math.nan),
         "model.likelihood.width": (0, 10**9),
         "threads": (0, 1_000_000, -1),
         "seed": (-1, 4294967296, 0.5, None),

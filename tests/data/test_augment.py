@@ -10,13 +10,13 @@ from tests.models.toy import SIDE, scenes
 
 from posefilter.data.augmentation import (
     Augment,
-    Blank,
-    Color,
+    ColorJitter,
     Compose,
     DepthNoise,
     PasteOccluder,
+    RandomCrop,
+    RandomErasing,
     RollAndZoom,
-    Window,
 )
 from posefilter.data.frames import Sample
 from posefilter.errors import UserError
@@ -63,11 +63,11 @@ def apply(step: Augment, seed: int, x: Sample | None = None) -> Sample:
     "step",
     [
         RollAndZoom(uniform_roll_probability=1.0),
-        Window((32, 32)),
+        RandomCrop((32, 32)),
         PasteOccluder(1.0),
-        Blank(),
+        RandomErasing(),
         RollAndZoom(zoom=(0.7, 2.2), pivot="object"),
-        Compose([RollAndZoom(), Window((32, 48))]),
+        Compose([RollAndZoom(), RandomCrop((32, 48))]),
     ],
 )
 def test_geometry_stays_true(step: Augment) -> None:
@@ -97,14 +97,14 @@ def test_a_zoom_about_the_object_leaves_its_middle_where_it_is() -> None:
         middles = [np.argwhere(x.mask).mean(0) for x in (off_center, zoomed)]
         return float(np.abs(middles[0] - middles[1]).max())
 
-    off_center = apply(Window((48, 48), uniform_probability=0.0), 2)
+    off_center = apply(RandomCrop((48, 48), uniform_probability=0.0), 2)
     assert shift("object") < 0.5 < 1.0 < shift("center")
     with pytest.raises(UserError, match="pivot=corner"):
         RollAndZoom(pivot="corner")
 
 
 def test_a_window_shifts_the_principal_point() -> None:
-    out = apply(Window((32, 32), uniform_probability=0.0), 0)
+    out = apply(RandomCrop((32, 32), uniform_probability=0.0), 0)
     assert out.rgb.shape == (32, 32, 3)
     assert out.mask.any()
     left, top = sample().intrinsics[:2, 2] - out.intrinsics[:2, 2]
@@ -134,7 +134,7 @@ def test_noise_leaves_holes_alone_and_stays_small() -> None:
 
 
 def test_color_keeps_the_geometry_and_the_same_seed_the_same_image() -> None:
-    a, b, c = apply(Color(), 1), apply(Color(), 1), apply(Color(), 2)
+    a, b, c = apply(ColorJitter(), 1), apply(ColorJitter(), 1), apply(ColorJitter(), 2)
     np.testing.assert_array_equal(a.rgb, b.rgb)
     assert not np.array_equal(a.rgb, c.rgb)
     np.testing.assert_array_equal(a.depth, sample().depth)

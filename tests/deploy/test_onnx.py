@@ -117,7 +117,9 @@ def compare_networks(
             own.center, own.radius, count, draw,
         )  # fmt: skip
         scores = own.score(scene, states, sigma, points, np.random.default_rng(1))
-        noise = poses.draw_points(points, own.settings["even_points"], np.random.default_rng(1))
+        noise = poses.draw_points(
+            points, own.settings["quasi_monte_carlo"], np.random.default_rng(1)
+        )
         tensors = [torch.from_numpy(one) for one in (states, noise)]
         with torch.no_grad():
             same = graphs.measure.network(tensors[0], torch.tensor(sigma), tensors[1], *truth[:5])

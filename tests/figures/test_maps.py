@@ -8,11 +8,11 @@ from posefilter.figures.canvas import TRUTH, full_view
 from posefilter.figures.layout import WIDTH, tile_width
 from posefilter.figures.maps import (
     Proposals,
-    average_relevance,
+    average_objectness,
     draw_heat_map,
+    draw_objectness,
     draw_point_map,
     draw_proposals,
-    draw_relevance,
 )
 
 H, W = 48, 64
@@ -39,20 +39,20 @@ def test_points_have_the_colors_of_their_axes_and_fade_with_doubt() -> None:
     assert picture[5, 25].max() < 40  # surely not the object
 
 
-def test_relevance_is_averaged_over_the_mask() -> None:
-    relevance = np.zeros((6, 8))
-    relevance[2:4, 4:6] = 0.8
-    assert average_relevance(relevance, MASK) == pytest.approx(0.8)
-    assert average_relevance(relevance, ~MASK) == 0
-    assert np.isnan(average_relevance(relevance, np.zeros_like(MASK)))
+def test_objectness_is_averaged_over_the_mask() -> None:
+    objectness = np.zeros((6, 8))
+    objectness[2:4, 4:6] = 0.8
+    assert average_objectness(objectness, MASK) == pytest.approx(0.8)
+    assert average_objectness(objectness, ~MASK) == 0
+    assert np.isnan(average_objectness(objectness, np.zeros_like(MASK)))
 
 
-def test_figure_of_relevance_shows_map_outline_and_both_sets_of_particles() -> None:
-    relevance = np.zeros((6, 8))
-    relevance[2:4, 4:6] = 1.0
+def test_figure_of_objectness_shows_map_outline_and_both_sets_of_particles() -> None:
+    objectness = np.zeros((6, 8))
+    objectness[2:4, 4:6] = 1.0
     weights = np.full(20, 0.05)
     start, end = np.tile([8.0, 8.0], (20, 1)), np.tile([40.0, 24.0], (20, 1))
-    figure = draw_relevance(relevance, RGB, MASK, (start, weights), (end, weights), "relevance")
+    figure = draw_objectness(objectness, RGB, MASK, (start, weights), (end, weights), "objectness")
     assert figure.shape[1] == WIDTH
     green = np.nonzero((figure == TRUTH).all(-1).any(1))[0]
     # of the clouds' photographs, below the map

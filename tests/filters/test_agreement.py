@@ -136,7 +136,7 @@ def test_as_many_fragments_are_considered_as_there_are() -> None:
         torch.zeros(1, 1), torch.zeros(1, 1, 2), torch.eye(4)[None, None], empty, said
     )
     for options, rows in ((1, [1]), (2, [1, 2]), (9, [1, 2, 0])):
-        share, found = Agreement(options=options).list_object_points(
+        share, found = Agreement(top_fragments=options).list_object_points(
             output, torch.zeros(1, 1, 3), torch.zeros(3), 1.0
         )
         torch.testing.assert_close(share[0, 0], log_share[0, 0, rows].exp())

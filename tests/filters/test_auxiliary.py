@@ -1,18 +1,18 @@
-"""Auxiliary weights of relevance move children, not the belief."""
+"""Auxiliary weights of objectness move children, not the belief."""
 
 import pytest
 import torch
 
 from posefilter.errors import UserError
-from posefilter.filters.auxiliary import AuxiliaryResampling, gather_relevance
+from posefilter.filters.auxiliary import AuxiliaryResampling, gather_objectness
 from posefilter.filters.resample import Systematic
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.types import Particles
 
 
 class Relevant:
-    def __init__(self, relevance: torch.Tensor) -> None:
-        self.relevance = relevance
+    def __init__(self, objectness: torch.Tensor) -> None:
+        self.objectness = objectness
 
 
 def cloud_of(N: int, seed: int) -> Particles:
@@ -23,16 +23,16 @@ def cloud_of(N: int, seed: int) -> Particles:
 
 
 def test_sampling_takes_the_cell_under_the_particle() -> None:
-    relevance = torch.arange(6.0).view(1, 1, 2, 3)
+    objectness = torch.arange(6.0).view(1, 1, 2, 3)
     state = torch.tensor([[[-0.5, -0.5], [9.4, 9.4], [9.6, 9.4], [29.0, 19.0], [500.0, -70.0]]])
-    assert gather_relevance(relevance, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
+    assert gather_objectness(objectness, state, 20, 30).tolist() == [[0.0, 0.0, 1.0, 5.0, 2.0]]
 
 
-def test_auxiliary_resampling_keeps_the_weighted_mean_and_prefers_relevant_particles() -> None:
+def test_auxiliary_resampling_keeps_the_weighted_mean_and_prefers_the_object() -> None:
     particles = cloud_of(40, 0)
-    relevance = torch.full((2, 1, 6, 8), 0.1)
-    relevance[..., :4] = 1.0  # the left half
-    draw = AuxiliaryResampling(Systematic()).bind(Relevant(relevance), 60, 80)
+    objectness = torch.full((2, 1, 6, 8), 0.1)
+    objectness[..., :4] = 1.0  # the left half
+    draw = AuxiliaryResampling(Systematic()).bind(Relevant(objectness), 60, 80)
     truth = (particles.log_weights.exp()[..., None] * particles.state).sum(1)
     g = torch.Generator().manual_seed(1)
     resampled = draw(particles, 20000, PixelSpace(), g)
@@ -49,7 +49,7 @@ def test_auxiliary_resampling_keeps_the_weighted_mean_and_prefers_relevant_parti
 
 
 def test_auxiliary_resampling_needs_a_map() -> None:
-    with pytest.raises(UserError, match="no map of relevance"):
+    with pytest.raises(UserError, match="no map of objectness"):
         AuxiliaryResampling(Systematic()).bind(object(), 60, 80)
     with pytest.raises(UserError, match="bound"):
         AuxiliaryResampling(Systematic())(cloud_of(4, 0), 4, PixelSpace(), torch.Generator())

@@ -15,7 +15,7 @@ from posefilter.filters.modes import find_modes, find_pose_modes
 from posefilter.filters.refine import Gradient, MeanShift, Rescore
 from posefilter.filters.resample import BelowESS, Islands, Soft, Systematic
 from posefilter.filters.resample_move import ResampleMove, draw_differences
-from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
+from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.types import Belief, ParticleOutput
@@ -167,7 +167,7 @@ def test_with_few_partners_there_is_no_difference() -> None:
 def test_one_shift_of_one_pair_goes_up() -> None:
     """The mean of a pair by their weights is never on the lower side."""
     method = Hill()
-    shift = MeanShift(iterations=1, antithetic_pairs=1, start=0.01, end=0.01)
+    shift = MeanShift(iterations=1, antithetic_pairs=1, initial_scale=0.01, final_scale=0.01)
     found = shift(belief(4), None, method, Generator().manual_seed(0))  # type: ignore[arg-type]
     assert method.counts == [2, 1]
     assert float(found.best[0, 0, 3]) > 0
@@ -189,7 +189,7 @@ def test_shifts_narrow_from_the_start_to_the_end_by_equal_ratios() -> None:
 
     method = Flat()
     method.spreads = []
-    shift = MeanShift(iterations=3, antithetic_pairs=4000, start=0.016, end=0.004)
+    shift = MeanShift(iterations=3, antithetic_pairs=4000, initial_scale=0.016, final_scale=0.004)
     shift(belief(2), None, method, Generator().manual_seed(0))  # type: ignore[arg-type]
     assert method.spreads == pytest.approx([0.016, 0.008, 0.004], rel=0.05)
 
@@ -251,11 +251,11 @@ def test_only_some_hundreds_of_partners_are_compared() -> None:
 
 
 def test_an_auxiliary_draw_by_hand() -> None:
-    """Relevances of 1 and 0.01, of which the floor makes 0.25: with even weights four of five
+    """Objectnesss of 1 and 0.01, of which the floor makes 0.25: with even weights four of five
     children are of the first, each with a quarter of the weight that one of the second has.
     """
     particles = make_particles(torch.tensor([[[0.0, 0.0], [1.0, 0.0]]]), 0)
-    scene = Relevance(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
+    scene = Objectness(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
     draw = AuxiliaryResampling(Systematic(), floor=0.25).bind(scene, 1, 2)
     new = draw(particles, 10, PIXELS, Generator().manual_seed(0))
     assert int((new.ancestors == 0).sum()) == 8
@@ -268,9 +268,9 @@ def test_an_auxiliary_draw_by_hand() -> None:
             AuxiliaryResampling(Systematic(), floor=floor)
 
 
-class Relevance:
-    def __init__(self, relevance: Tensor) -> None:
-        self.relevance = relevance
+class Objectness:
+    def __init__(self, objectness: Tensor) -> None:
+        self.objectness = objectness
 
 
 def test_a_mean_has_a_score_though_some_likelihood_is_zero() -> None:
@@ -287,8 +287,8 @@ def test_a_mean_has_a_score_though_some_likelihood_is_zero() -> None:
 
 def test_weights_of_three_kinds_by_hand() -> None:
     before, now, then = (torch.tensor([x]) for x in ([-1.0, -2.0], [0.5, 0.25], [0.125, 1.0]))
-    assert Sequential()(before, now, then).tolist() == [[-0.5, -1.75]]
-    assert TemperedSMC()(before, now, then).tolist() == [[-0.625, -2.75]]
-    assert Annealed()(before, now, then)[0].tolist() == pytest.approx(
+    assert SequentialBayes()(before, now, then).tolist() == [[-0.5, -1.75]]
+    assert LikelihoodRatio()(before, now, then).tolist() == [[-0.625, -2.75]]
+    assert CurrentLikelihood()(before, now, then)[0].tolist() == pytest.approx(
         [0.5 - math.log(2), 0.25 - math.log(2)]
     )

@@ -7,8 +7,8 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.filters.initialize import (
     FromDepth,
+    FromObjectness,
     FromProposals,
-    FromRelevance,
     Informed,
     UniformPixels,
     draw_from_depth,
@@ -37,8 +37,8 @@ class Poses:
 
 
 class Map:
-    def __init__(self, relevance: Tensor) -> None:
-        self.relevance = relevance
+    def __init__(self, objectness: Tensor) -> None:
+        self.objectness = objectness
 
 
 def images() -> Batch:
@@ -122,11 +122,11 @@ def test_without_any_depth_poses_start_a_meter_away() -> None:
     torch.testing.assert_close(origin_of(none, CENTER)[..., 2], torch.ones(2, 500))
 
 
-def test_relevance_draws_its_cells_and_little_else() -> None:
+def test_objectness_draws_its_cells_and_little_else() -> None:
     weight = torch.zeros(2, 1, 5, 10)
     weight[0, 0, 1, 7] = 3.0
     weight[1, 0, :, 0] = 0.1
-    state = run(FromRelevance(uniform_fraction=0.2), Pixels(), Map(weight))
+    state = run(FromObjectness(uniform_fraction=0.2), Pixels(), Map(weight))
     in_cell = (
         (state[0] >= torch.tensor([20.5, 3.5])) & (state[0] < torch.tensor([23.5, 7.5]))
     ).all(-1)
@@ -134,7 +134,7 @@ def test_relevance_draws_its_cells_and_little_else() -> None:
     assert float((state[1, :, 0] < 2.5).float().mean()) == pytest.approx(0.8 + 0.2 / 10, abs=0.02)
     chosen = state[0][in_cell]
     torch.testing.assert_close(chosen.mean(0), torch.tensor([22.0, 5.5]), atol=0.1, rtol=0)
-    empty = run(FromRelevance(uniform_fraction=0.0), Pixels(), Map(torch.zeros(2, 1, 5, 10)))
+    empty = run(FromObjectness(uniform_fraction=0.0), Pixels(), Map(torch.zeros(2, 1, 5, 10)))
     assert empty.std(1).min() > 4  # no opinion: everywhere
 
 
@@ -160,9 +160,9 @@ def test_informed_starts_read_the_mask_in_training_only() -> None:
     ("piece", "method", "words"),
     [
         (UniformPixels(), Poses(), "filter/initialize=uniform draws pixels"),
-        (FromRelevance(), Poses(), "filter/initialize=from_relevance draws pixels"),
+        (FromObjectness(), Poses(), "filter/initialize=from_objectness draws pixels"),
         (FromDepth(), Pixels(), "filter/initialize=from_depth draws poses"),
-        (FromRelevance(), Pixels(), "no map of relevance"),
+        (FromObjectness(), Pixels(), "no map of objectness"),
         (FromProposals(), Pixels(), "proposes no poses"),
     ],
 )
@@ -173,7 +173,7 @@ def test_what_does_not_fit_is_refused(piece: Initialize, method: object, words: 
 
 @pytest.mark.parametrize(
     "piece",
-    [UniformPixels(), FromRelevance(), Informed(UniformPixels())],
+    [UniformPixels(), FromObjectness(), Informed(UniformPixels())],
     ids=lambda x: type(x).__name__,
 )
 def test_the_same_generator_draws_the_same(piece: Initialize) -> None:

@@ -9,10 +9,10 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax, Mean
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propagate import Chain, Gaussian, Identity, LearnedDisplacement
+from posefilter.filters.propagate import Compose, Gaussian, Identity, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import BelowESS, NoResampling, Soft, Systematic
-from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
+from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.filters.transport import EnsembleTransform, SampledTransport
 from posefilter.geometry.spaces import PixelSpace
@@ -60,9 +60,9 @@ def build(
     pieces = {
         "initialize": start,
         "schedule": Constant(0.5),
-        "reweight": Sequential(),
+        "reweight": SequentialBayes(),
         "resample": resample or Systematic(),
-        "propagate": Chain([LearnedDisplacement(), Gaussian(0.4)]),
+        "propagate": Compose([LearnedDisplacement(), Gaussian(0.4)]),
         "estimate": Mean(),
         "refine": NoRefine(),
     }
@@ -117,7 +117,7 @@ def test_every_step_is_what_its_words_say() -> None:
     method = Hill(GOALS, pull=0.3)
     filt = build(
         Soft(0.5),
-        reweight=TemperedSMC(),
+        reweight=LikelihoodRatio(),
         propagate=LearnedDisplacement(),
         schedule=Geometric(2.0, 0.5),
     )
@@ -249,7 +249,7 @@ def test_a_dead_filter_says_so(bad: float) -> None:
 
 
 def test_annealed_weights_are_the_last_scores_alone() -> None:
-    trace = build(BelowESS(Systematic(), 0.3), reweight=Annealed(), estimate=Argmax())(
+    trace = build(BelowESS(Systematic(), 0.3), reweight=CurrentLikelihood(), estimate=Argmax())(
         None, Hill(GOALS), Generator().manual_seed(0)
     )
     torch.testing.assert_close(
@@ -267,7 +267,9 @@ def test_copies_of_a_particle_stay_together_until_noise_parts_them() -> None:
         ("alone", [LearnedDisplacement()]),
         ("with noise", [LearnedDisplacement(), Gaussian(1.0)]),
     ):
-        run = build(propagate=Chain(pieces), reweight=Annealed(), schedule=Geometric(6.0, 1.5))
+        run = build(
+            propagate=Compose(pieces), reweight=CurrentLikelihood(), schedule=Geometric(6.0, 1.5)
+        )
         trace = run(None, Hill(GOALS, pull=0.3), Generator().manual_seed(0))
         ends[name] = distinct(trace.particles[-1].state)
     assert (ends["alone"] < 0.5).all()

@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax, DensestMode, DensestPose, Mean, kernel_mass
 from posefilter.filters.propagate import (
     AxisTurns,
-    Chain,
+    Compose,
     Gaussian,
     HalfTurns,
     Identity,
@@ -40,7 +40,7 @@ def test_schedules() -> None:
     assert Constant(3.0)(4) == [3.0] * 4
     assert Geometric(8.0, 1.0)(4) == pytest.approx([8, 4, 2, 1])
     assert Geometric(8.0, 1.0)(1) == [1.0]
-    with pytest.raises(UserError, match="start"):
+    with pytest.raises(UserError, match="initial_sigma"):
         Geometric(0.0, 1.0)
 
 
@@ -71,13 +71,15 @@ def test_learned_displacement_and_chains() -> None:
     )
     assert torch.equal(Identity()(state, displacement, step(1.0), PIXELS, g), state)
     assert torch.equal(
-        Chain([LearnedDisplacement(), LearnedDisplacement()])(
+        Compose([LearnedDisplacement(), LearnedDisplacement()])(
             state, displacement, step(1.0), PIXELS, g
         ),
         2 * displacement,
     )
     again = Generator().manual_seed(0)
-    noisy = Chain([LearnedDisplacement(), Gaussian(1.0)])(state, displacement, step(1.0), PIXELS, g)
+    noisy = Compose([LearnedDisplacement(), Gaussian(1.0)])(
+        state, displacement, step(1.0), PIXELS, g
+    )
     torch.testing.assert_close(
         noisy, displacement + Gaussian(1.0)(state, displacement, step(1.0), PIXELS, again)
     )

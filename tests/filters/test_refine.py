@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.refine import Chain, Gradient, MeanShift, NoRefine, Rescore
+from posefilter.filters.refine import Compose, Gradient, MeanShift, NoRefine, Rescore
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
@@ -118,7 +118,7 @@ def test_images_climb_apart_and_alike() -> None:
 
 def test_a_mean_shift_finds_the_top() -> None:
     method, belief = Peak(), belief_around(0.015)
-    found = MeanShift(iterations=12, antithetic_pairs=200, start=0.02, end=0.01)(
+    found = MeanShift(iterations=12, antithetic_pairs=200, initial_scale=0.02, final_scale=0.01)(
         belief, truth(), method, Generator().manual_seed(0)
     )
     assert off(belief).min() > 0.005
@@ -141,7 +141,7 @@ class Bumpy(Peak):
 
 def test_a_mean_shift_walks_over_the_bumps_that_hold_a_climb() -> None:
     belief = belief_around(0.015)
-    shifted = MeanShift(iterations=12, antithetic_pairs=500, start=0.02, end=0.01)(
+    shifted = MeanShift(iterations=12, antithetic_pairs=500, initial_scale=0.02, final_scale=0.01)(
         belief, truth(), Bumpy(), Generator().manual_seed(0)
     )
     climbed = Gradient(steps=60, lr=1e-3, sigma=0.004)(
@@ -165,7 +165,8 @@ def test_a_mean_shift_on_even_ground_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"iterations": 0}, {"antithetic_pairs": 0}, {"start": 0.005}, {"end": 0.0}]
+    "wrong",
+    [{"iterations": 0}, {"antithetic_pairs": 0}, {"initial_scale": 0.005}, {"final_scale": 0.0}],
 )
 def test_a_mean_shift_to_nowhere_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="mean shift needs"):
@@ -175,7 +176,7 @@ def test_a_mean_shift_to_nowhere_is_refused(wrong: dict[str, float]) -> None:
 def test_chains_and_nothing() -> None:
     belief = belief_around(0.02)
     assert NoRefine()(belief, truth(), Peak(), Generator()) is belief
-    found = Chain([Rescore(), Gradient(steps=60)])(
+    found = Compose([Rescore(), Gradient(steps=60)])(
         belief, truth(), Peak(), Generator().manual_seed(0)
     )
     assert off(found).max() < 0.002

@@ -9,7 +9,7 @@ from posefilter.cli.instantiate import instantiate
 from posefilter.filters.estimate import Argmax, DensestMode
 from posefilter.filters.importance import ImportanceSampling
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.refine import Chain, MeanShift, NoRefine, Rescore
+from posefilter.filters.refine import Compose, MeanShift, NoRefine, Rescore
 
 GROUPS = Path(__file__).parents[2] / "conf" / "filter"
 
@@ -31,9 +31,9 @@ def test_every_estimate_says_what_its_score_is(choice: str) -> None:
 
 def test_a_refinement_that_scores_anew_has_the_last_word() -> None:
     densest = DensestMode(0.01)
-    assert "kernel" in make_filter(densest, Chain([])).score_is
+    assert "kernel" in make_filter(densest, Compose([])).score_is
     assert "kernel" in make_filter(densest, ImportanceSampling()).score_is  # keeps the score
-    refined = make_filter(densest, Chain([Rescore(), MeanShift(), ImportanceSampling()])).score_is
+    refined = make_filter(densest, Compose([Rescore(), MeanShift(), ImportanceSampling()])).score_is
     assert refined == MeanShift.score_is
     assert refined != Argmax.score_is
 

@@ -55,11 +55,11 @@ def test_predicted_points_count_within_a_fifth_of_the_radius() -> None:
 
 def test_what_lies_beside_the_pose_speaks_against_it_where_it_should() -> None:
     alone, more = look(0.05, 0.9), look(0.05, 0.9, beside=50)
-    assert more["explained"] < alone["explained"] - 0.3
-    for name in ("recognized", "glimpsed"):
+    assert more["mask_precision"] < alone["mask_precision"] - 0.3
+    for name in ("mask_recall", "top_objectness"):
         assert abs(more[name] - alone[name]) < 0.01
 
 
 def test_cells_that_the_network_does_not_recognize_are_told_by_their_share() -> None:
-    assert abs(look(0.05, 0.3)["recognized"] - 0.3) < 0.01
-    assert abs(look(0.05, 0.3)["glimpsed"] - 0.3) < 0.01
+    assert abs(look(0.05, 0.3)["mask_recall"] - 0.3) < 0.01
+    assert abs(look(0.05, 0.3)["top_objectness"] - 0.3) < 0.01

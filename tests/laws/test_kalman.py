@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from posefilter.filters.estimate import Mean
 from posefilter.filters.loop import ParticleFilter
-from posefilter.filters.propagate import Chain, Gaussian, LearnedDisplacement
+from posefilter.filters.propagate import Compose, Gaussian, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import (
     BelowESS,
@@ -20,7 +20,7 @@ from posefilter.filters.resample import (
     Stratified,
     Systematic,
 )
-from posefilter.filters.reweight import Annealed, Sequential
+from posefilter.filters.reweight import CurrentLikelihood, SequentialBayes
 from posefilter.filters.schedule import Constant
 from posefilter.filters.transport import EnsembleTransform, SampledTransport
 from posefilter.geometry.spaces import PixelSpace
@@ -87,11 +87,11 @@ def run(
     reweight: Reweight | None = None,
     propagate: Propagate | None = None,
 ) -> Trace:
-    move = propagate or Chain([LearnedDisplacement(), Gaussian(noise_scale=1.0)])
+    move = propagate or Compose([LearnedDisplacement(), Gaussian(noise_scale=1.0)])
     pieces = (
         Start(runs),
         Constant(MOVE),
-        reweight or Sequential(),
+        reweight or SequentialBayes(),
         resample,
         move,
         Mean(),
@@ -180,7 +180,7 @@ class Greedy(Systematic):
         {"resample": Greedy()},
         {"resample": Systematic(), "propagate": LearnedDisplacement()},
         {"resample": Systematic(), "propagate": Gaussian(1.0)},
-        {"resample": BelowESS(Systematic(), 0.05), "reweight": Annealed()},
+        {"resample": BelowESS(Systematic(), 0.05), "reweight": CurrentLikelihood()},
     ],
     ids=["weights forgotten", "greedy draw", "no noise", "no drift", "weights replaced"],
 )

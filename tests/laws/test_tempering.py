@@ -1,5 +1,5 @@
-"""One image's evidence counts once under TemperedSMC, at every level under the others: measured on
-a Gaussian score.
+"""One image's evidence counts once under LikelihoodRatio, at every level under the others: measured
+on a Gaussian score.
 """
 
 import math
@@ -13,7 +13,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import BelowESS, Systematic
-from posefilter.filters.reweight import Annealed, Sequential, TemperedSMC
+from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.protocols import Reweight
@@ -82,7 +82,7 @@ def test_tempered_weights_target_the_last_level_alone(schedule: Constant | Geome
     seen = WIDTH**2 + levels[-1] ** 2
     spread = math.sqrt(prior * seen / (prior + seen))
     mean = PLACE * prior / (prior + seen)
-    trace = run(TemperedSMC(), schedule)
+    trace = run(LikelihoodRatio(), schedule)
     found_mean, found_spread = moments(trace.particles[-1])
     assert found_mean == pytest.approx(mean, abs=0.04 * spread)
     assert found_spread == pytest.approx(spread, rel=0.03)
@@ -94,12 +94,14 @@ def test_tempered_weights_target_the_last_level_alone(schedule: Constant | Geome
     assert float(trace.log_evidence.sum(1).exp().mean().log()) == pytest.approx(exact, abs=0.04)
 
 
-@pytest.mark.parametrize("reweight", [Annealed(), Sequential()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize(
+    "reweight", [CurrentLikelihood(), SequentialBayes()], ids=lambda x: type(x).__name__
+)
 def test_the_others_are_too_sure_of_one_image(reweight: Reweight) -> None:
     schedule = Constant(0.2)
     assert (
         moments(run(reweight, schedule).particles[-1])[1]
-        < 0.85 * moments(run(TemperedSMC(), schedule).particles[-1])[1]
+        < 0.85 * moments(run(LikelihoodRatio(), schedule).particles[-1])[1]
     )
 
 
@@ -107,5 +109,5 @@ def test_measuring_one_image_t_times_narrows_it_by_the_root_of_t() -> None:
     output = torch.randn(4, 50)
     weights = torch.full((4, 50), -math.log(50))
     for _ in range(3):
-        weights = torch.log_softmax(Sequential()(weights, output, output), 1)
+        weights = torch.log_softmax(SequentialBayes()(weights, output, output), 1)
     torch.testing.assert_close(weights, torch.log_softmax(3 * output, 1))

@@ -53,7 +53,7 @@ def test_towards_object_points_at_the_nearest_pixel_or_the_center_within_reach(
     assert inner[0].tolist() == [-5.0, 0.0]
     center = TowardsObject("center")(trace, batch, model)[0, 0]
     assert center.tolist() == [[-5.5, 0.5], [0.5, -0.5]]
-    short = TowardsObject(reach=0.1)(trace, batch, model)[0, 0]
+    short = TowardsObject(max_displacement=0.1)(trace, batch, model)[0, 0]
     torch.testing.assert_close(short[0], f64([-2.0, 0.0]).to(short))
     with pytest.raises(UserError, match="nearest or center"):
         TowardsObject("rim")

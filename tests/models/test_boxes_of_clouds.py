@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from test_image_space import working
 from toy import W, scenes
 
-from posefilter.models.box_heads import SpreadBox, VotedBox
+from posefilter.models.box_heads import QuantileBox, VotedBox
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace
 from posefilter.types import Batch, Trace
@@ -49,7 +49,7 @@ def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
     trace = made(method, batch, places, weights, torch.zeros(7, 4))
 
     def box(quantile: float) -> list[list[float]]:
-        found: list[list[float]] = SpreadBox(size=3, quantile=quantile)(
+        found: list[list[float]] = QuantileBox(size=3, quantile=quantile)(
             trace, batch, method.model
         ).tolist()
         return found

@@ -97,14 +97,14 @@ def test_votes_are_refused_where_the_network_reads_the_latent(
     with pytest.raises(UserError) as refusal:
         images(tmp_path, f"model={model}", f"variant={variant}", "model/box_head=votes")
     one_line(refusal, "model/box_head=votes", "model/box_head=pose or spread")
-    for box_head in ("pose", "spread"):
+    for box_head in ("pose", "quantiles"):
         images(tmp_path, f"model={model}", f"variant={variant}", f"model/box_head={box_head}")
 
 
 def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
-    for legal in ("model/box_head=votes", "model/box_head=spread"):
+    for legal in ("model/box_head=votes", "model/box_head=quantiles"):
         images(tmp_path, "model=cnn_patch", legal)
-    images(tmp_path, "model=cnn_patch", "model/box_head=spread", "model.net.latent_width=0")
+    images(tmp_path, "model=cnn_patch", "model/box_head=quantiles", "model.net.latent_width=0")
     for width in (0, 3):
         with pytest.raises(UserError) as refusal:
             images(
@@ -264,7 +264,7 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
     [
         (
             "model=cnn_patch model/box_head=pose",
-            ("model/box_head=pose", "model=cnn_patch", "model/box_head=spread or votes"),
+            ("model/box_head=pose", "model=cnn_patch", "model/box_head=quantiles or votes"),
         ),
         (
             "model=patch_pf model/pose_head=none loss/aux/pose=none",

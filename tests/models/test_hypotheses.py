@@ -14,7 +14,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Identity
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import NoResampling
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
 from posefilter.losses.belief_maps import BeliefMaps
@@ -40,7 +40,14 @@ def thick() -> ObjectModel:
 
 def make(kind: str, seed: int = 0) -> Hypotheses:
     torch.manual_seed(seed)
-    pieces = (FromProposals(), Constant(0.02), Annealed(), NoResampling(), Identity(), Argmax())
+    pieces = (
+        FromProposals(),
+        Constant(0.02),
+        CurrentLikelihood(),
+        NoResampling(),
+        Identity(),
+        Argmax(),
+    )
     base = {
         "filter": ParticleFilter(64, 1, *pieces, NoRefine()),
         "optimizer": partial(torch.optim.AdamW, lr=3e-3),

@@ -16,19 +16,19 @@ from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.estimate import Argmax
-from posefilter.filters.initialize import FromRelevance, Informed, UniformPixels
+from posefilter.filters.initialize import FromObjectness, Informed, UniformPixels
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import NoResampling, Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject, Quality
 from posefilter.losses.displacement import Chamfer, DirectDisplacement, Sides
 from posefilter.losses.likelihood import BalancedBce, Bce
 from posefilter.losses.pose_loss import Add, Confidence, SurfacePointLoss
-from posefilter.models.box_heads import PoseBox, SpreadBox, VotedBox
+from posefilter.models.box_heads import PoseBox, QuantileBox, VotedBox
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.downsized import Downsized
 from posefilter.models.image_space import ImageSpace
@@ -58,7 +58,7 @@ def run_filter(
 ) -> ParticleFilter:
     pieces = (
         Constant(0.0),
-        Annealed(),
+        CurrentLikelihood(),
         resample or NoResampling(),
         LearnedDisplacement(),
         estimate or Argmax(),
@@ -111,7 +111,7 @@ def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> 
         "encoder": NoContext(),
         "pose_head": NoPose() if detects else AbsoluteQuaternion(),
         "displacement": Unbounded(),
-        "box_head": SpreadBox(size) if detects else PoseBox(),
+        "box_head": QuantileBox(size) if detects else PoseBox(),
         "filter": run_filter(50, steps),
         "loss": Chamfer(size) if detects else Add(),
         "optimizer": partial(torch.optim.Adam, lr=1e-3),
@@ -218,7 +218,7 @@ def test_neither_mask_nor_pose_is_used_in_evaluation() -> None:
     assert torch.equal(a.particles[-1].state, b.particles[-1].state)
 
 
-def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
+def test_particles_start_and_are_resampled_where_the_objectness_is() -> None:
     torch.manual_seed(0)
     method = working(PatchPF, 3)
     teach(method, 40)
@@ -232,10 +232,10 @@ def test_particles_start_and_are_resampled_where_the_relevance_is() -> None:
         return method.compute_metrics()["diagnostics"]["on_object"]
 
     uniform = share(UniformPixels(), NoResampling())
-    assert share(FromRelevance(), NoResampling())[0] > uniform[0] + 0.3
+    assert share(FromObjectness(), NoResampling())[0] > uniform[0] + 0.3
     assert share(UniformPixels(), AuxiliaryResampling(Systematic()))[1] > uniform[1]
-    with pytest.raises(UserError, match="relevance"):
-        paper(PatchPF, 3, filter=run_filter(8, 2, FromRelevance()))
+    with pytest.raises(UserError, match="objectness"):
+        paper(PatchPF, 3, filter=run_filter(8, 2, FromObjectness()))
 
 
 def test_stages_change_the_weights_as_training_proceeds() -> None:

@@ -12,7 +12,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import NoResampling, Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.lookup import nearest_mask_pixel
 from posefilter.geometry.spaces import PixelSpace
@@ -81,7 +81,7 @@ def test_with_true_displacements_every_particle_reaches_the_object(
     pieces = (
         UniformPixels(),
         Constant(0.0),
-        Annealed(),
+        CurrentLikelihood(),
         resample,
         LearnedDisplacement(),
         Argmax(),
@@ -107,7 +107,7 @@ def test_with_mean_displacements_they_drift_together_and_miss() -> None:
     pieces = (
         UniformPixels(),
         Constant(0.0),
-        Annealed(),
+        CurrentLikelihood(),
         NoResampling(),
         LearnedDisplacement(),
         Argmax(),

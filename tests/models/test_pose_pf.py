@@ -13,13 +13,13 @@ from posefilter.filters.estimate import Argmax
 from posefilter.filters.initialize import FromDepth, FromProposals
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
-from posefilter.filters.refine import Chain, Gradient, NoRefine, Rescore
+from posefilter.filters.refine import Compose, Gradient, NoRefine, Rescore
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose import invert
 from posefilter.labels.paper_points import PaperPoints
-from posefilter.losses.contrast import Contrast
+from posefilter.losses.contrastive import Contrastive
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
 from posefilter.models.candidate_samplers import CandidatePoses, LabeledRays, pick_pixels
@@ -38,7 +38,7 @@ def working(initialize: object = None) -> PosePF:
     pieces = (
         start,
         Geometric(0.05, SIGMA[0]),
-        Annealed(),
+        CurrentLikelihood(),
         Systematic(),
         Gaussian(0.4),
         Argmax(),
@@ -46,10 +46,10 @@ def working(initialize: object = None) -> PosePF:
     )
     method = PosePF(
         PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
-        CandidatePoses(candidates_per_kind=6, proposals=4, particles=6, sigma=SIGMA),
+        CandidatePoses(candidates_per_kind=6, proposals=4, particles=6, sigma_range=SIGMA),
         ObjectCoordinateNet((16, 24, 32, 32), fragments=16, features=4),
         filter=ParticleFilter(100, 6, *pieces, first_particles=200),
-        loss=Contrast(),
+        loss=Contrastive(),
         optimizer=partial(torch.optim.AdamW, lr=3e-3),
     )
     method.set_object(square())
@@ -121,7 +121,7 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
     with torch.no_grad():
         scene = trained.encode(batch)
         climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])
-        refined = Chain([Rescore(1, 256, SIGMA[0]), climb])(belief, scene, trained, g)
+        refined = Compose([Rescore(1, 256, SIGMA[0]), climb])(belief, scene, trained, g)
     before, after = (
         add(x, truth, trained.model.points).median() for x in (belief.best, refined.best)
     )

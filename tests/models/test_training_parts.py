@@ -24,7 +24,7 @@ from posefilter.filters.propagate import Identity
 from posefilter.filters.resample import Systematic
 from posefilter.models.base import with_lightning
 from posefilter.models.cnn_patch import CnnPatch
-from posefilter.models.image_space import ImageSpace, relevance_loss
+from posefilter.models.image_space import ImageSpace, objectness_loss
 from posefilter.models.loss_schedule import Stage
 from posefilter.models.patch_pf import PatchPF
 from posefilter.nets.context import ContextMap
@@ -42,12 +42,12 @@ def told(chance: Tensor) -> ContextMap:
 
 
 def loss_and_gradient(seen: ContextMap, mask: Tensor) -> tuple[Tensor, Tensor]:
-    assert seen.relevance is not None
-    loss = relevance_loss(seen, mask)
-    return loss.detach(), torch.autograd.grad(loss.sum(), seen.relevance)[0]
+    assert seen.objectness is not None
+    loss = objectness_loss(seen, mask)
+    return loss.detach(), torch.autograd.grad(loss.sum(), seen.objectness)[0]
 
 
-def test_the_relevances_loss_is_the_mean_of_both_kinds_of_cells_means() -> None:
+def test_the_objectnesss_loss_is_the_mean_of_both_kinds_of_cells_means() -> None:
     mask = torch.zeros(2, 1, 4, 8, dtype=torch.bool)  # 2 x 4 cells of 2 x 2 pixels
     mask[0, 0, 1, 3] = True  # one pixel is enough for a cell: row 0, column 1
     mask[1, 0, :, 2:] = True  # six of the eight cells
@@ -87,7 +87,7 @@ def test_where_one_kind_of_cell_is_missing_the_other_still_counts_half() -> None
     torch.testing.assert_close(gradient, (chance - mask[:, :, ::2, ::2].float()[:, 0]) / 16)
 
 
-def test_the_relevances_loss_and_gradient_stay_finite_however_sure_it_is() -> None:
+def test_the_objectnesss_loss_and_gradient_stay_finite_however_sure_it_is() -> None:
     mask = torch.stack(
         [torch.zeros(1, 4, 8), torch.ones(1, 4, 8), torch.eye(4).repeat(1, 1, 2)]
     ).bool()
@@ -148,16 +148,16 @@ def test_progress_is_the_share_of_the_steps_that_are_done() -> None:
 THREE = {
     0: {"displacement"},
     7: {"displacement"},
-    8: {"loss", "likelihood", "pose", "relevance"},
-    11: {"loss", "likelihood", "pose", "relevance"},
+    8: {"loss", "likelihood", "pose", "objectness"},
+    11: {"loss", "likelihood", "pose", "objectness"},
     12: set(),
     19: set(),
 }
 THREE_MOTION = {
     0: {"loss", "displacement"},
     7: {"loss", "displacement"},
-    8: {"likelihood", "sides", "relevance"},
-    11: {"likelihood", "sides", "relevance"},
+    8: {"likelihood", "sides", "objectness"},
+    11: {"likelihood", "sides", "objectness"},
     12: set(),
     19: set(),
 }
@@ -215,7 +215,7 @@ class Watch(Callback):
         self, trainer: Trainer, method: LightningModule, out: Any, batch: Any, number: int
     ) -> None:
         logged = trainer.callback_metrics
-        names = ("chosen", "displacement", "likelihood", "sides", "relevance")
+        names = ("chosen", "displacement", "likelihood", "sides", "objectness")
         off = {name for name in names if not logged[f"train/loss_{name}"]}
         self.seen.append((self.share, off))
 
@@ -237,7 +237,7 @@ def test_a_training_walks_through_its_stages() -> None:
     )
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
     trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement")), data)
-    first, second = {"chosen", "displacement"}, {"likelihood", "sides", "relevance"}
+    first, second = {"chosen", "displacement"}, {"likelihood", "sides", "objectness"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]
     assert watch.seen == [one for one in want for _ in range(2)]
 

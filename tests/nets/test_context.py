@@ -66,14 +66,14 @@ def test_encoder_learns_where_the_red_square_is(make: Callable[[], nn.Module]) -
         rgb, depth, on = draw()
         said = encoder(rgb, depth, K.expand(4, 3, 3))
         loss = nn.functional.binary_cross_entropy_with_logits(
-            said.relevance, on, pos_weight=torch.tensor(10.0)
+            said.objectness, on, pos_weight=torch.tensor(10.0)
         )
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     rgb, depth, on = draw()
-    relevance = encoder(rgb, depth, K.expand(4, 3, 3)).relevance
-    assert relevance[on > 0].mean() > relevance[on == 0].mean() + 2
+    objectness = encoder(rgb, depth, K.expand(4, 3, 3)).objectness
+    assert objectness[on > 0].mean() > objectness[on == 0].mean() + 2
 
 
 def test_resnet_has_the_parameter_names_and_shapes_of_torchvision() -> None:
@@ -141,7 +141,7 @@ def test_wide_images_are_downsampled_and_sampled_at_the_same_positions(
     depth[:, :, 100, 201] = 0
     wide = intrinsics(300.0, 300.0, 159.5, 119.5)[None]
     torch.manual_seed(0)
-    encoder = ConvEncoder(most_px=192).eval()
+    encoder = ConvEncoder(max_width_px=192).eval()
     small_rgb = torch.nn.functional.avg_pool2d(rgb, 2)
     known = torch.nn.functional.avg_pool2d((depth > 0).float(), 2)
     small_depth = torch.nn.functional.avg_pool2d(depth, 2) / known.clamp_min(1e-6)
@@ -160,9 +160,9 @@ def test_wide_images_are_downsampled_and_sampled_at_the_same_positions(
 
 def test_images_that_are_not_too_wide_keep_their_size() -> None:
     torch.manual_seed(0)
-    bounded, free = ConvEncoder(most_px=160).eval(), ConvEncoder().eval()
+    bounded, free = ConvEncoder(max_width_px=160).eval(), ConvEncoder().eval()
     free.load_state_dict(bounded.state_dict())
     with torch.no_grad():
         assert torch.equal(bounded(*scene(), K).levels[0], free(*scene(), K).levels[0])
-    with pytest.raises(UserError, match=r"model.encoder.most_px=16"):
-        ConvEncoder(most_px=16)
+    with pytest.raises(UserError, match=r"model.encoder.max_width_px=16"):
+        ConvEncoder(max_width_px=16)

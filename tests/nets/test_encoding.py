@@ -35,7 +35,7 @@ def maps(encoder: nn.Module, rgb: Tensor, depth: Tensor) -> list[Tensor]:
     said = encoder(rgb, depth, K.to(rgb).expand(len(rgb), 3, 3))
     if isinstance(encoder, ObjectCoordinateNet):
         return [said.logit[..., None], said.log_share, said.position.flatten(3), said.features]
-    return [said.levels[0].permute(0, 2, 3, 1), said.relevance[..., None]]
+    return [said.levels[0].permute(0, 2, 3, 1), said.objectness[..., None]]
 
 
 @pytest.mark.parametrize(("height", "width"), [(32, 33), (75, 100), (181, 320), (96, 120)])
@@ -97,7 +97,10 @@ def test_geometry_of_an_odd_image_is_that_of_the_even_part_and_a_half_known_rim(
 @pytest.mark.parametrize(
     ("kind", "want"),
     [
-        ("unet", "relevance color enter down4 down8 down16 down32 to16 up16 to8 up8 to4 skip4 up4"),
+        (
+            "unet",
+            "objectness color enter down4 down8 down16 down32 to16 up16 to8 up8 to4 skip4 up4",
+        ),
         ("coordinates", "color enter down4 down8 down16 down32 to16 up16 to8 up8 out"),
     ],
 )

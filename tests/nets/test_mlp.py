@@ -46,7 +46,7 @@ def test_the_displacement_reads_the_logit_or_the_likelihood() -> None:
     torch.manual_seed(0)
     size = {"latent_width": 8, "width": 16, "normalization": "layer"}
     by_logit, by_likelihood = (
-        LatentNet(0, 1, displacement_reads=reads, **size) for reads in ("logit", "likelihood")
+        LatentNet(0, 1, displacement_input=reads, **size) for reads in ("logit", "likelihood")
     )
     by_likelihood.load_state_dict(by_logit.state_dict())
     inputs = torch.rand(1, 3, 4, 1, 1), torch.zeros(1, 3, 0), torch.zeros(1, 3, 8)
@@ -56,7 +56,7 @@ def test_the_displacement_reads_the_logit_or_the_likelihood() -> None:
         torch.testing.assert_close(out.displacement, net.displacement(told))
     assert not torch.equal(by_logit(*inputs).displacement, by_likelihood(*inputs).displacement)
     with pytest.raises(UserError, match="choose logit or likelihood"):
-        LatentNet(0, 1, displacement_reads="odds")
+        LatentNet(0, 1, displacement_input="odds")
 
 
 @pytest.mark.parametrize("kernel", [1, 5])

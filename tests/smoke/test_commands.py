@@ -344,7 +344,7 @@ def test_plain_is_for_machines(
     ("choice", "words"),
     [
         ("filter/initialize=from_depth", "filter/initialize=from_depth.*patch_pf"),
-        ("filter/initialize=from_relevance model/encoder=pyramid", "from_relevance.*patch_pf"),
+        ("filter/initialize=from_objectness model/encoder=pyramid", "from_objectness.*patch_pf"),
         ("filter/resample=auxiliary model/encoder=none", "filter/resample=auxiliary"),
         ("filter/refine=rescore", "refine.*patch_pf"),
     ],

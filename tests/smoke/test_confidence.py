@@ -207,7 +207,7 @@ def test_methods_in_image_space_are_calibrated_too(
     words += [f"absent={without}", "frames=12", f"out={out}", *QUIET]
     assert run_command("calibrate", HOME, words) == 0
     stored = torch.load(out, weights_only=True)["calibration"]
-    assert set(stored["features"]) == {"score", "concentration", "surface", "solid"}
+    assert set(stored["features"]) == {"score", "concentration", "surface", "free_space"}
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     color = cv2.cvtColor(cv2.imread(str(rgb)), cv2.COLOR_BGR2RGB)

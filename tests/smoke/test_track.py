@@ -62,7 +62,7 @@ def test_a_folder_of_pictures_is_tracked(folder: Path, tmp_path: Path) -> None:
     assert run_command("track", HOME, typed) == 0
     lines = [json.loads(line) for line in (out / "poses.jsonl").read_text().splitlines()]
     assert [one["status"] for one in lines] == ["started", "tracked", "tracked", "tracked"]
-    assert lines[2]["relevance"] == 0
+    assert lines[2]["objectness"] == 0
     places = np.array([one["camera_from_object"] for one in lines])[:, :3, 3]
     notes = json.loads(min(SCENE.glob("*.left.json")).read_text())
     truth = np.array(notes["objects"][0]["location"]) / 100

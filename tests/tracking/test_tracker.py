@@ -10,9 +10,9 @@ from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 import posefilter
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.errors import UserError
+from posefilter.tracking.loss_detector import LossDetector
 from posefilter.tracking.motion import RandomWalk
-from posefilter.tracking.settings import Effort, TrackerSettings
-from posefilter.tracking.watch import Watch
+from posefilter.tracking.settings import FrameBudget, TrackerSettings
 
 NONE = np.zeros_like(DEPTH)
 BLACK = np.zeros_like(RGB)
@@ -33,7 +33,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
         assert result.status == ("tracked" if number else "started")
         assert result.found
         assert off(result, pose) < 0.008
-        assert result.relevance > 0.8
+        assert result.objectness > 0.8
         if number:
             assert len(result.belief.weights) < 150 < toy.filter.particles
     assert result.object == "toy"
@@ -116,7 +116,7 @@ def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
 
 
 def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object() -> None:
-    """The calibrated presence tells what the relevance of the pixels does not."""
+    """The calibrated presence tells what the objectness of the pixels does not."""
     toy, estimator = make_toy()
     toy.calibration = Calibration(
         ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
@@ -128,7 +128,7 @@ def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object()
     for number in range(20):
         toy.truth = None if 6 <= number < 12 else pose
         results.append(tracker.update(RGB, DEPTH, K))
-    assert min(one.relevance for one in results[:8]) > 0.8
+    assert min(one.objectness for one in results[:8]) > 0.8
     assert [one.found for one in results[6:12]] == [True] + 5 * [False]
     assert all(one.presence < 0.1 and one.probability < one.presence for one in results[6:12])
     assert any(one.found for one in results[12:15])
@@ -153,14 +153,14 @@ def test_in_doubt_the_network_sees_the_whole_image() -> None:
 
 
 @pytest.mark.parametrize("patience", [1, 3])
-def test_a_watch_counts_frames_in_a_row(patience: int) -> None:
-    watch = Watch(TrackerSettings(patience=patience, lost_below=0.2, found_above=0.6))
-    assert [watch.judge(p)[1] for p in (0.1, 0.5, 0.7)] == ["lost", "lost", "started"]
+def test_a_loss_detector_counts_frames_in_a_row(patience: int) -> None:
+    detector = LossDetector(TrackerSettings(patience=patience, lost_below=0.2, found_above=0.6))
+    assert [detector.judge(p)[1] for p in (0.1, 0.5, 0.7)] == ["lost", "lost", "started"]
     for _ in range(3):  # what is between the bounds, or good, starts the count anew
-        assert [watch.judge(0.1)[1] for _ in range(patience - 1)] == ["tracked"] * (patience - 1)
-        assert watch.judge(0.3) == (True, "tracked")
-    assert [watch.judge(0.1)[1] for _ in range(patience)][-1] == "lost"
-    assert [watch.judge(p) for p in (0.5, 0.7)] == [(False, "lost"), (True, "found")]
+        assert [detector.judge(0.1)[1] for _ in range(patience - 1)] == ["tracked"] * (patience - 1)
+        assert detector.judge(0.3) == (True, "tracked")
+    assert [detector.judge(0.1)[1] for _ in range(patience)][-1] == "lost"
+    assert [detector.judge(p) for p in (0.5, 0.7)] == [(False, "lost"), (True, "found")]
 
 
 def test_one_bad_frame_is_no_loss() -> None:
@@ -173,7 +173,7 @@ def test_one_bad_frame_is_no_loss() -> None:
         assert result.found == (rgb is not BLACK)
         assert off(result, pose) < 0.01
         blank = rgb is BLACK or depth is NONE
-        assert (result.relevance == 0) == blank
+        assert (result.objectness == 0) == blank
         assert (result.verdict == "unsure") == blank
     assert result.status == "found"  # two of them are a loss
 
@@ -245,13 +245,13 @@ def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> 
 
 
 def test_impossible_efforts_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    effort = TrackerSettings().follow
+    budget = TrackerSettings().follow
     with pytest.raises(UserError, match="max_particles=5 is below min_particles=10"):
-        dataclasses.replace(effort, min_particles=10, max_particles=5)
+        dataclasses.replace(budget, min_particles=10, max_particles=5)
     with pytest.raises(UserError, match="noise levels fall"):
-        Effort(10, 20, 0, 2, 0.001, 0.004, 64)
+        FrameBudget(10, 20, 0, 2, 0.001, 0.004, 64)
     toy, estimator = make_toy()
-    monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses", "relevance"))
+    monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses", "objectness"))
     toy.__dict__.pop("capabilities", None)
     with pytest.raises(UserError, match=r"Toy provides no propose_poses; .*model/proposals=dense"):
         posefilter.Tracker(estimator)

@@ -14,7 +14,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import pixel_grid, project
 from posefilter.geometry.pose import origin_of, pose_about
@@ -36,7 +36,7 @@ class ToyScene(NamedTuple):
     """The true pose, and a map of the cells about where it puts the object."""
 
     truth: Tensor | None
-    relevance: Tensor
+    objectness: Tensor
 
 
 class Toy(PoseEstimator):
@@ -47,13 +47,13 @@ class Toy(PoseEstimator):
         "pose_space",
         "score_poses",
         "propose_poses",
-        "relevance",
+        "objectness",
     )
 
     def __init__(self) -> None:
         filter = ParticleFilter(
-            200, 8, FromProposals(), Geometric(0.04, 0.004), Annealed(), Systematic(), Gaussian(),
-            Argmax(), NoRefine(),
+            200, 8, FromProposals(), Geometric(0.04, 0.004), CurrentLikelihood(), Systematic(),
+            Gaussian(), Argmax(), NoRefine(),
         )  # fmt: skip
         super().__init__(filter, loss=unused, optimizer=unused)  # type: ignore[arg-type]
         self.truth: Tensor | None = None

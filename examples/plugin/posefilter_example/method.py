@@ -10,7 +10,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.geometry.lookup import sample
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.models.box_heads import SpreadBox
+from posefilter.models.box_heads import QuantileBox
 from posefilter.types import Batch, ParticleOutput, Particles, Step, Trace
 
 
@@ -46,4 +46,4 @@ class ColorWalk(PoseEstimator):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return where the particles are, (B, 4) [px]."""
-        return SpreadBox(size=9)(trace, batch, self.model)
+        return QuantileBox(size=9)(trace, batch, self.model)

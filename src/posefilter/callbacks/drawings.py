@@ -26,14 +26,14 @@ from posefilter.figures.animation import Animation
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.field import draw_point_field, draw_pose_field
 from posefilter.figures.gif import encode_gif
-from posefilter.figures.maps import draw_proposals, draw_relevance
+from posefilter.figures.maps import draw_objectness, draw_proposals
 from posefilter.figures.overlay import Shape, trace_outline
 from posefilter.figures.particles import draw_iterations, normalize_weights
 from posefilter.figures.silhouettes import draw_silhouettes, outline_hulls, project_hulls
 from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import HasImagePatches, HasRelevance, ProposesPoses, ScoresPoses
+from posefilter.protocols import HasImagePatches, HasObjectness, ProposesPoses, ScoresPoses
 from posefilter.types import Batch, Trace
 
 
@@ -175,16 +175,16 @@ def proposals(o: Occasion) -> Drawn:
 
 
 @needs("pixel_space")
-def relevance(o: Occasion) -> Drawn:
-    """Draw the map of relevance beside where particles started and ended."""
-    if not isinstance(o.scene, HasRelevance):
+def objectness(o: Occasion) -> Drawn:
+    """Draw the map of objectness beside where particles started and ended."""
+    if not isinstance(o.scene, HasObjectness):
         return None
     history = [
         (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
         for c in (o.trace.particles[0], o.trace.particles[-1])
     ]
-    seen = o.scene.relevance[0, 0].detach().float().cpu().numpy()
-    return draw_relevance(seen, o.one.rgb, o.mask(), history[0], history[1], o.title("Relevance"))
+    seen = o.scene.objectness[0, 0].detach().float().cpu().numpy()
+    return draw_objectness(seen, o.one.rgb, o.mask(), history[0], history[1], o.title("Objectness"))
 
 
 @needs("pixel_space")
@@ -246,6 +246,6 @@ DRAWINGS: dict[str, Drawing] = {
     drawing.__name__: drawing
     for drawing in (
         overlays, worst, best, particles, silhouettes, trajectories, glimpses,
-        belief, field, points, proposals, relevance, animation,
+        belief, field, points, proposals, objectness, animation,
     )
 }  # fmt: skip

@@ -22,7 +22,7 @@ GROUPS = {
     "particles": "2_filter", "animation": "2_filter", "trajectories": "2_filter",
     "health": "2_filter",
     "belief": "3_belief",
-    "field": "4_network", "proposals": "4_network", "relevance": "4_network",
+    "field": "4_network", "proposals": "4_network", "objectness": "4_network",
     "glimpses": "4_network",
     "diagnostics": "5_diagnostics",
 }  # fmt: skip

@@ -271,7 +271,7 @@ ABLATIONS = (
         "box_m14_votes",
         "Working, without votes for the box (detectors).",
         "working",
-        ("model/box_head=spread",),
+        ("model/box_head=quantiles",),
     ),
 )
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from posefilter.cli.renamed import find_renamed
+from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
 from posefilter.paths import stays_inside
@@ -42,7 +42,7 @@ LIMITS = {
     "split_seed": 1 << 63,
     "workers": 256,
     "frames": 10_000_000,
-    "warm_up": 10**12,
+    "warmup_steps": 10**12,
     "particles": 100_000,
     "first_particles": 100_000,
 }
@@ -110,9 +110,10 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
         )
     if not all(isinstance(choice, str) and _KEY.fullmatch(choice) for choice in choices.values()):
         raise UserError(f"{said}: its recipe's choices should be names")
-    settings = _without_selects(settings, settings)
+    now = upgrade(recipe)
+    settings = _without_selects(now["settings"], now["settings"])
     _check_expansion(settings, said)
-    return {"choices": dict(choices), "settings": settings}
+    return {"choices": now["choices"], "settings": settings}
 
 
 def without_pretrained(node: Any) -> Any:
@@ -160,7 +161,7 @@ def check_data(data: Mapping[str, Any], typed: Mapping[str, Any]) -> None:
     if data.get("cache") == "disk" and "cache" not in typed:
         raise UserError(
             "data.cache=disk: a checkpoint does not decide where frames are kept; type "
-            "data.cache=disk or latent"
+            "data.cache=disk or memory"
         )
 
 

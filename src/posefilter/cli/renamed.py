@@ -56,7 +56,7 @@ KEYS = {
     "callbacks.figures.without": "callbacks.figures.exclude",
     "most_mb": "max_mb",
     "compact": "quantize",
-    "model.relevance": "model.relevance_weight",
+    "model.relevance": "model.objectness_weight",
     "tracker.walk": "tracker.move_scale",
     "tracker.jump": "tracker.jump_penalty",
     "tracker.epsilon": "tracker.kld_epsilon",
@@ -74,11 +74,25 @@ KEYS = {
     "tracker.follow.most": "tracker.follow.max_particles",
     "tracker.search.least": "tracker.search.min_particles",
     "tracker.search.most": "tracker.search.max_particles",
+    "tracker.fit_points": "tracker.fit_pixels",
+    **{
+        f"tracker.{part}.{old}": f"tracker.{part}.{new}"
+        for part in ("follow", "look", "search")
+        for old, new in (
+            ("start", "initial_sigma"),
+            ("stop", "final_sigma"),
+            ("points", "pixels"),
+        )
+    },
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
 _CHOICES = {
     "filter": {"pose_paper": "pose filter.particles=1000 filter.steps=100"},
     "filter/estimate": {"best": "argmax"},
+    "filter/initialize": {"from_relevance": "from_objectness"},
+    "scheduler": {"warm_cosine": "warmup_cosine"},
+    "loss": {"contrast": "contrastive"},
+    "model/box_head": {"spread": "quantiles"},
     "filter/resample": {
         "never": "none",
         "transport": "optimal_transport_sampled",
@@ -145,23 +159,45 @@ CLASSES = {
     "filters.guided.Guided": "filters.auxiliary.AuxiliaryResampling",
     "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
     "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
+    "filters.initialize.FromRelevance": "filters.initialize.FromObjectness",
+    "filters.propagate.Chain": "filters.propagate.Compose",
+    "filters.refine.Chain": "filters.refine.Compose",
+    "filters.reweight.Annealed": "filters.reweight.CurrentLikelihood",
+    "filters.reweight.Sequential": "filters.reweight.SequentialBayes",
+    "filters.reweight.TemperedSMC": "filters.reweight.LikelihoodRatio",
+    "losses.contrast.Contrast": "losses.contrastive.Contrastive",
+    "models.box_heads.SpreadBox": "models.box_heads.QuantileBox",
+    "models.schedules.warm_cosine": "models.schedules.warmup_cosine",
+    "data.augmentation.Window": "data.augmentation.RandomCrop",
+    "data.augmentation.Blank": "data.augmentation.RandomErasing",
+    "data.augmentation.Color": "data.augmentation.ColorJitter",
 }
-_RELEVANCE = {"relevance": "relevance_weight"}
-# arguments of classes, by the class's place below posefilter
+_OBJECTNESS = {"relevance": "objectness_weight", "relevance_weight": "objectness_weight"}
+# arguments of classes, by today's place of the class below posefilter
 ARGUMENTS = {
-    "filters.propagate.Chain": {"pieces": "components"},
+    "filters.propagate.Compose": {"pieces": "components"},
     "filters.propagate.Gaussian": {"factor": "noise_scale"},
     "filters.propagate.HalfTurns": {"share": "probability"},
     "filters.propagate.AxisTurns": {
         "share": "probability",
         "any_angle": "uniform_angle_probability",
     },
-    "filters.refine.Chain": {"pieces": "components"},
+    "filters.refine.Compose": {"pieces": "components"},
     "filters.refine.Rescore": {"top": "top_k"},
-    "filters.refine.MeanShift": {"rounds": "iterations", "pairs": "antithetic_pairs"},
-    "filters.agreement.Agreement": {"rounds": "iterations"},
+    "filters.refine.MeanShift": {
+        "rounds": "iterations",
+        "pairs": "antithetic_pairs",
+        "start": "initial_scale",
+        "end": "final_scale",
+    },
+    "filters.schedule.Geometric": {"start": "initial_sigma", "stop": "final_sigma"},
+    "filters.agreement.Agreement": {
+        "rounds": "iterations",
+        "options": "top_fragments",
+        "counts": "effective_particles",
+    },
     "filters.initialize.FromDepth": {"behind": "depth_offset"},
-    "filters.initialize.FromRelevance": {"anywhere": "uniform_fraction"},
+    "filters.initialize.FromObjectness": {"anywhere": "uniform_fraction"},
     "filters.initialize.Informed": {
         "otherwise": "initializer",
         "share": "object_fraction",
@@ -171,22 +207,30 @@ ARGUMENTS = {
         "each": "candidates_per_kind",
         "proposed": "proposals",
         "own_level": "persistent_sigma_probability",
+        "sigma": "sigma_range",
+        "start": "initial_sigma",
     },
     "models.candidate_samplers.LabeledRays": {"past": "margin_behind"},
-    "models.box_heads.SpreadBox": {"beyond": "quantile"},
-    "models.cnn_patch.CnnPatch": _RELEVANCE,
-    "models.downsized.Downsized": _RELEVANCE,
-    "models.patch_pf.PatchPF": _RELEVANCE,
-    "models.pixel_pf.PixelPF": _RELEVANCE,
+    "models.box_heads.QuantileBox": {"beyond": "quantile"},
+    "models.cnn_patch.CnnPatch": _OBJECTNESS,
+    "models.downsized.Downsized": _OBJECTNESS,
+    "models.patch_pf.PatchPF": _OBJECTNESS,
+    "models.pixel_pf.PixelPF": _OBJECTNESS,
+    "models.pose_pf.PosePF": {"even_points": "quasi_monte_carlo"},
     "models.muon.Muon": {"spared": "adam_layers"},
+    "models.schedules.warmup_cosine": {"warm_up": "warmup_steps", "floor": "min_lr_fraction"},
+    "nets.context.ConvEncoder": {"most_px": "max_width_px"},
+    "nets.heads.Bounded": {"reach": "max_displacement"},
+    "nets.mlp.LatentNet": {"displacement_reads": "displacement_input"},
+    "labels.displacement.TowardsObject": {"reach": "max_displacement"},
     "nets.paper_likelihood.PaperLikelihood": {"about": "anchor"},
     "losses.displacement.Chamfer": {"most": "max_pixels"},
     "losses.rgbd_chamfer.RgbdChamfer": {"most": "max_pixels"},
     "losses.pose_loss.SurfacePointLoss": {"within": "offset_weight"},
     "labels.paper_points.PaperPoints": {"on": "surface_label", "behind": "behind_label"},
     "data.augmentation.RollAndZoom": {"about": "pivot", "any_roll": "uniform_roll_probability"},
-    "data.augmentation.Window": {"anywhere": "uniform_probability"},
-    "data.augmentation.Blank": {"most": "max_rectangles"},
+    "data.augmentation.RandomCrop": {"anywhere": "uniform_probability"},
+    "data.augmentation.RandomErasing": {"most": "max_rectangles"},
     "callbacks.health.FilterHealth": {"most": "max_iterations", "share": "max_time_fraction"},
     "callbacks.diagnostics.Diagnostics": {"share": "max_time_fraction"},
     "callbacks.figures.Figures": {"share": "max_time_fraction"},
@@ -233,17 +277,41 @@ def _rename_key(key: str) -> str:
 
 
 def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Return the first name of before in a checkpoint's recipe, and today's; None where there is
-    none.
+    """Return the first group or setting of before in a checkpoint's recipe whose values have
+    changed too, and today's name; None where there is none.
 
     Args:
         recipe: Its `choices` and `settings`.
     """
     old = [*recipe.get("choices", ()), *recipe.get("settings", ())]
-    for name in map(str, old):
-        if name in GROUPS or name in KEYS:
-            return name, _rename_key(name)
-    return _find_argument(recipe.get("settings"), "")
+    return next(((n, _rename_key(n)) for n in map(str, old) if n in GROUPS or n in KEYS), None)
+
+
+def upgrade(recipe: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a checkpoint's recipe with today's names of choices, classes and arguments.
+
+    Args:
+        recipe: Its `choices` and `settings`, checked for depth and size.
+    """
+    choices = {
+        group: _CHOICES.get(group, {}).get(choice, choice)
+        for group, choice in recipe["choices"].items()
+    }
+    return {"choices": choices, "settings": _upgrade(recipe["settings"])}
+
+
+def _upgrade(node: Any) -> Any:
+    if isinstance(node, list):
+        return [_upgrade(value) for value in node]
+    if not isinstance(node, Mapping):
+        return node
+    target = rename_class(node.get("_target_")) or node.get("_target_")
+    out = {}
+    for key, value in node.items():
+        name = rename_argument(target, str(key)) or key
+        # both names: the old one is refused when the class is built
+        out[key if name in node else name] = target if key == "_target_" else _upgrade(value)
+    return out
 
 
 def rename_argument(target: object, name: str) -> str | None:
@@ -264,22 +332,3 @@ def rename_class(target: object) -> str | None:
     """
     new = CLASSES.get(str(target).removeprefix("posefilter."))
     return new and f"posefilter.{new}"
-
-
-def _find_argument(node: Any, place: str) -> tuple[str, str] | None:
-    """Return the first class or argument with a name of before in settings, and today's."""
-    if isinstance(node, list):
-        pairs = [(f"{place}[{i}]", value) for i, value in enumerate(node)]
-    elif isinstance(node, Mapping):
-        known = rename_class(node.get("_target_"))
-        if known is not None:
-            return str(node["_target_"]), known
-        for name in map(str, node):
-            new = rename_argument(node.get("_target_"), name)
-            if new is not None:
-                return f"{place}.{name}", new
-        pairs = [(f"{place}.{key}" if place else str(key), value) for key, value in node.items()]
-    else:
-        return None
-    found = (_find_argument(value, at) for at, value in pairs)
-    return next((one for one in found if one is not None), None)

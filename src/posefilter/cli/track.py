@@ -36,7 +36,7 @@ from posefilter.tracking.records import (
     make_row,
     write_rows,
 )
-from posefilter.tracking.settings import Effort, TrackerSettings
+from posefilter.tracking.settings import FrameBudget, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
 
@@ -229,7 +229,7 @@ def make_settings(node: DictConfig) -> TrackerSettings:
             **{
                 **plain,
                 "motion": RandomWalk(**plain["motion"]),
-                **{name: Effort(**plain[name]) for name in ("follow", "look", "search")},
+                **{name: FrameBudget(**plain[name]) for name in ("follow", "look", "search")},
             }
         )
     except TypeError as error:

@@ -40,7 +40,7 @@ _SECTIONS = {
     "track": {
         "data.root": "folder of the dataset, where data= is given",
         "tracker.motion.translation_mm": "how far an object may move between two frames",
-        "tracker.follow.points": "image points of a pose; cost is in proportion",
+        "tracker.follow.pixels": "image points of a pose; cost is in proportion",
         "tracker.smoothing_noise": "smoothing over time [m]",
     },
     "check_data": {"data.root": "folder of the dataset"},

@@ -23,6 +23,12 @@ LIMIT = 3.0  # standard deviations
 COUNTS = ("right", "wrong", "absent")
 _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
 _MOST_GROUPS, _MOST_SCORES = 16, 100_000
+_RENAMED = {  # features, by their names in earlier versions
+    "solid": "free_space",
+    "explained": "mask_precision",
+    "recognized": "mask_recall",
+    "glimpsed": "top_objectness",
+}
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
@@ -137,6 +143,7 @@ def _read(content: Any) -> Calibration:
     good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
     if not good or not all(isinstance(one, str) and _NAME.fullmatch(one) for one in features):
         raise ValueError(f"should name 1 to {_MOST_FEATURES} features")
+    features = [_RENAMED.get(one, one) for one in features]
     if len(set(features)) < len(features):
         raise ValueError("names a feature twice")
     count = len(features)

@@ -55,8 +55,8 @@ def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, T
         model: The object.
 
     Returns:
-        (B,) each. `surface`: the share of the points that agree. `solid`: of those that agree or
-        are seen through, the share that agrees.
+        (B,) each. `surface`: the share of the points that agree. `free_space`: of those that agree
+        or are seen through, the share that agrees.
     """
     points = transform(best, subsample(model.points, _POINTS).to(best))
     pixels = nearest_pixel(project(points, batch.intrinsics))
@@ -67,7 +67,7 @@ def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, T
     agrees = (known & (behind.abs() < tolerance)).float().mean(1)
     through = (known & (behind >= tolerance)).float().mean(1)
     few = 1 / points.shape[1]
-    return {"surface": agrees, "solid": (agrees + few) / (agrees + through + 2 * few)}
+    return {"surface": agrees, "free_space": (agrees + few) / (agrees + through + 2 * few)}
 
 
 def measure_coordinates(
@@ -84,12 +84,12 @@ def measure_coordinates(
         model: The object.
 
     Returns:
-        (B,) each. `explained`: of the cells that the network takes for the object, by its
-        probability, the share that is on it. `recognized`: of the cells that are on the object, the
-        share that the network takes for it. `coordinates`: of the cells that the network takes for
-        the object, the share whose predicted object point is the one that the pose puts there,
-        within a fifth of the radius. `glimpsed`: the mean probability of the cells that the network
-        is surest of, wherever they are.
+        (B,) each. `mask_precision`: of the cells that the network takes for the object, by its
+        probability, the share that is on it. `mask_recall`: of the cells that are on the object,
+        the share that the network takes for it. `coordinates`: of the cells that the network takes
+        for the object, the share whose predicted object point is the one that the pose puts there,
+        within a fifth of the radius. `top_objectness`: the mean probability of the cells that the
+        network is surest of, wherever they are.
     """
     share = torch.sigmoid(coordinates.logit).flatten(1) * cells.valid.flatten(1)
     points = transform(invert(best), cells.point.flatten(1, 2))
@@ -100,8 +100,8 @@ def measure_coordinates(
     error = (predicted - (points - model.center.to(best)) / model.radius).norm(dim=-1)
     total, few = share.sum(1), 0.5  # cells, so that few of them tell little
     return {
-        "explained": (share * on).sum(1) / (total + few),
-        "recognized": (share * on).sum(1) / (on.sum(1) + few),
+        "mask_precision": (share * on).sum(1) / (total + few),
+        "mask_recall": (share * on).sum(1) / (on.sum(1) + few),
         "coordinates": (share * (error < 0.2)).sum(1) / (total + few),
-        "glimpsed": share.topk(min(_CELLS, share.shape[1]), dim=1).values.mean(1),
+        "top_objectness": share.topk(min(_CELLS, share.shape[1]), dim=1).values.mean(1),
     }

@@ -90,7 +90,7 @@ class RollAndZoom:
 
 
 @dataclasses.dataclass(frozen=True)
-class Window:
+class RandomCrop:
     """Cut a window of the image: most show the object, at any place in them; the rest are drawn
     from anywhere.
 
@@ -188,7 +188,7 @@ class PasteOccluder:
 
 
 @dataclasses.dataclass(frozen=True)
-class Blank:
+class RandomErasing:
     """Lose rectangles of depth (holes) or paint rectangles of color (stickers, glare)."""
 
     max_rectangles: int = 5
@@ -231,7 +231,7 @@ class DepthNoise:
 
 
 @dataclasses.dataclass(frozen=True)
-class Color:
+class ColorJitter:
     """Jitter white balance, exposure, gamma, contrast and saturation, blur and add noise; strength
     1 is strong.
     """

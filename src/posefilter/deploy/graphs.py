@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from posefilter.deploy.resizing import Resize
 from posefilter.filters.agreement import Agreement
-from posefilter.models.image_space import ImageScene, ImageSpace, RelevantScene
+from posefilter.models.image_space import ImageScene, ImageSpace, ObjectnessScene
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.context import ContextMap
 from posefilter.nets.coordinates import Context, Coordinates
@@ -138,18 +138,18 @@ class EncodePixelScene(nn.Module):
         method: The trained method.
         resize: From the camera's size to the network's.
         levels: Number of its encoder's maps of features.
-        relevance: Whether its particles are drawn by the encoder's relevance map.
+        objectness: Whether its particles are drawn by the encoder's objectness map.
     """
 
     inputs = ("rgb", "depth", "intrinsics")
 
-    def __init__(self, method: ImageSpace, resize: Resize, levels: int, relevance: bool) -> None:
+    def __init__(self, method: ImageSpace, resize: Resize, levels: int, objectness: bool) -> None:
         super().__init__()
-        self.method, self.resize, self.relevance = method, resize, relevance
+        self.method, self.resize, self.objectness = method, resize, objectness
         self.outputs = (
             *("image", "surface", "network_intrinsics"),
             *(f"features_{number}" for number in range(levels)),
-            *(("relevance",) if relevance else ()),
+            *(("objectness",) if objectness else ()),
         )
 
     def forward(self, rgb: Tensor, depth: Tensor, intrinsics: Tensor) -> tuple[Tensor, ...]:
@@ -163,15 +163,15 @@ class EncodePixelScene(nn.Module):
         Returns:
             For `MeasurePixels`: `image` (4, h, w), `surface` (2, h, w), depth without holes and
             where it was measured; `network_intrinsics` (3, 3) [px]; maps of features.  And
-            `relevance` (h', w'), the probability that each cell shows the object, where particles
+            `objectness` (h', w'), the probability that each cell shows the object, where particles
             are drawn by it.
         """
         scene = self.method.encode(_batch(*self.resize(rgb, depth, intrinsics)))
         kept = [scene.image[0], scene.depth[0], scene.intrinsics[0]]
         kept += [level[0] for level in scene.context.levels]
-        if self.relevance:
-            assert isinstance(scene, RelevantScene)
-            kept.append(scene.relevance[0, 0])
+        if self.objectness:
+            assert isinstance(scene, ObjectnessScene)
+            kept.append(scene.objectness[0, 0])
         return tuple(kept)
 
 

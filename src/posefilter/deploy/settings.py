@@ -35,12 +35,13 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         "particles": own.particles,
         "levels": [float(level) for level in own.schedule(own.steps)],
         "points": method.pixels if isinstance(method, PosePF) else None,
-        "even_points": isinstance(method, PosePF) and method.even_points,
+        "quasi_monte_carlo": isinstance(method, PosePF) and method.quasi_monte_carlo,
         "latent_width": method.latent_width,
         "initialize": _describe_start(own.initialize),
         "resample": _choose(own.resample, "resample", systematic=resample.Systematic,
                             none=resample.NoResampling),
-        "reweight": _choose(own.reweight, "reweight", current_likelihood=reweight.Annealed),
+        "reweight": _choose(own.reweight, "reweight",
+                            current_likelihood=reweight.CurrentLikelihood),
         "propagate": [part for one in _list(own.propagate) for part in _describe_move(one, method)],
         "estimate": _describe_estimate(own.estimate),
         "refine": [part for one in _list(own.refine) for part in _describe_refinement(one)],
@@ -89,8 +90,8 @@ def _choose(component: Any, group: str, **kinds: type) -> str:
 def _describe_start(start: Any) -> dict[str, Any]:
     if isinstance(start, initialize.Informed):  # the truth informs training alone
         start = start.initializer
-    if isinstance(start, initialize.FromRelevance):
-        return {"kind": "from_relevance", "uniform_fraction": start.uniform_fraction}
+    if isinstance(start, initialize.FromObjectness):
+        return {"kind": "from_objectness", "uniform_fraction": start.uniform_fraction}
     known = {"uniform": initialize.UniformPixels, "from_proposals": initialize.FromProposals}
     return {"kind": _choose(start, "initialize", **known)}
 
@@ -120,7 +121,7 @@ def _describe_move(move: Any, method: PoseEstimator) -> list[dict[str, Any]]:
 
 def _describe_estimate(one: Any) -> dict[str, Any]:
     if isinstance(one, Agreement):
-        names = ("scale_m", "hypotheses", "iterations", "counts")
+        names = ("scale_m", "hypotheses", "iterations", "effective_particles")
         return {"kind": "agreement", **{name: getattr(one, name) for name in names}}
     return {"kind": _choose(one, "estimate", argmax=estimate.Argmax)}
 
@@ -132,6 +133,13 @@ def _describe_refinement(one: Any) -> list[dict[str, Any]]:
         names: tuple[str, ...] = ("top_k", "pixels", "sigma")
         return [{"kind": "rescore", **{name: getattr(one, name) for name in names}}]
     if isinstance(one, refine.MeanShift):
-        names = ("iterations", "antithetic_pairs", "start", "end", "sigma", "pixels")
+        names = (
+            "iterations",
+            "antithetic_pairs",
+            "initial_scale",
+            "final_scale",
+            "sigma",
+            "pixels",
+        )
         return [{"kind": "mean_shift", **{name: getattr(one, name) for name in names}}]
     raise _refuse(one, "refine", "mean_shift", "rescore", "none")

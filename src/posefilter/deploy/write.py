@@ -20,7 +20,7 @@ from posefilter.deploy.settings import describe_filter
 from posefilter.errors import UserError
 from posefilter.estimator import get_trained_size
 from posefilter.files import write_whole
-from posefilter.filters.initialize import FromRelevance
+from posefilter.filters.initialize import FromObjectness
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
@@ -130,12 +130,12 @@ def make_graphs(method: PoseEstimator, width: int, height: int) -> Graphs:
 def _find_strides(
     method: ImageSpace, resize: Resize, image: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[tuple[int, ...], bool]:
-    """Return the strides of the encoder's maps, and whether its relevance draws particles."""
+    """Return the strides of the encoder's maps, and whether its objectness draws particles."""
     color, z, K = resize(*image)
     strides = method.encoder(color, z, K).strides
     start = method.filter.initialize
     start = getattr(start, "initializer", start)
-    return strides, isinstance(start, FromRelevance)
+    return strides, isinstance(start, FromObjectness)
 
 
 def trace(graph: Graph) -> torch.export.ExportedProgram:

@@ -131,23 +131,23 @@ def draw_heat_map(
     return np.asarray(0.35 * ground + 0.65 * cells).round().astype(np.uint8)
 
 
-def draw_relevance(
-    relevance: np.ndarray,
+def draw_objectness(
+    objectness: np.ndarray,
     rgb: np.ndarray,
     mask: np.ndarray,
     first: tuple[np.ndarray, np.ndarray],
     last: tuple[np.ndarray, np.ndarray],
     title: str,
 ) -> np.ndarray:
-    """Draw a map of relevance (h, w) in [0, 1] beside the first and the last particles: pixels
+    """Draw a map of objectness (h, w) in [0, 1] beside the first and the last particles: pixels
     (N, 2), weights (N,) each.
 
     mask (H, W) bool: the object's visible part, whose rim is drawn.
     """
     wide, half = (full_view(rgb.shape[0], rgb.shape[1], tile_width(columns)) for columns in (1, 2))
-    heat = draw_heat_map(rgb, relevance, wide)
+    heat = draw_heat_map(rgb, objectness, wide)
     draw_lines(heat, [wide.place(line) for line in trace_outline(mask)], TRUTH, 3, closed=True)
-    on, off = average_relevance(relevance, mask), average_relevance(relevance, ~mask)
+    on, off = average_objectness(objectness, mask), average_objectness(objectness, ~mask)
     mean = f"{on:.2f} on the object, {off:.2f} elsewhere"
     tiles = []
     for name, (pixels, weights) in (("first", first), ("last", last)):
@@ -158,17 +158,20 @@ def draw_relevance(
         tiles.append(add_caption(picture, f"the {name} iteration"))
     foot = [
         draw_legend([("rim of the mask", TRUTH)]),
-        draw_color_scale("relevance: 0", "1", "magma"),
+        draw_color_scale("objectness: 0", "1", "magma"),
         draw_weight_scale(),
     ]
     return compose_figure(title, add_caption(heat, mean), arrange_grid(tiles, 2), *foot)
 
 
-def average_relevance(relevance: np.ndarray, mask: np.ndarray) -> float:
-    """Return the mean relevance of a mask's pixels, NaN where it has none.  (h, w), (H, W) bool."""
+def average_objectness(objectness: np.ndarray, mask: np.ndarray) -> float:
+    """Return the mean objectness of a mask's pixels, NaN where there are none.
+
+    (h, w), (H, W) bool.
+    """
     if not mask.any():
         return float("nan")
     full = cv2.resize(
-        relevance.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_NEAREST
+        objectness.astype(np.float32), mask.shape[::-1], interpolation=cv2.INTER_NEAREST
     )
     return float(full[mask].mean())

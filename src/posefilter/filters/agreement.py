@@ -32,21 +32,21 @@ class Agreement:
     """Estimate the pose that most particles' surface points agree on, weighted by likelihood.
 
     Each particle predicts which object point its own measured point is: by its pose, or by its
-    `options` most probable fragments where the method predicts fragments. The hypotheses are the
-    poses of the particles of highest likelihood, and as many rigid fits to a few particles' points
-    (RANSAC, Fischler and Bolles 1981). A hypothesis is scored by the weight of its inliers. The
-    best one is refitted to all particles by iteratively reweighted least squares: Kabsch's fit
+    `top_fragments` most probable fragments where the method predicts fragments. The hypotheses are
+    the poses of the particles of highest likelihood, and as many rigid fits to a few particles'
+    points (RANSAC, Fischler and Bolles 1981). A hypothesis is scored by the weight of its inliers.
+    The best one is refitted to all particles by iteratively reweighted least squares: Kabsch's fit
     (1976) with Geman-McClure weights and a falling scale.
 
     The belief is the set of fitted poses, each weighted by its share of inliers to the power of
-    `counts`.
+    `effective_particles`.
 
     Args:
         scale_m: Scale of the residuals of inliers [m].
         hypotheses: Number of hypotheses of each kind.
         iterations: Iterations of the refit.
-        options: Fragments considered for each particle.
-        counts: How many particles count as independent observations.
+        top_fragments: Fragments considered for each particle.
+        effective_particles: How many particles count as independent observations.
     """
 
     requires: ClassVar[Capabilities] = ("pose", "surface_points")
@@ -60,19 +60,19 @@ class Agreement:
         scale_m: float = 0.015,
         hypotheses: int = 64,
         iterations: int = 8,
-        options: int = 3,
-        counts: float = 8.0,
+        top_fragments: int = 3,
+        effective_particles: float = 8.0,
     ) -> None:
-        if min(hypotheses, options) < 1 or scale_m <= 0:
+        if min(hypotheses, top_fragments) < 1 or scale_m <= 0:
             raise UserError(
-                f"estimate: hypotheses={hypotheses} and options={options} must be 1 or more, and "
-                f"scale_m={scale_m} above 0"
+                f"estimate: hypotheses={hypotheses} and top_fragments={top_fragments} must be 1 "
+                f"or more, and scale_m={scale_m} above 0"
             )
         self.scale_m = scale_m
         self.hypotheses = hypotheses
         self.iterations = iterations
-        self.options = options
-        self.counts = counts
+        self.top_fragments = top_fragments
+        self.effective_particles = effective_particles
 
     def __call__(
         self,
@@ -113,7 +113,7 @@ class Agreement:
             (weight * agreeing).sum(1) / weight.sum(1) * output.log_likelihood.exp().max(1).values
         )
         log_weights = torch.log_softmax(
-            self.counts * support[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
+            self.effective_particles * support[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
         )
         return Belief(votes, log_weights, best, score)
 
@@ -130,7 +130,7 @@ class Agreement:
             object_point = transform(invert(output.pose.detach()), point[:, :, None])
             return torch.ones_like(object_point[..., 0]), (object_point - center) / radius
         log_share, fragment = fragments.log_share.detach().topk(
-            min(self.options, fragments.log_share.shape[-1]), dim=-1
+            min(self.top_fragments, fragments.log_share.shape[-1]), dim=-1
         )
         return log_share.exp(), fragments.position.detach().gather(
             2, fragment[..., None].expand(-1, -1, -1, 3)

@@ -1,4 +1,4 @@
-"""Auxiliary resampling by a predicted relevance map (the paper, section 6, idea 4)."""
+"""Auxiliary resampling by a predicted objectness map (the paper, section 6, idea 4)."""
 
 from typing import ClassVar
 
@@ -7,27 +7,27 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.protocols import HasRelevance, Resample, Scene, Space
+from posefilter.protocols import HasObjectness, Resample, Scene, Space
 from posefilter.types import Batch, Particles, Resampled
 
 
-def gather_relevance(relevance: Tensor, state: Tensor, height: int, width: int) -> Tensor:
-    """Return the relevance of the cell that each particle lies in; off the frame, of the nearest.
+def gather_objectness(objectness: Tensor, state: Tensor, height: int, width: int) -> Tensor:
+    """Return the objectness of the cell that each particle lies in; off the frame, of the nearest.
 
     Args:
-        relevance: (B, 1, h, w) map over the image.
+        objectness: (B, 1, h, w) map over the image.
         state: (B, N, 2) particles [px].
         height: The image's height [px].
         width: The image's width [px].
 
     Returns:
-        Relevance (B, N).
+        Objectness (B, N).
     """
-    h, w = relevance.shape[-2:]
+    h, w = objectness.shape[-2:]
     fraction = (state.detach() + 0.5) / state.new_tensor([width, height])
     cell = (fraction * state.new_tensor([w, h])).floor().nan_to_num(0.0)
     column, row = cell[..., 0].clamp(0, w - 1).long(), cell[..., 1].clamp(0, h - 1).long()
-    return relevance.flatten(1).gather(1, row * w + column)
+    return objectness.flatten(1).gather(1, row * w + column)
 
 
 def bind_to_scene(resample: Resample, scene: Scene, batch: Batch) -> Resample:
@@ -38,23 +38,23 @@ def bind_to_scene(resample: Resample, scene: Scene, batch: Batch) -> Resample:
 
 
 class AuxiliaryResampling:
-    """Draw ancestors by weight x relevance, and correct the weights by 1 / relevance.
+    """Draw ancestors by weight x objectness, and correct the weights by 1 / objectness.
 
-    The first stage of an auxiliary particle filter (Pitt and Shephard 1999), with the relevance as
-    its auxiliary function. The weighted distribution is unchanged: relevant regions get more
+    The first stage of an auxiliary particle filter (Pitt and Shephard 1999), with the objectness as
+    its auxiliary function. The weighted distribution is unchanged: regions of the object get more
     children, each of less weight. This holds where weights are carried on
     (filter/reweight=likelihood_ratio, sequential_bayes). The choice current_likelihood discards
     them, so there it only concentrates the search.
 
     Args:
         resampler: The scheme that draws the ancestors.
-        floor: Lower bound of the relevance, in (0, 1]; it bounds the correction.
+        floor: Lower bound of the objectness, in (0, 1]; it bounds the correction.
 
     Raises:
         UserError: `floor` is out of range.
     """
 
-    requires: ClassVar[Capabilities] = ("pixel_space", "relevance")
+    requires: ClassVar[Capabilities] = ("pixel_space", "objectness")
 
     def __init__(self, resampler: Resample, floor: float = 0.05) -> None:
         if not 0 < floor <= 1:
@@ -66,24 +66,24 @@ class AuxiliaryResampling:
         """Return the resampler for one scene.
 
         Args:
-            scene: The encoded images, with a relevance map.
+            scene: The encoded images, with an objectness map.
             height: The images' height [px].
             width: The images' width [px].
 
         Raises:
-            UserError: The scene has no relevance map.
+            UserError: The scene has no objectness map.
         """
-        if not isinstance(scene, HasRelevance):
+        if not isinstance(scene, HasObjectness):
             raise UserError(
-                "filter/resample=auxiliary: the method makes no map of relevance; choose an "
+                "filter/resample=auxiliary: the method makes no map of objectness; choose an "
                 "encoder that does, such as unet"
             )
-        relevance = scene.relevance.detach()
+        objectness = scene.objectness.detach()
 
         def resample(
             particles: Particles, count: int, space: Space, generator: Generator
         ) -> Resampled:
-            values = gather_relevance(relevance, particles.state, height, width)
+            values = gather_objectness(objectness, particles.state, height, width)
             log_auxiliary = values.clamp_min(self.floor).log()
             return self.draw(particles, log_auxiliary, count, space, generator)
 
@@ -113,5 +113,5 @@ class AuxiliaryResampling:
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Raise UserError: the relevance is known only after `bind`."""
+        """Raise UserError: the objectness is known only after `bind`."""
         raise UserError("filter/resample=auxiliary must be bound to a scene before it draws")

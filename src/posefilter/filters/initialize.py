@@ -11,7 +11,7 @@ from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import HasRelevance, Initialize, Method, ProposesPoses, Scene
+from posefilter.protocols import HasObjectness, Initialize, Method, ProposesPoses, Scene
 from posefilter.types import Batch
 
 
@@ -131,15 +131,15 @@ class FromDepth:
         )
 
 
-class FromRelevance:
-    """Pixels drawn from the scene's relevance map (the paper, section 6, idea 4).
+class FromObjectness:
+    """Pixels drawn from the scene's objectness map (the paper, section 6, idea 4).
 
     Args:
         uniform_fraction: Weight of the uniform distribution that is mixed in, so that every
             pixel can be drawn.
     """
 
-    requires: ClassVar[Capabilities] = ("pixel_space", "relevance")
+    requires: ClassVar[Capabilities] = ("pixel_space", "objectness")
 
     def __init__(self, uniform_fraction: float = 0.1) -> None:
         self.uniform_fraction = uniform_fraction
@@ -148,13 +148,13 @@ class FromRelevance:
         self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], uniform within each drawn cell."""
-        require_pixel_space(method, "from_relevance")
-        if not isinstance(scene, HasRelevance):
+        require_pixel_space(method, "from_objectness")
+        if not isinstance(scene, HasObjectness):
             raise UserError(
-                f"filter/initialize=from_relevance: {type(method).__name__} makes no map of "
-                f"relevance; choose uniform"
+                f"filter/initialize=from_objectness: {type(method).__name__} makes no map of "
+                f"objectness; choose uniform"
             )
-        weight = scene.relevance[:, 0].detach()
+        weight = scene.objectness[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
         weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
             0

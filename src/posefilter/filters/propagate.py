@@ -147,7 +147,7 @@ def half_turns(
     return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
-class Chain:
+class Compose:
     """Apply several kernels one after the other."""
 
     def __init__(self, components: Iterable[Propagate]) -> None:

@@ -27,7 +27,7 @@ class NoRefine:
         return belief
 
 
-class Chain:
+class Compose:
     """Apply several refinements one after the other."""
 
     def __init__(self, components: Iterable[Refine]) -> None:
@@ -108,8 +108,8 @@ class MeanShift:
     Args:
         iterations: Number of shifts.
         antithetic_pairs: Pairs of opposite perturbations in an iteration.
-        start: Standard deviation in the first iteration [m on the object's surface].
-        end: Standard deviation in the last iteration; geometric between.
+        initial_scale: Standard deviation in the first iteration [m on the object's surface].
+        final_scale: Standard deviation in the last iteration; geometric between.
         sigma: Noise level of the likelihood [m].
         pixels: Image points for each score, drawn anew in each iteration.
 
@@ -124,18 +124,18 @@ class MeanShift:
         self,
         iterations: int = 4,
         antithetic_pairs: int = 24,
-        start: float = 0.012,
-        end: float = 0.007,
+        initial_scale: float = 0.012,
+        final_scale: float = 0.007,
         sigma: float = 0.004,
         pixels: int = 256,
     ) -> None:
-        if iterations < 1 or antithetic_pairs < 1 or not 0 < end <= start:
+        if iterations < 1 or antithetic_pairs < 1 or not 0 < final_scale <= initial_scale:
             raise UserError(
                 f"refine: a mean shift needs iterations and antithetic_pairs >= 1 and "
-                f"0 < end <= start, got {end} and {start}"
+                f"0 < final_scale <= initial_scale, got {final_scale} and {initial_scale}"
             )
         self.iterations, self.antithetic_pairs = iterations, antithetic_pairs
-        self.start, self.end = start, end
+        self.initial_scale, self.final_scale = initial_scale, final_scale
         self.sigma, self.pixels = sigma, pixels
 
     @torch.no_grad()
@@ -145,7 +145,8 @@ class MeanShift:
         """Return the belief with the estimate shifted; without gradient."""
         scorer, best = require_scorer(method), belief.best
         for index in range(self.iterations):
-            spread = self.start * (self.end / self.start) ** (index / max(self.iterations - 1, 1))
+            fraction = index / max(self.iterations - 1, 1)
+            spread = self.initial_scale * (self.final_scale / self.initial_scale) ** fraction
             scale = method.space.noise_scale(best.new_tensor(spread))
             shape = (len(best), self.antithetic_pairs, method.space.dimensions)
             noise = torch.randn(shape, generator=generator, device=best.device, dtype=best.dtype)

@@ -5,7 +5,7 @@ import math
 from torch import Tensor
 
 
-class Sequential:
+class SequentialBayes:
     """Bayes' rule: multiply the weights by the likelihood (Gordon et al. 1993).
 
     The choice `filter/reweight=sequential_bayes`.
@@ -20,7 +20,7 @@ class Sequential:
         return log_weights + log_likelihood
 
 
-class Annealed:
+class CurrentLikelihood:
     """Weights from this step's likelihood alone; earlier weights are discarded.
 
     The choice `filter/reweight=current_likelihood`. There is no temperature: what falls over the
@@ -36,7 +36,7 @@ class Annealed:
         return log_likelihood - math.log(log_likelihood.shape[1])
 
 
-class TemperedSMC:
+class LikelihoodRatio:
     """Multiply the weights by the *ratio* of the likelihoods of a particle and of its ancestor.
 
     The choice `filter/reweight=likelihood_ratio`.

@@ -22,21 +22,24 @@ class Geometric:
     """Sigma changes by a constant factor from the first step to the last.
 
     Args:
-        start: Noise level at the first step.
-        stop: Noise level at the last step.
+        initial_sigma: Noise level at the first step.
+        final_sigma: Noise level at the last step.
 
     Raises:
         UserError: A level is not above 0.
     """
 
-    def __init__(self, start: float, stop: float) -> None:
-        if not (start > 0 and stop > 0):
-            raise UserError(f"schedule: start={start} and stop={stop} must be above 0")
-        self.start, self.stop = start, stop
+    def __init__(self, initial_sigma: float, final_sigma: float) -> None:
+        if not (initial_sigma > 0 and final_sigma > 0):
+            raise UserError(
+                f"schedule: initial_sigma={initial_sigma} and final_sigma={final_sigma} must "
+                f"be above 0"
+            )
+        self.initial_sigma, self.final_sigma = initial_sigma, final_sigma
 
     def __call__(self, steps: int) -> list[float]:
-        """Return `steps` values; a single step gets `stop`."""
+        """Return `steps` values; a single step gets `final_sigma`."""
         if steps == 1:
-            return [self.stop]
-        factor = (self.stop / self.start) ** (1 / (steps - 1))
-        return [self.start * factor**number for number in range(steps)]
+            return [self.final_sigma]
+        factor = (self.final_sigma / self.initial_sigma) ** (1 / (steps - 1))
+        return [self.initial_sigma * factor**number for number in range(steps)]

@@ -14,7 +14,7 @@ from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.filters.loop import ParticleFilter
 from posefilter.instances.pixels import blank, find_visible, keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import HasRelevance, Scene
+from posefilter.protocols import HasObjectness, Scene
 from posefilter.types import Batch, Belief, Trace
 
 _CELLS = 6  # of the network, that a small object covers
@@ -222,10 +222,10 @@ def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Scene]:
 
 def _look_left(scene: Scene) -> float:
     """Return the mean probability of the surest cells of a scene; 1 where it has none."""
-    if not isinstance(scene, HasRelevance):
+    if not isinstance(scene, HasObjectness):
         return 1.0
-    relevance = scene.relevance.flatten()
-    return float(relevance.topk(min(_CELLS, len(relevance))).values.mean())
+    objectness = scene.objectness.flatten()
+    return float(objectness.topk(min(_CELLS, len(objectness))).values.mean())
 
 
 def _assess(method: PoseEstimator, belief: Belief, image: Batch, scene: Scene) -> Assessment | None:

@@ -18,7 +18,7 @@ class TowardsObject:
         target: "nearest" for the nearest mask pixel (zero on the mask), or "center" for the mask's
             centroid.
         margin_px: Erosion of the mask for `nearest` [px], where the mask is wide enough.
-        reach: Maximum length, in frame widths; longer displacements keep their direction.
+        max_displacement: Maximum length, in frame widths; longer ones keep their direction.
 
     Raises:
         UserError: `target` is unknown.
@@ -27,13 +27,13 @@ class TowardsObject:
     requires: ClassVar[Capabilities] = ("pixel_space",)
 
     def __init__(
-        self, target: str = "nearest", margin_px: int = 0, reach: float = float("inf")
+        self, target: str = "nearest", margin_px: int = 0, max_displacement: float = float("inf")
     ) -> None:
         if target not in ("nearest", "center"):
             raise UserError(f"label.target={target!r} is unknown: choose nearest or center")
         self.target = target
         self.margin_px = margin_px
-        self.reach = reach
+        self.max_displacement = max_displacement
 
     @torch.no_grad()
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
@@ -47,4 +47,4 @@ class TowardsObject:
             goal = goal.unflatten(1, (len(states), -1)).transpose(0, 1)
         way = goal - states
         length = way.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        return way * (self.reach * batch.rgb.shape[-1] / length).clamp(max=1.0)
+        return way * (self.max_displacement * batch.rgb.shape[-1] / length).clamp(max=1.0)

@@ -43,7 +43,7 @@ class PaperPoints:
         if trace.particles[-1].state.dim() != 3:
             raise UserError(
                 "loss=regression judges points along rays, not poses: choose "
-                "model/candidate_sampler=labeled_rays, or loss=contrast"
+                "model/candidate_sampler=labeled_rays, or loss=contrastive"
             )
         offset, own_color = (
             trace.particles[-1].state[..., 2],

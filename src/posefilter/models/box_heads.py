@@ -35,7 +35,7 @@ def weighted_quantile(values: Tensor, weights: Tensor, quantile: float) -> Tenso
     return values.gather(1, order).gather(1, rank)[:, 0]
 
 
-class SpreadBox:
+class QuantileBox:
     """The box of the particles' positions, without their outermost weight.
 
     All that the paper's detector predicts is that its particles have moved onto the object.

@@ -117,12 +117,12 @@ class CandidatePoses:
         candidates_per_kind: Candidates of each kind around the truth.
         proposals: Poses from the proposal network, where there is one.
         particles: Persistent particles of the filter's own, which are hard negatives; 0 for none.
-        sigma: Lowest and highest noise level [m].
-        start: Noise level at which persistent particles start from proposals, as they do at test
-            time [m]. Without proposals they start from depth, at the highest level.
+        sigma_range: Lowest and highest noise level [m].
+        initial_sigma: Noise level at which persistent particles start from proposals, as they do
+            at test time [m]. Without proposals they start from depth, at the highest level.
         levels: Steps of the persistent particles from there to the lowest level.
         persistent_sigma_probability: Probability that an image is scored at the noise level of its
-            persistent particles, rather than at one drawn from `sigma`.
+            persistent particles, rather than at one drawn from `sigma_range`.
         turns: Kernel that turns the truth, for hard negatives. By default half turns about the
             axes of the mesh's frame.
     """
@@ -134,19 +134,19 @@ class CandidatePoses:
         candidates_per_kind: int = 8,
         proposals: int = 8,
         particles: int = 16,
-        sigma: tuple[float, float] = (0.004, 0.25),
-        start: float = 0.05,
+        sigma_range: tuple[float, float] = (0.004, 0.25),
+        initial_sigma: float = 0.05,
         levels: int = 12,
         persistent_sigma_probability: float = 0.5,
         turns: Propagate | None = None,
     ) -> None:
         self.candidates_per_kind, self.proposals = candidates_per_kind, proposals
-        self.sigma = (float(sigma[0]), float(sigma[1]))
+        self.sigma_range = (float(sigma_range[0]), float(sigma_range[1]))
         self.persistent_sigma_probability = persistent_sigma_probability
-        self.start = float(start)
+        self.initial_sigma = float(initial_sigma)
         self.turns = turns or HalfTurns(1.0)
         self.persistent = (
-            PersistentParticles(particles, levels, self.sigma[0]) if particles else None
+            PersistentParticles(particles, levels, self.sigma_range[0]) if particles else None
         )
 
     def __call__(
@@ -155,7 +155,7 @@ class CandidatePoses:
         """Draw and score candidates, and advance the persistent particles by a step."""
         B, device = len(batch.rgb), batch.rgb.device
         model = method.model
-        low, high = math.log(self.sigma[0]), math.log(self.sigma[1])
+        low, high = math.log(self.sigma_range[0]), math.log(self.sigma_range[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
         groups = [
             sample_around_truth(
@@ -163,7 +163,7 @@ class CandidatePoses:
                 model,
                 method.space,
                 self.candidates_per_kind,
-                self.sigma,
+                self.sigma_range,
                 generator,
                 self.turns,
             )
@@ -180,7 +180,7 @@ class CandidatePoses:
                 else sample_from_depth(batch, space, count, generator)
             )
             states, level = self.persistent.recall(
-                batch, fresh, self.start if proposes else self.sigma[1]
+                batch, fresh, self.initial_sigma if proposes else self.sigma_range[1]
             )
             own = (
                 torch.rand(B, device=device, generator=generator)

@@ -38,7 +38,7 @@ class DenseScene(NamedTuple):
     weights: Tensor  # (B, n) their probability of the object, 0 where no depth is known
 
     @property
-    def relevance(self) -> Tensor:
+    def objectness(self) -> Tensor:
         """The probability that each cell shows the object, (B, 1, h, w)."""
         return torch.sigmoid(self.coordinates.logit)[:, None]
 

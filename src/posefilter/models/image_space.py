@@ -36,10 +36,10 @@ class ImageScene:
 
 
 @dataclass(frozen=True)
-class RelevantScene(ImageScene):
-    """Encoded images with a relevance map."""
+class ObjectnessScene(ImageScene):
+    """Encoded images with an objectness map."""
 
-    relevance: Tensor  # (B, 1, h, w), the probability that the cell shows the object
+    objectness: Tensor  # (B, 1, h, w), the probability that the cell shows the object
 
 
 class ImageSpace(PoseEstimator):
@@ -55,7 +55,7 @@ class ImageSpace(PoseEstimator):
         box_head: Computes the object's bounding box from the particles.
         aux_losses: Losses that are added to the chosen one, by name; None: switched off.
         loss_schedule: Factors on the losses as training proceeds; None: 1 throughout.
-        relevance_weight: Weight of the loss on the encoder's relevance map, where it has one.
+        objectness_weight: Weight of the loss on the encoder's objectness map, where it has one.
         detach_position: Block the gradient of what is seen at a position with respect to the
             displacement that led there.
         truncate: Truncate backpropagation through positions and latents at every so many steps;
@@ -90,7 +90,7 @@ class ImageSpace(PoseEstimator):
         box_head: BoxHead,
         aux_losses: Mapping[str, Auxiliary | None] | None = None,
         loss_schedule: Sequence[Stage] | None = None,
-        relevance_weight: float = 1.0,
+        objectness_weight: float = 1.0,
         detach_position: bool = False,
         truncate: int | None = None,
         object_model: ObjectModel | None = None,
@@ -111,11 +111,11 @@ class ImageSpace(PoseEstimator):
         self.box_head = box_head
         self.aux_losses = {name: aux for name, aux in (aux_losses or {}).items() if aux is not None}
         self.loss_schedule = tuple(loss_schedule or ())
-        check_loss_schedule(self.loss_schedule, ["loss", "relevance", *(aux_losses or {})])
+        check_loss_schedule(self.loss_schedule, ["loss", "objectness", *(aux_losses or {})])
         for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
             check_latent_width(self.latent_width, getattr(component, "latent_width", None))
-        self.relevance_weight, self.detach_position, self.truncate = (
-            relevance_weight,
+        self.objectness_weight, self.detach_position, self.truncate = (
+            objectness_weight,
             detach_position,
             truncate,
         )
@@ -137,10 +137,10 @@ class ImageSpace(PoseEstimator):
         context = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
-        if context.relevance is None:
+        if context.objectness is None:
             return ImageScene(image, depth, batch.intrinsics, context)
-        relevance = torch.sigmoid(context.relevance)[:, None]
-        return RelevantScene(image, depth, batch.intrinsics, context, relevance)
+        objectness = torch.sigmoid(context.objectness)[:, None]
+        return ObjectnessScene(image, depth, batch.intrinsics, context, objectness)
 
     def measure(
         self, scene: ImageScene, particles: Particles, step: Step, generator: Generator
@@ -219,7 +219,7 @@ class ImageSpace(PoseEstimator):
         """Return the weighted losses of one roll-out, by name.
 
         Returns:
-            The chosen loss, the auxiliary losses and the relevance loss, (B,) each.
+            The chosen loss, the auxiliary losses and the objectness loss, (B,) each.
         """
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
@@ -228,8 +228,10 @@ class ImageSpace(PoseEstimator):
         losses = {"loss": self.loss(trace, batch, self.model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.model)
-        if isinstance(scene, RelevantScene) and self.relevance_weight:
-            losses["relevance"] = self.relevance_weight * relevance_loss(scene.context, batch.mask)
+        if isinstance(scene, ObjectnessScene) and self.objectness_weight:
+            losses["objectness"] = self.objectness_weight * objectness_loss(
+                scene.context, batch.mask
+            )
         factors = factors_at(self.loss_schedule, self.progress())
         return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
 
@@ -265,7 +267,7 @@ class ImageSpace(PoseEstimator):
 
 
 class _EncodedMethod:
-    """A method whose images are encoded already: the roll-out and the relevance loss share them."""
+    """A method whose images are encoded: the roll-out and the objectness loss share them."""
 
     def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
         self.method, self.scene = method, scene
@@ -317,17 +319,17 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
         )
 
 
-def relevance_loss(context: ContextMap, mask: Tensor) -> Tensor:
-    """Return the balanced binary cross-entropy of the relevance map.
+def objectness_loss(context: ContextMap, mask: Tensor) -> Tensor:
+    """Return the balanced binary cross-entropy of the objectness map.
 
     Args:
-        context: Feature maps with a relevance map.
+        context: Feature maps with an objectness map.
         mask: (B, 1, H, W) bool, the object.
 
     Returns:
         (B,), half of the weight on the cells that show the object.
     """
-    logit = context.relevance
+    logit = context.objectness
     assert logit is not None
     shows = F.adaptive_max_pool2d(mask.float(), logit.shape[-2:])[:, 0]
     entropy = F.binary_cross_entropy_with_logits(logit, shows, reduction="none")

@@ -35,7 +35,7 @@ class PoseScene(NamedTuple):
     cells: Cells | None
 
     @property
-    def relevance(self) -> Tensor:
+    def objectness(self) -> Tensor:
         """The probability that each cell shows the object, (B, 1, h, w).
 
         Raises:
@@ -43,12 +43,12 @@ class PoseScene(NamedTuple):
         """
         if self.coordinates is None:
             raise UserError(
-                "filter/initialize=from_relevance needs the proposal network; "
+                "filter/initialize=from_objectness needs the proposal network; "
                 "choose model/proposals=dense"
             )
         return torch.sigmoid(self.coordinates.logit)[:, None]
 
-    def draw_evenly(self) -> "PoseScene":
+    def with_quasi_monte_carlo(self) -> "PoseScene":
         """Return the same images, whose poses are scored by points that are drawn evenly."""
         return self._replace(image=self.image._replace(even=True))
 
@@ -65,8 +65,9 @@ class PosePF(PoseParticles):
         candidate_sampler: Draws the candidates that the likelihood is trained on.
         proposals: Network of dense object coordinates that initial poses are drawn from, or None.
         pixels: Image points that each pose is scored from, at each step of the filter.
-        even_points: Whether these are drawn evenly (nets/even_points.py), with less noise in the
-            score, instead of independently. Training draws them independently.
+        quasi_monte_carlo: Whether these are a low-discrepancy sequence, with less noise in the
+            score, instead of independent draws (nets/quasi_monte_carlo.py). Training draws them
+            independently.
         train_pixels: The same in training.
         likelihood_batch_size: Images of a batch that the likelihood is trained on; None: all. The
             proposal network, which needs more of them, is always trained on all.
@@ -76,7 +77,7 @@ class PosePF(PoseParticles):
 
     provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
     # training rolls out no filter
-    test_only_settings = ("filter", "train_filter", "pixels", "even_points")
+    test_only_settings = ("filter", "train_filter", "pixels", "quasi_monte_carlo")
     # for comparing the scores of estimate and truth: image points, noise level [m]
     comparison_pixels, comparison_sigma = 4096, 0.004
 
@@ -86,7 +87,7 @@ class PosePF(PoseParticles):
         candidate_sampler: CandidateSampler,
         proposals: ObjectCoordinateNet | None = None,
         pixels: int = 64,
-        even_points: bool = False,
+        quasi_monte_carlo: bool = False,
         train_pixels: int = 48,
         likelihood_batch_size: int | None = None,
         proposal_weight: float = 1.0,
@@ -98,13 +99,17 @@ class PosePF(PoseParticles):
             proposals,
             candidate_sampler,
         )
-        self.pixels, self.even_points, self.train_pixels = pixels, even_points, train_pixels
+        self.pixels, self.quasi_monte_carlo, self.train_pixels = (
+            pixels,
+            quasi_monte_carlo,
+            train_pixels,
+        )
         self.likelihood_batch_size = likelihood_batch_size
         self.proposal_weight = proposal_weight
 
     def encode(self, batch: Batch) -> PoseScene:
         """Flatten the images, and run the proposal network once."""
-        even = self.even_points and not self.training
+        even = self.quasi_monte_carlo and not self.training
         if self.proposals is None:
             image = flatten_images(batch.rgb, batch.depth, batch.intrinsics)
             return PoseScene(image._replace(even=even), None, None)

@@ -26,7 +26,7 @@ class ContextMap(NamedTuple):
     levels: tuple[Tensor, ...]  # each (B, F, h, w)
     strides: tuple[int, ...]  # pixels a cell of each
     # (B, h, w) logit of membership of the object, at strides[0]; None without
-    relevance: Tensor | None
+    objectness: Tensor | None
 
 
 class NoContext(nn.Module):
@@ -100,14 +100,14 @@ class Pyramid(nn.Module):
 
 
 class _Encoder(nn.Module):
-    """A single feature map, and relevance logits from it by a 1 x 1 convolution."""
+    """A single feature map, and objectness logits from it by a 1 x 1 convolution."""
 
-    provides: ClassVar[Capabilities] = ("relevance",)
+    provides: ClassVar[Capabilities] = ("objectness",)
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.width = width
-        self.relevance = nn.Conv2d(width, 1, 1)
+        self.relevance = nn.Conv2d(width, 1, 1)  # objectness, by its name in checkpoints
 
     def _map(self, features: Tensor, stride: int) -> ContextMap:
         features = features.float()
@@ -138,23 +138,25 @@ class ConvEncoder(_Encoder, UNet):
     Args:
         widths: Channels at strides 4, 8, 16 and 32, multiples of 8.
         width: Features of a particle.
-        most_px: Wider images are downsampled by the least integer factor to at most this width;
-            None for never.
+        max_width_px: Wider images are downsampled by the least integer factor to at most this
+            width; None for never.
 
     Raises:
-        UserError: `most_px` is below 32.
+        UserError: `max_width_px` is below 32.
     """
 
     def __init__(
         self,
         widths: tuple[int, int, int, int] = (32, 64, 96, 128),
         width: int = 64,
-        most_px: int | None = None,
+        max_width_px: int | None = None,
     ) -> None:
         super().__init__(width)
-        if most_px is not None and most_px < 32:
-            raise UserError(f"model.encoder.most_px={most_px}: must be 32 or more, or null")
-        self.most_px = most_px
+        if max_width_px is not None and max_width_px < 32:
+            raise UserError(
+                f"model.encoder.max_width_px={max_width_px}: must be 32 or more, or null"
+            )
+        self.max_width_px = max_width_px
         self.build_trunk(widths)
         a, b = widths[:2]
         self.up8 = ResBlock(b)
@@ -166,7 +168,7 @@ class ConvEncoder(_Encoder, UNet):
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map, of 4 pixels of the downsampled image a cell."""
-        factor = 1 if self.most_px is None else math.ceil(rgb.shape[-1] / self.most_px)
+        factor = 1 if self.max_width_px is None else math.ceil(rgb.shape[-1] / self.max_width_px)
         if factor > 1:
             rgb, depth, K = downsample(rgb, depth, K, factor)
         shape = geometry(depth, K)

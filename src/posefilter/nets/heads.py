@@ -74,23 +74,23 @@ class Unbounded(nn.Module):
 
 
 class Bounded(nn.Module):
-    """At most `reach` frame widths along each axis (tanh), and within the frame.
+    """At most `max_displacement` frame widths along each axis (tanh), and within the frame.
 
     The clamp to the frame has a straight-through gradient, so that particles at an edge still get
     one.
 
     Args:
-        reach: Largest displacement along an axis, in frame widths.
+        max_displacement: Largest displacement along an axis, in frame widths.
     """
 
-    def __init__(self, reach: float = 0.25) -> None:
+    def __init__(self, max_displacement: float = 0.25) -> None:
         super().__init__()
-        self.reach = reach
+        self.max_displacement = max_displacement
 
     def forward(self, raw: Tensor, logit: Tensor, state: Tensor, width: int, height: int) -> Tensor:
         """(B, N, 2), (B, N), (B, N, 2) [px] -> (B, N, 2) [px]."""
         corner = state.new_tensor([width - 1.0, height - 1.0])
-        goal = state + torch.tanh(raw) * self.reach * width
+        goal = state + torch.tanh(raw) * self.max_displacement * width
         inside = torch.minimum(goal.clamp_min(0.0), corner)
         return goal + (inside - goal).detach() - state
 

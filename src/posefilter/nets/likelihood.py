@@ -23,10 +23,10 @@ from posefilter.geometry.camera import project, rays
 from posefilter.geometry.lookup import gather_rows
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.nets.coordinates import Context, Coordinates, flatten_context, query
-from posefilter.nets.even_points import draw_evenly
 from posefilter.nets.fused import Tables, applies, missing_context, score
 from posefilter.nets.layers import ResnetFC, fourier
 from posefilter.nets.linear import Linear
+from posefilter.nets.quasi_monte_carlo import draw_quasi_random
 from posefilter.nets.surface_term import SurfaceTerm
 
 SPREAD = 0.6  # of the pixels that a pose is scored by, in projected radii of the object
@@ -245,7 +245,7 @@ class PoseLikelihood(nn.Module):
             Log-likelihoods (B, N).
         """
         if image.even:
-            noise = draw_evenly(len(poses), pixels, generator, poses.device)
+            noise = draw_quasi_random(len(poses), pixels, generator, poses.device)
         else:
             noise = torch.randn(len(poses), 1, pixels, 2, generator=generator, device=poses.device)
         if applies(poses.device) and sigma.numel() == 1:

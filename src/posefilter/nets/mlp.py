@@ -77,7 +77,7 @@ class LatentNet(nn.Module):
         width: Width of hidden layers.
         layers: Linear layers of each MLP.
         normalization: "batch" or "layer".
-        displacement_reads: "logit" or "likelihood" (its sigmoid), beside pose and latent.
+        displacement_input: "logit" or "likelihood" (its sigmoid), beside pose and latent.
     """
 
     def __init__(
@@ -89,12 +89,12 @@ class LatentNet(nn.Module):
         width: int = 512,
         layers: int = 4,
         normalization: str = "batch",
-        displacement_reads: str = "logit",
+        displacement_input: str = "logit",
     ) -> None:
         super().__init__()
-        if displacement_reads not in ("logit", "likelihood"):
+        if displacement_input not in ("logit", "likelihood"):
             raise UserError(
-                f"model.net.displacement_reads={displacement_reads!r} is unknown: choose logit or "
+                f"model.net.displacement_input={displacement_input!r} is unknown: choose logit or "
                 "likelihood"
             )
         if min(latent_width, width, layers) < 1:
@@ -102,7 +102,7 @@ class LatentNet(nn.Module):
                 f"net: latent_width={latent_width}, width={width} and layers={layers} "
                 f"must be 1 or more"
             )
-        self.displacement_reads = displacement_reads
+        self.displacement_input = displacement_input
         self.latent_width = latent_width
         self.latent = mlp(
             4 * size * size + extra + latent_width, latent_width, width, layers, normalization
@@ -115,7 +115,7 @@ class LatentNet(nn.Module):
         """(B, N, C, k, k), (B, N, E), (B, N, L) -> NetOutput; C = 4, k = `size`, E = `extra`."""
         latent = self.latent(torch.cat([patch.flatten(2), extra, latent], dim=-1))
         pose, logit = self.pose(latent), self.likelihood(latent)
-        read = logit if self.displacement_reads == "logit" else torch.sigmoid(logit)
+        read = logit if self.displacement_input == "logit" else torch.sigmoid(logit)
         displacement = self.displacement(torch.cat([pose, read, latent], dim=-1))
         return NetOutput(latent, logit[..., 0], displacement, pose)
 

@@ -22,7 +22,7 @@ class ObjectCoordinateNet(UNet):
         features: Further features of each cell, for the likelihood.
     """
 
-    provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "relevance")
+    provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "objectness")
 
     centers: Tensor  # (K, 3) the fragments' centers, from the object's center, in radii
     reach: Tensor  # () their mean radius, in radii of the object

@@ -27,7 +27,7 @@ SECTIONS = {  # the first whose words a picture's name has; what is in none is "
         "field",
         "points",
         "proposals",
-        "relevance",
+        "objectness",
         "marginals",
     },
     "particles": {

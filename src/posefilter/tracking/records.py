@@ -19,7 +19,7 @@ from posefilter.tracking.track import TrackResult
 from posefilter.types import ObjectModel
 
 _COLUMNS = (
-    "video", "frame", "scene_id", "im_id", "obj_id", "object", "status", "score", "relevance",
+    "video", "frame", "scene_id", "im_id", "obj_id", "object", "status", "score", "objectness",
     "presence", "probability", "particles", "add_mm", "add_s_mm", "seconds",
 )  # fmt: skip
 
@@ -134,7 +134,7 @@ def describe_row(row: TrackRow) -> dict[str, Any]:
         "status": result.status,
         "camera_from_object": result.pose.tolist(),
         "score": result.score,
-        "relevance": result.relevance,
+        "objectness": result.objectness,
         "presence": result.presence,
         "probability": result.probability,
         "particles": len(result.belief.weights),

@@ -12,7 +12,7 @@ from posefilter.nets.layers import fast_bfloat16
 from posefilter.protocols import Scene
 from posefilter.types import Batch, ParticleOutput, Particles, Step
 
-_NEEDED = ("pose_space", "score_poses", "propose_poses", "relevance")
+_NEEDED = ("pose_space", "score_poses", "propose_poses", "objectness")
 
 
 def check_method(method: PoseEstimator) -> None:
@@ -26,10 +26,10 @@ def check_method(method: PoseEstimator) -> None:
 
 
 @runtime_checkable
-class DrawsEvenly(Protocol):
+class SupportsQuasiMonteCarlo(Protocol):
     """An encoded frame that can have its poses scored by points that are drawn evenly."""
 
-    def draw_evenly(self) -> Scene:
+    def with_quasi_monte_carlo(self) -> Scene:
         """Return the frame, so set."""
         ...
 
@@ -57,7 +57,9 @@ class Glance:
     ) -> None:
         self.method, self.points = method, points
         # few points tell more of a pose where they are spread evenly
-        self.scene = scene.draw_evenly() if isinstance(scene, DrawsEvenly) else scene
+        self.scene = (
+            scene.with_quasi_monte_carlo() if isinstance(scene, SupportsQuasiMonteCarlo) else scene
+        )
         self.jumps, self.against = jumps, against
 
     @property

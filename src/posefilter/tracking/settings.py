@@ -15,7 +15,7 @@ def check_whole(settings: object, **least: int) -> None:
 
 
 @dataclass(frozen=True)
-class Effort:
+class FrameBudget:
     """What a frame may cost.
 
     Attributes:
@@ -24,9 +24,9 @@ class Effort:
         proposals: Particles that the network proposes, beside them, in frames of which it sees the
             whole image.
         steps: Likelihood steps.
-        start: Noise level of the first step [m].
-        stop: Noise level of the last [m].
-        points: Image points that a pose is scored from.
+        initial_sigma: Noise level of the first step [m].
+        final_sigma: Noise level of the last [m].
+        pixels: Image points that a pose is scored from.
 
     Raises:
         UserError: A number is out of range.
@@ -36,21 +36,22 @@ class Effort:
     max_particles: int
     proposals: int
     steps: int
-    start: float
-    stop: float
-    points: int
+    initial_sigma: float
+    final_sigma: float
+    pixels: int
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, min_particles=1, max_particles=1, proposals=0, steps=1, points=1)
+        check_whole(self, min_particles=1, max_particles=1, proposals=0, steps=1, pixels=1)
         if self.max_particles < self.min_particles:
             raise UserError(
                 f"tracker: max_particles={self.max_particles} is below "
                 f"min_particles={self.min_particles}"
             )
-        if not 0 < self.stop <= self.start:
+        if not 0 < self.final_sigma <= self.initial_sigma:
             raise UserError(
-                f"tracker: start={self.start}, stop={self.stop}: noise levels fall, and are above 0"
+                f"tracker: initial_sigma={self.initial_sigma}, "
+                f"final_sigma={self.final_sigma}: noise levels fall, and are above 0"
             )
 
 
@@ -66,7 +67,7 @@ class TrackerSettings:
         move_scale: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
-        fit_points: Image points that a pose is scored from in these fits.
+        fit_pixels: Image points that a pose is scored from in these fits.
         jump_penalty: Log odds against a jump to what the network proposes, while the object is
             tracked [nat]; so that it does not flip between faces that look alike.
         kld_epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -90,12 +91,12 @@ class TrackerSettings:
     """
 
     motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: Effort = Effort(32, 300, 8, 1, 0.008, 0.008, 64)
-    look: Effort = Effort(32, 32, 64, 1, 0.02, 0.02, 32)
-    search: Effort = Effort(64, 64, 64, 6, 0.04, 0.004, 32)
+    follow: FrameBudget = FrameBudget(32, 300, 8, 1, 0.008, 0.008, 64)
+    look: FrameBudget = FrameBudget(32, 32, 64, 1, 0.02, 0.02, 32)
+    search: FrameBudget = FrameBudget(64, 64, 64, 6, 0.04, 0.004, 32)
     move_scale: float = 0.4
     rounds: int = 1
-    fit_points: int = 128
+    fit_pixels: int = 128
     jump_penalty: float = 5.0
     kld_epsilon: float = 0.15
     kld_quantile: float = 0.95
@@ -112,7 +113,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, fit_points=1, patience=1)
+        check_whole(self, rounds=0, fit_pixels=1, patience=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0)
         least = min(self.move_scale, self.smoothing_noise, self.jump_penalty)
         if not (least >= 0 and self.window_scale >= 1):

@@ -14,7 +14,7 @@ from posefilter.data.resize import network_size
 from posefilter.filters.loop import ParticleFilter, inherit, make_particles
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.resample import Multinomial, Systematic
-from posefilter.filters.reweight import Annealed
+from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
@@ -24,11 +24,11 @@ from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
 from posefilter.tracking.frame import Frame
+from posefilter.tracking.loss_detector import LOST, TRACKED, LossDetector
+from posefilter.tracking.objectness import measure_objectness, measure_presence
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
-from posefilter.tracking.relevance import measure_presence, measure_relevance
 from posefilter.tracking.scoring import Glance, check_method
-from posefilter.tracking.settings import Effort, TrackerSettings
-from posefilter.tracking.watch import LOST, TRACKED, Watch
+from posefilter.tracking.settings import FrameBudget, TrackerSettings
 from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, Belief, Particles, Trace
 
@@ -43,7 +43,7 @@ class TrackResult(Result):
     Attributes:
         status: "started" by an estimate on a single image, "tracked" from the frame before,
             "found" again after a loss, or "lost": then the pose is no more than a guess.
-        relevance: What the network says of the pixels that the object covers: the mean probability
+        objectness: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
 
     `presence` and `probability` are those of an estimate on a single image with the same features;
@@ -51,7 +51,7 @@ class TrackResult(Result):
     """
 
     status: str
-    relevance: float
+    objectness: float
 
     @property
     def found(self) -> bool:
@@ -73,16 +73,16 @@ class Memory(NamedTuple):
 
     random: Tensor  # state of the generator
     state: State | None
-    watch: Watch
+    loss_detector: LossDetector
     frames: int
 
 
-class Sight(NamedTuple):
+class FrameEstimate(NamedTuple):
     """What one frame shows."""
 
     batch: Batch  # the image, or the window of it that was looked at
     belief: Belief | None  # None where nothing has depth, or the frame cannot be judged
-    relevance: float  # the mean relevance of the pixels that the estimate covers
+    objectness: float  # the mean objectness of the pixels that the estimate covers
     presence: float  # what the track is judged by
     found: Assessment | None  # the calibrated probabilities
     size: ApparentSize | None = None  # of estimates from the whole image
@@ -122,25 +122,25 @@ class Track:
         """Forget the object: the next frame is the first."""
         self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
         self.state: State | None = None
-        self.watch = Watch(self.settings)
+        self.loss_detector = LossDetector(self.settings)
         self.frames = 0
 
     @property
     def memory(self) -> Memory:
         """What the next frame depends on."""
-        return Memory(self.generator.get_state(), self.state, self.watch, self.frames)
+        return Memory(self.generator.get_state(), self.state, self.loss_detector, self.frames)
 
     @memory.setter
     def memory(self, memory: Memory) -> None:
         self.generator.set_state(memory.random)
-        self.state, self.watch, self.frames = memory[1:]
+        self.state, self.loss_detector, self.frames = memory[1:]
 
     @property
     def burden(self) -> float:
         """About what the next frame will cost, in frames that are tracked in a window."""
         if self.state is None:
             return 8.0
-        if self.watch.lost:
+        if self.loss_detector.lost:
             return 2.5 if self._search_is_due else 1.0
         return 1.5 if self._whole_is_due else 1.0
 
@@ -151,24 +151,24 @@ class Track:
         predicted = None if self.state is None else self._predict(self.state)
         if predicted is None:
             sight = self._estimate(frame)
-        elif self.watch.lost:
+        elif self.loss_detector.lost:
             sight = self._search(frame, predicted)
         else:
             sight = self._follow(frame, predicted)
-        trusted, status = self.watch.judge(sight.presence)
+        trusted, status = self.loss_detector.judge(sight.presence)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
         result = make_result(self._describe(sight, frame.blank), 0)
         content = {**vars(result), "seconds": time.perf_counter() - start}
-        return TrackResult(**content, status=status, relevance=sight.relevance)
+        return TrackResult(**content, status=status, objectness=sight.objectness)
 
     # -- the steps of a frame ---------------------------------------------------------------------
 
     def _predict(self, state: State) -> State:
         """Return where the object is expected: draws of the moved belief, of equal weight."""
         settings = self.settings
-        effort = settings.look if self.watch.lost else settings.follow
+        budget = settings.look if self.loss_detector.lost else settings.follow
         motion = settings.motion
         drift = motion.expect(state.velocity)
         expected = self.space.move(state.best, drift)
@@ -177,7 +177,7 @@ class Track:
             drift,
             motion.widen(state.surprise),
             motion,
-            effort.max_particles,
+            budget.max_particles,
             self.space,
             self.generator,
         )
@@ -188,79 +188,81 @@ class Track:
             settings.kld_cell,
             settings.kld_epsilon,
             settings.kld_quantile,
-            effort.min_particles,
+            budget.min_particles,
         )
         return state._replace(belief=make_particles(draws, 0), best=expected)
 
-    def _estimate(self, frame: Frame) -> Sight:
+    def _estimate(self, frame: Frame) -> FrameEstimate:
         """Run the estimator's own filter on the whole image."""
         batch = self._take(frame.see_whole(self.size))
         if frame.blank or not bool(batch.depth.any()):
-            return Sight(batch, None, 0.0, 0.0, None)
+            return FrameEstimate(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
         size = self.method.measure_apparent_size(trace, batch)
         return self._weigh(batch, trace)._replace(size=size)
 
-    def _follow(self, frame: Frame, predicted: State) -> Sight:
+    def _follow(self, frame: Frame, predicted: State) -> FrameEstimate:
         """Run a filter of few particles from the predicted belief."""
         window = self._choose_window(frame.images, predicted)
         seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
         batch = self._take(seen)
         if frame.blank or not bool(batch.depth.any()):
-            return Sight(batch, None, 0.0, 0.0, None)
-        settings, effort = self.settings, self.settings.follow
+            return FrameEstimate(batch, None, 0.0, 0.0, None)
+        settings, budget = self.settings, self.settings.follow
         factor, against = settings.motion.widen(predicted.surprise), settings.jump_penalty
         if factor > 1:
             # from wide levels down; what the network proposes gains on a prior that is thinner
             # by the factor in each of six dimensions
-            steps = effort.steps + math.ceil(math.log(factor, 4))
-            level = max(effort.start, min(_WIDE, factor * effort.start))
-            effort = replace(effort, steps=steps, start=level, proposals=3 * effort.proposals)
+            steps = budget.steps + math.ceil(math.log(factor, 4))
+            level = max(budget.initial_sigma, min(_WIDE, factor * budget.initial_sigma))
+            budget = replace(
+                budget, steps=steps, initial_sigma=level, proposals=3 * budget.proposals
+            )
             against = max(0.0, against - 6 * math.log(factor))
         elif window is not None:  # what it shows is the predicted belief's already
-            effort = replace(effort, proposals=0)
+            budget = replace(budget, proposals=0)
         scene, start = self.method.encode(batch), predicted.belief.state
-        return self._filter(batch, scene, start, effort, settings.rounds, against)
+        return self._filter(batch, scene, start, budget, settings.rounds, against)
 
-    def _search(self, frame: Frame, predicted: State) -> Sight:
+    def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
         """Look for a lost object in the whole image, and search where that is worth it."""
         batch = self._take(frame.see_whole(self.size))
         if frame.blank or not bool(batch.depth.any()):
-            return Sight(batch, None, 0.0, 0.0, None)
+            return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, scene = self.settings, self.method.encode(batch)
         seen = self._filter(batch, scene, predicted.belief.state, settings.look, 0)
         if seen.presence < settings.search_above and not self._search_is_due:
             return seen
         assert seen.belief is not None
-        begun, effort = begin(seen.belief).belief, settings.search
-        drawn = Multinomial()(begun, effort.min_particles, self.space, self.generator)
+        begun, budget = begin(seen.belief).belief, settings.search
+        drawn = Multinomial()(begun, budget.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
-        return self._filter(batch, scene, start, effort, settings.rounds)
+        return self._filter(batch, scene, start, budget, settings.rounds)
 
     def _filter(
         self,
         batch: Batch,
         scene: Any,
         start: Tensor,
-        effort: Effort,
+        budget: FrameBudget,
         rounds: int,
         against: float = 0.0,
-    ) -> Sight:
+    ) -> FrameEstimate:
         """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
         settings = self.settings
         filter = ParticleFilter(
-            particles=min(start.shape[1], 2 * effort.min_particles),  # after the first step
-            steps=effort.steps,
-            initialize=FromBelief(start, effort.proposals),
-            schedule=Geometric(effort.start, effort.stop),
-            reweight=Annealed(),
+            particles=min(start.shape[1], 2 * budget.min_particles),  # after the first step
+            steps=budget.steps,
+            initialize=FromBelief(start, budget.proposals),
+            schedule=Geometric(budget.initial_sigma, budget.final_sigma),
+            reweight=CurrentLikelihood(),
             resample=Systematic(),
             propagate=Gaussian(settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=QuadraticFit(rounds, pixels=settings.fit_points),
+            refine=QuadraticFit(rounds, pixels=settings.fit_pixels),
         )
-        glance = Glance(self.method, scene, effort.points, effort.proposals, against)
+        glance = Glance(self.method, scene, budget.pixels, budget.proposals, against)
         return self._weigh(batch, filter(batch, glance, self.generator))
 
     def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State | None:
@@ -299,7 +301,7 @@ class Track:
     def _whole_is_due(self) -> bool:
         every = self.settings.whole_image_every
         # what a window leaves in doubt the whole image may tell
-        return not self.watch.sure or (every > 0 and (self.frames + self.turn) % every == 0)
+        return not self.loss_detector.sure or (every > 0 and (self.frames + self.turn) % every == 0)
 
     def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
@@ -322,14 +324,14 @@ class Track:
     def _take(self, batch: Batch) -> Batch:
         return Batch(*(x.to(self.method.device) for x in batch))
 
-    def _weigh(self, batch: Batch, trace: Trace) -> Sight:
+    def _weigh(self, batch: Batch, trace: Trace) -> FrameEstimate:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
         belief, points = trace.belief, self.method.model.points
-        relevance = measure_relevance(trace.scene.relevance, batch, belief.best[0], points)
-        presence, found = measure_presence(self.method, trace, batch, relevance)
-        return Sight(batch, belief, relevance, presence, found)
+        objectness = measure_objectness(trace.scene.objectness, batch, belief.best[0], points)
+        presence, found = measure_presence(self.method, trace, batch, objectness)
+        return FrameEstimate(batch, belief, objectness, presence, found)
 
-    def _describe(self, sight: Sight, blank: str) -> Run:
+    def _describe(self, sight: FrameEstimate, blank: str) -> Run:
         """Return the state as an estimator's run on what was looked at."""
         state = self.state
         if state is None:  # no more than a guess: a meter ahead

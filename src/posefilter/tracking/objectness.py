@@ -5,7 +5,7 @@ from torch import Tensor
 
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.features import measure_depth
-from posefilter.filters.auxiliary import gather_relevance
+from posefilter.filters.auxiliary import gather_objectness
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import transform
 from posefilter.models.base import PoseEstimator
@@ -13,18 +13,18 @@ from posefilter.types import Batch, Trace
 
 _POINTS = 256  # of the surface, that are looked at
 _FULL = (
-    0.6  # relevance that is as good as 1: rims and what stands before an object take their share
+    0.6  # objectness that is as good as 1: rims and what stands before an object take their share
 )
 
 
-def measure_relevance(relevance: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
-    """Return the mean relevance of the pixels that a pose's object covers.
+def measure_objectness(objectness: Tensor, batch: Batch, pose: Tensor, points: Tensor) -> float:
+    """Return the mean objectness of the pixels that a pose's object covers.
 
     The score of a pose cannot tell this: scores are log-likelihoods up to a constant of the image,
     and of an image without the object the search finds a pose that scores as high.
 
     Args:
-        relevance: (1, 1, h, w) the probability that each cell of the image shows the object.
+        objectness: (1, 1, h, w) the probability that each cell of the image shows the object.
         batch: The image.
         pose: (4, 4) camera_from_object [m].
         points: (P, 3) surface points of the object [m].
@@ -42,25 +42,25 @@ def measure_relevance(relevance: Tensor, batch: Batch, pose: Tensor, points: Ten
     inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(1)
     if not bool(inside.any()):
         return 0.0
-    found = gather_relevance(relevance, pixels[inside][None], height, width)
+    found = gather_objectness(objectness, pixels[inside][None], height, width)
     return float(torch.mean(found))
 
 
 def measure_presence(
-    method: PoseEstimator, trace: Trace, batch: Batch, relevance: float
+    method: PoseEstimator, trace: Trace, batch: Batch, objectness: float
 ) -> tuple[float, Assessment | None]:
     """Return how probable it is that the object is where an estimate puts it.
 
     Of a calibrated method it is its calibrated presence. That is fitted to estimates on single
     images; a track's features are of the same kind, but its particles are fewer, and the network
-    may have seen a window only. Of another method it is the relevance, as a share of 0.6, lowered
+    may have seen a window only. Of another method it is the objectness, as a share of 0.6, lowered
     where the depth sees through more of the surface than it finds there; that is no probability.
 
     Args:
         method: The object's filter.
         trace: The estimate, with the encoded image.
         batch: The image.
-        relevance: As returned by `measure_relevance`.
+        objectness: As returned by `measure_objectness`.
 
     Returns:
         The presence in [0, 1], and the calibrated probabilities where there are any.
@@ -68,5 +68,5 @@ def measure_presence(
     found = method.assess(trace, batch)
     if found is not None:
         return float(found.presence), found
-    solid = measure_depth(trace.belief.best, batch, method.model)["solid"]
-    return min(1.0, relevance / _FULL) * min(1.0, 2 * float(solid)), None
+    free_space = measure_depth(trace.belief.best, batch, method.model)["free_space"]
+    return min(1.0, objectness / _FULL) * min(1.0, 2 * float(free_space)), None

@@ -9,7 +9,7 @@ from tests.models.toy import scenes, square
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.labels.paper_points import PaperPoints
-from posefilter.losses.contrast import Contrast, pose_distance
+from posefilter.losses.contrastive import Contrastive, pose_distance
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
 from posefilter.models.candidate_samplers import make_uniform_particles, one_step_trace
@@ -36,7 +36,7 @@ def test_two_candidates_by_hand() -> None:
     p = 1 / (1 + math.exp(-0.5 * (0.02 / 0.01) ** 2))  # target on the truth
     q = 1 / (1 + math.exp(-0.5))
     by_hand = p * math.log(p / q) + (1 - p) * math.log((1 - p) / (1 - q))
-    assert Contrast()(trace(poses, scores, 0.01), batch, MODEL).item() == pytest.approx(
+    assert Contrastive()(trace(poses, scores, 0.01), batch, MODEL).item() == pytest.approx(
         by_hand, rel=1e-4
     )
 
@@ -45,15 +45,15 @@ def test_the_divergence_vanishes_at_the_target_alone() -> None:
     batch = scenes(2)
     poses = candidates(batch, [0.0, 0.01, 0.03])
     best = -0.5 * (torch.tensor([0.0, 0.01, 0.03]) / 0.02) ** 2
-    right = Contrast()(trace(poses, best.expand(2, 3) + 7.0, 0.02), batch, MODEL)
+    right = Contrastive()(trace(poses, best.expand(2, 3) + 7.0, 0.02), batch, MODEL)
     assert right.abs().max() < 1e-5
-    assert Contrast()(trace(poses, best.flip(0).expand(2, 3), 0.02), batch, MODEL).min() > 0.1
+    assert Contrastive()(trace(poses, best.flip(0).expand(2, 3), 0.02), batch, MODEL).min() > 0.1
 
 
 def test_images_without_the_object_teach_nothing() -> None:
     batch = scenes(2)
     batch.mask[0] = False
-    value = Contrast()(
+    value = Contrastive()(
         trace(candidates(batch, [0.0, 0.1]), torch.tensor([[0.0, 9.0], [0.0, 9.0]]), 0.01),
         batch,
         MODEL,

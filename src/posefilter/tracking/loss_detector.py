@@ -5,7 +5,7 @@ from posefilter.tracking.settings import TrackerSettings
 STARTED, TRACKED, FOUND, LOST = "started", "tracked", "found", "lost"
 
 
-class Watch:
+class LossDetector:
     """Judge a track by the presence of its object, frame after frame.
 
     A track is lost after `patience` frames in a row whose presence is below `lost_below`; a lost

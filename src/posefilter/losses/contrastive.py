@@ -33,7 +33,7 @@ def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int 
     return torch.stack(options).amin(0)
 
 
-class Contrast:
+class Contrastive:
     """KL(target || softmax(score)) over an image's candidates; target ~ exp(-ADD^2 / (2 sigma^2)).
 
     At its minimum exp(score) is proportional to the posterior smoothed by sigma, the noise level of
@@ -50,7 +50,7 @@ class Contrast:
         """
         if trace.particles[-1].state.dim() != 4:
             raise UserError(
-                "loss=contrast judges candidate poses, not points: choose "
+                "loss=contrastive judges candidate poses, not points: choose "
                 "model/candidate_sampler=candidates, or loss=regression"
             )
         poses, scores, sigma = (

@@ -3,14 +3,14 @@
 import torch
 
 from posefilter.geometry.camera import intrinsics
-from posefilter.nets.even_points import draw_evenly
 from posefilter.nets.likelihood import PoseLikelihood, flatten_images
+from posefilter.nets.quasi_monte_carlo import draw_quasi_random
 
 CPU = torch.device("cpu")
 
 
 def test_every_point_is_standard_normal_by_itself() -> None:
-    points = draw_evenly(4000, 16, torch.Generator().manual_seed(0), CPU)
+    points = draw_quasi_random(4000, 16, torch.Generator().manual_seed(0), CPU)
     assert points.shape == (4000, 1, 16, 2)
     assert points.dtype == torch.float32
     assert torch.isfinite(points).all()
@@ -22,7 +22,7 @@ def test_every_point_is_standard_normal_by_itself() -> None:
 
 
 def test_sets_are_independent_and_the_seed_decides() -> None:
-    draw = lambda seed: draw_evenly(3000, 8, torch.Generator().manual_seed(seed), CPU)  # noqa: E731
+    draw = lambda seed: draw_quasi_random(3000, 8, torch.Generator().manual_seed(seed), CPU)  # noqa: E731
     one = draw(1)
     assert torch.equal(one, draw(1))
     assert not torch.equal(one, draw(2))

@@ -8,7 +8,7 @@ _STEP = (0.7548776662466927, 0.5698402909980532)
 _EDGE = 1e-7  # of the unit square, that the quantile function is kept from
 
 
-def draw_evenly(batch: int, count: int, generator: Generator, device: torch.device) -> Tensor:
+def draw_quasi_random(batch: int, count: int, generator: Generator, device: torch.device) -> Tensor:
     """Draw standard normal points: an additive sequence in the unit square, shifted at random.
 
     Every single point is standard normal, so that a mean over the points has the expectation that
