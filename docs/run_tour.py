@@ -58,7 +58,7 @@ def go_on(words: Sequence[str], home: Path) -> list[str]:
 
 def main() -> int:
     """Run the whole tour in processes of their own, each command shown before it runs; stop at the
-    first that fails. Called again, it goes on with an earlier tour.
+    first that fails. Called again, it resumes an earlier tour.
     """
     for page in commands(PAGE.read_text()):
         words = go_on(page, HOME)

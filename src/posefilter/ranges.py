@@ -275,6 +275,7 @@ RANGES: dict[str, Range] = {
     "candidate_sampler.rays": COUNT,
     "candidate_sampler.samples": COUNT,
     "candidate_sampler.initial_sigma": METERS,
+    "candidate_sampler.min_depth": METERS,
     "candidate_sampler.margin_behind": Range(0, 100),
     "candidate_sampler.tolerance": METERS,
     "candidate_sampler.candidates_per_kind": COUNT,

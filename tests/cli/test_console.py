@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from rich.progress import Progress
 
 from posefilter.cli.console import ended, logging_for, say, typed
-from posefilter.cli.progress_bar import Bars, Lines, briefly, progress, told
+from posefilter.cli.progress_bar import Bars, Lines, briefly, format_metrics, progress
 from posefilter.progress import bars, watched
 
 METRICS = {
@@ -145,7 +145,7 @@ def test_commands_can_be_typed_as_they_stand(value: str) -> None:
 
 
 def test_words_and_hydras_own_log() -> None:
-    assert told(METRICS) == "loss 1.25, ADD AUC 71.0"
+    assert format_metrics(METRICS) == "loss 1.25, ADD AUC 71.0"
     assert (
         briefly({"train/loss": 2.0, "val/particles_on_object": 0.5, "val/iou": 1.0})
         == "loss 2, on object 50.0 %"

@@ -84,7 +84,10 @@ REFUSED = {
         "filter/initialize=from_depth",
         "or model/proposals=dense",
     ),
-    "model=patch_pf model/box_head=votes": ("model/box_head=pose or spread", "or model/net=patch"),
+    "model=patch_pf model/box_head=votes": (
+        "model/box_head=pose or quantiles",
+        "or model/net=patch",
+    ),
     "model=patch_pf loss/aux/pose=none model/pose_head=fragments": (
         "model/pose_head=fragments",
         "loss/aux/pose=surface_point",

@@ -27,7 +27,7 @@ def contents(folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("command", "arguments", "told"),
     [
-        ("train", [], "holds a run already; choose another folder, or go on with it: resume="),
+        ("train", [], "holds a run already; choose another folder, or resume it: resume="),
         ("train", ["-m", "seed=1,2"], "holds a single run; choose another folder"),
         ("evaluate", ["checkpoint=weights/x.ckpt"], "holds an evaluation already; choose another"),
     ],

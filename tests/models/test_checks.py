@@ -96,7 +96,7 @@ def test_votes_are_refused_where_the_network_reads_the_latent(
 ) -> None:
     with pytest.raises(UserError) as refusal:
         images(tmp_path, f"model={model}", f"variant={variant}", "model/box_head=votes")
-    one_line(refusal, "model/box_head=votes", "model/box_head=pose or spread")
+    one_line(refusal, "model/box_head=votes", "model/box_head=pose or quantiles")
     for box_head in ("pose", "quantiles"):
         images(tmp_path, f"model={model}", f"variant={variant}", f"model/box_head={box_head}")
 
@@ -169,7 +169,7 @@ NUMBERS = {
         "1 pixel or more",
     ],
     "model=patch_pf model.glimpse.spacing=0": ["model.glimpse.spacing=0", "above 0"],
-    "model=patch_pf filter.estimate.options=0": ["estimate", "options=0", "1 or more"],
+    "model=patch_pf filter.estimate.top_fragments=0": ["estimate", "top_fragments=0", "1 or more"],
     "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
     "model=patch_pf filter.estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
     "model.candidate_sampler.levels=1": ["model.candidate_sampler", "levels=1", "2 or more"],
@@ -200,9 +200,9 @@ def test_numbers_that_mean_nothing_are_refused_by_the_key_that_was_typed(
         "model=pixel_pf model.glimpse.size=1",
         "model=patch_pf model.glimpse.size=6",
         "model=cnn_patch model.glimpse.size=1",
-        "model=patch_pf filter.estimate.options=1",
+        "model=patch_pf filter.estimate.top_fragments=1",
         "model=patch_pf filter.estimate.hypotheses=1",
-        "model=patch_pf filter.estimate.options=100",
+        "model=patch_pf filter.estimate.top_fragments=100",
         "model=patch_pf filter.estimate.iterations=0",
         "model=patch_pf model.net.layers=1",
         "model=cnn_patch model.net.hidden=0",

@@ -99,7 +99,7 @@ def test_geometry_of_an_odd_image_is_that_of_the_even_part_and_a_half_known_rim(
     [
         (
             "unet",
-            "objectness color enter down4 down8 down16 down32 to16 up16 to8 up8 to4 skip4 up4",
+            "relevance color enter down4 down8 down16 down32 to16 up16 to8 up8 to4 skip4 up4",
         ),
         ("coordinates", "color enter down4 down8 down16 down32 to16 up16 to8 up8 out"),
     ],

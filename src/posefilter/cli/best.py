@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is tested, and which one it goes on from."""
+"""Which checkpoint of a run is tested, and which one it is resumed from."""
 
 import math
 import os
@@ -63,8 +63,8 @@ class Best(ModelCheckpoint):
 
 
 class Last(Checkpoint):
-    """Write what a run goes on from: at each validation, every few minutes, and where it is told to
-    stop.
+    """Write what a run is resumed from: at each validation, every few minutes, and when it is
+    interrupted.
 
     The checkpoint before it is kept as last.previous.ckpt, for the day on which the last is broken.
 

@@ -62,13 +62,13 @@ def assign_estimates(
 
 
 def score_targets(
-    rows: Sequence[PoseRow], told: str, records: Sequence[FrameRecord], data: PoseDataModule
+    rows: Sequence[PoseRow], selection: str, records: Sequence[FrameRecord], data: PoseDataModule
 ) -> dict[str, Any]:
     """Return the average recall of estimates.
 
     Args:
         rows: The estimates.
-        told: A file of targets, or "all": of `records`, those of visibility 0.1 or more.
+        selection: A file of targets, or "all": of `records`, those of visibility 0.1 or more.
         records: The instances that are tested.
         data: Their dataset, with the meshes of its objects.
 
@@ -78,8 +78,8 @@ def score_targets(
     Raises:
         UserError: A target is not in the data, or an object has no mesh.
     """
-    groups = _group(data.reader.records() if told != ALL else records)
-    targets = read_targets(Path(told)) if told != ALL else None
+    groups = _group(data.reader.records() if selection != ALL else records)
+    targets = read_targets(Path(selection)) if selection != ALL else None
     counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
     place = {record.key: i for i, record in enumerate(data.reader.records())}
     by_key = _sort_rows(rows)
@@ -88,7 +88,7 @@ def score_targets(
     for key in groups if counts is None else counts:
         if key not in groups:
             names = dict(zip(Target._fields, key, strict=False))
-            raise UserError(f"targets={told}: the data have no instance of {names}")
+            raise UserError(f"targets={selection}: the data have no instance of {names}")
         samples = [data.reader.read(place[record.key]) for record in groups[key]]
         shares = [data.reader.visible_share(sample) for sample in samples]
         order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()

@@ -33,7 +33,7 @@ class KeepResults(Callback):
             self._check_run(config)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Check a sweep's folder: an earlier start of the sweep is gone on with."""
+        """Check a sweep's folder: an earlier start of the sweep is resumed."""
         with passing_hydra():
             check_out(config)
             folder = Path(config.hydra.sweep.dir)
@@ -48,9 +48,7 @@ class KeepResults(Callback):
             if holds_evaluation(folder):
                 refuse(folder, "an evaluation already; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
-            refuse(
-                folder, f"a run already; choose another folder, or go on with it: resume={folder}"
-            )
+            refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
         hold_folder(folder)
 
 

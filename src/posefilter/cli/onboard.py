@@ -121,7 +121,7 @@ class Onboarding:
         }
 
     def job(self, folder: Path, *more: str) -> Job:
-        """Return the training, as one of a sweep: begun before, it is gone on with."""
+        """Return the training, as one of a sweep: begun before, it is resumed."""
         quoted = {"data.object": self.mesh.name, "data.root": self.data}
         quoted |= {"data.meshes": self.out / "meshes"}
         words = [

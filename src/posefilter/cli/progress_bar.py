@@ -27,7 +27,7 @@ def progress(console: str) -> Callback:
     return Bars() if console != JSON and sys.stdout.isatty() else Lines(console)
 
 
-def told(metrics: dict[str, Any]) -> str:
+def format_metrics(metrics: dict[str, Any]) -> str:
     """Return the metrics that matter in words: `loss 1.25, ADD AUC 71.0`."""
     known = [(find_metric(name), float(metrics[name])) for name in SHOWN if name in metrics]
     return ", ".join(f"{info.short or info.label} {info.describe(value)}" for info, value in known)
@@ -36,7 +36,9 @@ def told(metrics: dict[str, Any]) -> str:
 def briefly(metrics: dict[str, Any]) -> str:
     """Return the two that fit beside a bar: the loss, and how well it finds the object."""
     finds = "val/add/auc" if "val/add/auc" in metrics else "val/particles_on_object"
-    return told({name: metrics[name] for name in ("train/loss", finds) if name in metrics})
+    return format_metrics(
+        {name: metrics[name] for name in ("train/loss", finds) if name in metrics}
+    )
 
 
 def is_whole(name: str) -> bool:
@@ -97,7 +99,9 @@ class Lines(Callback):
         left = (
             f", {format_duration((steps - step) / rate)} left" if rate > 0 and steps > step else ""
         )
-        words = ", ".join(part for part in (told(seen), f"{rate:.2f} steps/s{left}") if part)
+        words = ", ".join(
+            part for part in (format_metrics(seen), f"{rate:.2f} steps/s{left}") if part
+        )
         numbers = {
             name: float(value)
             for name, value in seen.items()
@@ -149,7 +153,8 @@ class Bars(Callback):
         self._looked()
         if not trainer.sanity_checking:
             self._shown().console.print(
-                f"step {trainer.global_step}: {told(trainer.callback_metrics)}", highlight=False
+                f"step {trainer.global_step}: {format_metrics(trainer.callback_metrics)}",
+                highlight=False,
             )
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

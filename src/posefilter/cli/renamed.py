@@ -210,7 +210,7 @@ ARGUMENTS = {
         "sigma": "sigma_range",
         "start": "initial_sigma",
     },
-    "models.candidate_samplers.LabeledRays": {"past": "margin_behind"},
+    "models.candidate_samplers.LabeledRays": {"past": "margin_behind", "start": "min_depth"},
     "models.box_heads.QuantileBox": {"beyond": "quantile"},
     "models.cnn_patch.CnnPatch": _OBJECTNESS,
     "models.downsized.Downsized": _OBJECTNESS,

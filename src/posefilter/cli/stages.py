@@ -1,4 +1,4 @@
-"""Work in stages that is gone on with where it was interrupted: what is done is kept in a file."""
+"""Work in stages that is resumed where it was interrupted: what is done is kept in a file."""
 
 import json
 import time

@@ -193,5 +193,5 @@ def say_stopped(run: Run) -> None:
         again = typed("train", resume=job.folder, **plugins(job))
         if job.swept:
             again = f"the same command with out={job.folder.parent}"
-        sentence += f"; go on with: {again}"
+        sentence += f"; resume with: {again}"
     say(job.cfg.console, "stopped", sentence, step=step, next=again)

@@ -233,7 +233,7 @@ class LabeledRays:
         rays: Mask pixels of an image, drawn with replacement; None: all of them once, as in the
             paper.
         samples: Points on a ray, evenly spaced.
-        start: Depth of the first [m].
+        min_depth: Depth of the first [m].
         margin_behind: How far the last lies behind the observed point [m].
         tolerance: Half width of the surface [m]; on it a second sample has the observed color.
             Other colors are random.
@@ -246,11 +246,11 @@ class LabeledRays:
         self,
         rays: int | None = 64,
         samples: int = 30,
-        start: float = 0.10,
+        min_depth: float = 0.10,
         margin_behind: float = 0.05,
         tolerance: float = 0.01,
     ) -> None:
-        self.rays, self.samples, self.start = rays, samples, start
+        self.rays, self.samples, self.min_depth = rays, samples, min_depth
         self.margin_behind, self.tolerance = margin_behind, tolerance
 
     def __call__(
@@ -271,13 +271,13 @@ class LabeledRays:
         B, _, _, W = batch.depth.shape
         device = batch.rgb.device
         depth = batch.depth.flatten(1)
-        usable = (batch.mask.flatten(1) & (depth > self.start)).float()
+        usable = (batch.mask.flatten(1) & (depth > self.min_depth)).float()
         pick, drawn = pick_pixels(usable, self.rays, generator)
         pixel = torch.stack([pick % W, pick // W], dim=-1).float()
         z = depth.gather(1, pick)[..., None]
         fraction = torch.linspace(0, 1, self.samples, device=device)
         at = (
-            self.start + (z + self.margin_behind - self.start) * fraction
+            self.min_depth + (z + self.margin_behind - self.min_depth) * fraction
         )  # (B, rays, samples) z-depth [m]
         length = rays(pixel, batch.intrinsics).norm(dim=-1, keepdim=True)
         offset = ((at - z) * length).flatten(1)

@@ -80,7 +80,7 @@ def generate(
     moving_deg: float = 1.0,
     covered_frames: int = 0,
 ) -> Summary:
-    """Render frames of an object into a FAT dataset, or go on with one that was begun.
+    """Render frames of an object into a FAT dataset, or resume one that was begun.
 
     Frame i depends on the settings, the seed and i alone. Settings and the meshes that the frames
     take are checked before anything is written.

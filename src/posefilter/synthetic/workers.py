@@ -75,7 +75,7 @@ def _render_chunks(
             except BrokenProcessPool as error:
                 raise UserError(
                     f"workers={workers}: the system has ended a process that rendered (was it out "
-                    f"of memory?); take fewer, and type the command again: it goes on"
+                    f"of memory?); take fewer, and type the command again: it resumes"
                 ) from error
             finally:
                 pool.shutdown(cancel_futures=True)

@@ -63,7 +63,7 @@ class TrackerSettings:
         motion: How an object may move between two frames.
         follow: What a frame costs while the object is tracked.
         look: What a first look at the whole image costs while the object is lost.
-        search: What a search costs that goes on from the best of what was seen.
+        search: What a search costs that starts from the best of that look.
         move_scale: Standard deviation of the move between two steps, over the noise level.
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
