@@ -25,6 +25,7 @@ OLD = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrast.Contrast"},
         "start": "not an argument that was renamed here",
+        "loss_schedule": [{"until": 1.0, "factors": {"relevance": 0.0, "pose": 0.5}}],
     },
     "filter": {
         "resample": {"_target_": "posefilter.filters.transport.OptimalTransport"},
@@ -40,6 +41,7 @@ NEW = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrastive.Contrastive"},
         "start": "not an argument that was renamed here",
+        "loss_schedule": [{"until": 1.0, "factors": {"objectness": 0.0, "pose": 0.5}}],
     },
     "filter": {
         "resample": {"_target_": "posefilter.filters.transport.SampledTransport"},

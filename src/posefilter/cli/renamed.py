@@ -172,6 +172,7 @@ CLASSES = {
     "data.augmentation.Blank": "data.augmentation.RandomErasing",
     "data.augmentation.Color": "data.augmentation.ColorJitter",
 }
+_LOSSES = {"relevance": "objectness"}
 _OBJECTNESS = {"relevance": "objectness_weight", "relevance_weight": "objectness_weight"}
 # arguments of classes, by today's place of the class below posefilter
 ARGUMENTS = {
@@ -309,6 +310,8 @@ def _upgrade(node: Any) -> Any:
     out = {}
     for key, value in node.items():
         name = rename_argument(target, str(key)) or key
+        if key == "factors" and isinstance(value, Mapping):  # of losses, in a stage of a training
+            value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
         # both names: the old one is refused when the class is built
         out[key if name in node else name] = target if key == "_target_" else _upgrade(value)
     return out
