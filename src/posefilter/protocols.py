@@ -133,6 +133,21 @@ class HasRelevance(Protocol):
         ...
 
 
+@runtime_checkable
+class HasDepth(Protocol):
+    """A scene that keeps the measured depth; required by refinement that aligns with it."""
+
+    @property
+    def measured_depth(self) -> Tensor:
+        """The z-depth (B, H, W) [m]; 0 unknown."""
+        ...
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """The camera matrices (B, 3, 3) [px]."""
+        ...
+
+
 class Schedule(Protocol):
     """Set the noise level of each step."""
 
