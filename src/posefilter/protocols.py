@@ -225,9 +225,9 @@ class Refine(Protocol):
     """Work on a belief after the last step: on its estimate, or on its particles.
 
     Some replace the estimate `best` and its `score` by better ones (rescoring, mean shift, gradient
-    ascent) and leave the particles. Others replace the particles and weights (importance sampling,
-    resample-move) and leave the estimate. One that scores the estimate anew says in `score_is` what
-    the score then is.
+    ascent), or the estimate alone (ICP), and leave the particles. Others replace the particles and
+    weights (importance sampling, resample-move) and leave the estimate. One that scores the
+    estimate anew says in `score_is` what the score then is.
     """
 
     def __call__(

@@ -161,6 +161,7 @@ RANGES: dict[str, Range] = {
     "tracker.move_scale": Range(0, 100),
     "tracker.rounds": _whole(0, 10_000),
     "tracker.fit_points": COUNT,
+    "tracker.icp_prior": Range(0, 1000),
     "tracker.jump_penalty": Range(0, 1000),
     "tracker.kld_epsilon": POSITIVE,
     "tracker.kld_quantile": Range(0, 0.999_999_999, above=True),

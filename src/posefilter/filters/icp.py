@@ -177,3 +177,4 @@ def look_up(depth: Tensor, K: Tensor, pixels: Tensor) -> Surface:
     bend = torch.stack([z[..., 1] + z[..., 2], z[..., 3] + z[..., 4]]) / 2 - z[..., 0]
     flat = (bend.abs() < (_BEND[0] + _BEND[1] * z[..., 0]) / 2).all(0)
     return Surface(middle, normal, (z > 0).all(-1) & flat)
+
