@@ -54,6 +54,9 @@ class PoseFilter:
             weights = softmax(scores)
         best, score = poses[scores.argmax()], scores.max()
         for step in s["refine"]:
+            if step["kind"] == "icp":
+                best = self.align(image, best, **step)
+                continue
             refine = self.rescore if step["kind"] == "rescore" else self.shift
             best, score = refine(scene, best, poses, weights, rng, **step)
         return best, float(score), poses, weights
@@ -98,6 +101,54 @@ class PoseFilter:
             weight = softmax(self.score(scene, near, sigma, pixels, rng))
             best = move(best[None], (weight[:, None] * moves).sum(0)[None], self.center)[0]
         return best, self.score(scene, best[None], sigma, pixels, rng)[0]
+
+    def align(self, image, best, surface, iterations, initial_gate, final_gate, prior, noise,
+              effective, **_):  # fmt: skip
+        """ICP: lay the surface on the measured depth, with the estimate as a Gaussian prior."""
+        pose, own, known = best.astype(float), np.array(surface), False
+        precision = np.diag(self.scale(prior).astype(float) ** -2)
+        moved = np.zeros(6)  # for turns as small as these, twists add up
+        for index in range(iterations):
+            share = index / max(iterations - 1, 1)
+            width = initial_gate * (final_gate / initial_gate) ** share
+            rows, along, weights = pair(image, pose, own, self.center, width)
+            known = weights.sum() > 10
+            if not known:
+                continue
+            weights = weights * min(1, effective / weights.sum()) / noise**2
+            slope = rows.T @ (weights * along) - precision @ moved
+            step = np.linalg.solve((rows.T * weights) @ rows + precision, slope)
+            pose, moved = move(pose[None], step[None], self.center)[0], moved + step
+        return np.float32(pose) if known else best
+
+
+def pair(image, pose, own, center, width):
+    """Point-to-plane distances of surface points (P, 3) to what is measured at their pixels.
+
+    Returns derivatives by a move (P, 6), distances (P,) [m] and weights (P,).
+    """
+    depth, K, R = image["depth"], image["intrinsics"], pose[:3, :3]
+    points, middle = own @ R.T + pose[:3, 3], R @ center + pose[:3, 3]
+    ray = points / np.linalg.norm(points, axis=1, keepdims=True)
+    at = (points[:, :2] / points[:, 2:].clip(1e-3)) * [K[0, 0], K[1, 1]] + K[:2, 2]
+    reach = max(1, round(0.004 * float(K[0, 0])))
+    sides = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * reach
+    u, v = np.moveaxis(np.floor(at + 0.5).clip(-1e6, 1e6).astype(int)[:, None] + sides, -1, 0)
+    inside = (u >= 0) & (u < depth.shape[1]) & (v >= 0) & (v < depth.shape[0])
+    z = depth[v.clip(0, depth.shape[0] - 1), u.clip(0, depth.shape[1] - 1)] * inside
+    seen = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(z)], -1)
+    seen = seen * z[..., None]
+    normal = np.cross(seen[:, 3] - seen[:, 4], seen[:, 1] - seen[:, 2])
+    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12)
+    normal = np.where((normal * seen[:, 0]).sum(1, keepdims=True) > 0, -normal, normal)
+    bend = np.abs((z[:, 1::2] + z[:, 2::2]) / 2 - z[:, :1]).max(1)
+    way = seen[:, 0] - points
+    along = (way * normal).sum(1)
+    counted = (z > 0).all(1) & (bend < 0.003 + 0.005 * z[:, 0]) & (points[:, 2] > 0.05)
+    counted &= (((points - middle) * ray).sum(1) < 0) & ((normal * ray).sum(1) < -0.3)
+    counted &= np.linalg.norm(way, axis=1) < 2.5 * width
+    weights = (1 - (along / width) ** 2).clip(0) ** 2 * counted
+    return np.concatenate([normal, np.cross(points - middle, normal) @ R], 1), along, weights
 
 
 def draw_points(count, even, rng):

@@ -133,6 +133,21 @@ class HasObjectness(Protocol):
         ...
 
 
+@runtime_checkable
+class HasDepth(Protocol):
+    """A scene that keeps the measured depth; required by refinement that aligns with it."""
+
+    @property
+    def measured_depth(self) -> Tensor:
+        """The z-depth (B, H, W) [m]; 0 unknown."""
+        ...
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """The camera matrices (B, 3, 3) [px]."""
+        ...
+
+
 class Schedule(Protocol):
     """Set the noise level of each step."""
 
@@ -210,9 +225,9 @@ class Refine(Protocol):
     """Work on a belief after the last step: on its estimate, or on its particles.
 
     Some replace the estimate `best` and its `score` by better ones (rescoring, mean shift, gradient
-    ascent) and leave the particles. Others replace the particles and weights (importance sampling,
-    resample-move) and leave the estimate. One that scores the estimate anew says in `score_is` what
-    the score then is.
+    ascent), or the estimate alone (ICP), and leave the particles. Others replace the particles and
+    weights (importance sampling, resample-move) and leave the estimate. One that scores the
+    estimate anew says in `score_is` what the score then is.
     """
 
     def __call__(

@@ -21,10 +21,12 @@ from posefilter.deploy.resizing import Resize
 from posefilter.deploy.settings import describe_filter
 from posefilter.deploy.write import make_graphs, to_program, write_filter
 from posefilter.errors import UserError
+from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.geometry.pose import fit_rigid, is_rigid, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
+from posefilter.types import Belief
 
 HOME = Path(__file__).parents[2]
 SCENE = (
@@ -125,6 +127,28 @@ def compare_networks(
             same = graphs.measure.network(tensors[0], torch.tensor(sigma), tensors[1], *truth[:5])
         assert scores.std() > 0 or count == 1
         assert np.abs(scores - same.numpy()).max() < 2e-2  # of scores of up to hundreds
+
+
+def test_the_example_aligns_as_torch_does(
+    estimator: posefilter.Estimator, poses: ModuleType
+) -> None:
+    rgb, depth, K = read_scene()
+    method = estimator.methods[0]
+    batch = make_batch(check_images(rgb, depth, K)[0], None, None)
+    icp = PointToPlaneIcp(iterations=6, prior=0.01)
+    own = poses.PoseFilter.__new__(poses.PoseFilter)
+    own.center, own.radius = method.model.center.numpy(), float(method.model.radius)
+    surface = icp.choose_points(method.model.points).numpy()
+    found = torch.from_numpy(estimator.predict(rgb, depth, K).pose).float()
+    image = {"depth": batch.depth[0, 0].numpy(), "intrinsics": batch.intrinsics[0].numpy()}
+    for number in range(3):
+        noise = torch.randn(6, generator=torch.Generator().manual_seed(number))
+        start = method.space.move(found, 0.004 * noise)[None]
+        given = Belief(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
+        theirs = icp(given, method.encode(batch), method, torch.Generator()).best[0].numpy()
+        ours = own.align(image, start[0].numpy(), surface, **vars(icp))
+        assert np.abs(theirs - start[0].numpy()).max() > 8e-3
+        assert np.abs(ours - theirs).max() < 1e-3  # pixels are rounded in another precision
 
 
 def test_an_estimate_is_that_of_torch(

@@ -5,6 +5,7 @@ from typing import Any
 from posefilter.errors import UserError
 from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
 from posefilter.filters.agreement import Agreement
+from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
@@ -44,7 +45,9 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
                             current_likelihood=reweight.CurrentLikelihood),
         "propagate": [part for one in _list(own.propagate) for part in _describe_move(one, method)],
         "estimate": _describe_estimate(own.estimate),
-        "refine": [part for one in _list(own.refine) for part in _describe_refinement(one)],
+        "refine": [
+            part for one in _list(own.refine) for part in _describe_refinement(one, method)
+        ],
     }  # fmt: skip
 
 
@@ -126,7 +129,7 @@ def _describe_estimate(one: Any) -> dict[str, Any]:
     return {"kind": _choose(one, "estimate", argmax=estimate.Argmax)}
 
 
-def _describe_refinement(one: Any) -> list[dict[str, Any]]:
+def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]]:
     if isinstance(one, refine.NoRefine):
         return []
     if isinstance(one, refine.Rescore):
@@ -142,4 +145,9 @@ def _describe_refinement(one: Any) -> list[dict[str, Any]]:
             "pixels",
         )
         return [{"kind": "mean_shift", **{name: getattr(one, name) for name in names}}]
-    raise _refuse(one, "refine", "mean_shift", "rescore", "none")
+    if isinstance(one, PointToPlaneIcp) and isinstance(method, PosePF):
+        names = ("iterations", "initial_gate", "final_gate", "prior", "noise", "effective")
+        surface = one.choose_points(method.model.points).tolist()
+        own = {name: getattr(one, name) for name in names}
+        return [{"kind": "icp", **own, "surface": surface}]
+    raise _refuse(one, "refine", "mean_shift_icp", "mean_shift", "rescore", "none")

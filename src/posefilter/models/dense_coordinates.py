@@ -36,6 +36,8 @@ class DenseScene(NamedTuple):
     source: Tensor  # (B, n, 3) predicted object points of the likeliest cells [m]
     target: Tensor  # (B, n, 3) their measured camera points [m]
     weights: Tensor  # (B, n) their probability of the object, 0 where no depth is known
+    measured_depth: Tensor  # (B, H, W) z-depth [m]; 0 unknown
+    intrinsics: Tensor  # (B, 3, 3) [px]
 
     @property
     def objectness(self) -> Tensor:
@@ -54,7 +56,13 @@ class DenseCoordinates(Hypotheses):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = ("correspondences", "pose", "pose_space", "propose_poses")
+    provides: ClassVar[Capabilities] = (
+        "correspondences",
+        "depth",
+        "pose",
+        "pose_space",
+        "propose_poses",
+    )
     test_only_settings = ("filter", "train_filter", "cells", "inlier", "refits")
 
     def __init__(
@@ -79,7 +87,9 @@ class DenseCoordinates(Hypotheses):
         source = coordinates.coordinate.detach().flatten(1, 2).gather(1, rows)
         source = source * self.model.radius + self.model.center.to(source)
         target = cells.point.flatten(1, 2).gather(1, rows)
-        return DenseScene(coordinates, cells, self.proposals.reach, source, target, weights)
+        depth = batch.depth[:, 0]
+        paired = (self.proposals.reach, source, target, weights)
+        return DenseScene(coordinates, cells, *paired, depth, batch.intrinsics)
 
     def propose_poses(self, scene: DenseScene, particles: int, generator: Generator) -> Tensor:
         """Fit poses to three correspondences each, and then to those that agree with them.

@@ -34,6 +34,11 @@ class ImageScene:
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: ContextMap
 
+    @property
+    def measured_depth(self) -> Tensor:
+        """The z-depth (B, H, W) [m]; 0 unknown."""
+        return self.image[:, 3]
+
 
 @dataclass(frozen=True)
 class ObjectnessScene(ImageScene):
@@ -66,6 +71,7 @@ class ImageSpace(PoseEstimator):
     """
 
     provides: ClassVar[Capabilities] = (
+        "depth",
         "displacement",
         "image_patches",
         "pixel_space",

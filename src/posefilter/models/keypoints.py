@@ -37,6 +37,7 @@ class KeypointScene(NamedTuple):
     logits: Tensor  # (B, 9, h, w)
     keypoints: Tensor  # (9, 3) in the object's frame [m]
     intrinsics: Tensor  # (B, 3, 3) [px]
+    measured_depth: Tensor  # (B, H, W) z-depth [m]; 0 unknown
     stride: int = STRIDE
 
     @property
@@ -59,7 +60,13 @@ class Keypoints(Hypotheses):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = ("belief_maps", "pose", "pose_space", "propose_poses")
+    provides: ClassVar[Capabilities] = (
+        "belief_maps",
+        "depth",
+        "pose",
+        "pose_space",
+        "propose_poses",
+    )
     test_only_settings = ("filter", "train_filter", "peaks", "subset", "inlier_px")
 
     def __init__(
@@ -77,7 +84,7 @@ class Keypoints(Hypotheses):
         """Run the network."""
         logits = self.net(batch.rgb, batch.depth, batch.intrinsics)
         keypoints = box_keypoints(self.model.hull).to(logits)
-        return KeypointScene(logits, keypoints, batch.intrinsics)
+        return KeypointScene(logits, keypoints, batch.intrinsics, batch.depth[:, 0])
 
     def propose_poses(self, scene: KeypointScene, particles: int, generator: Generator) -> Tensor:
         """Solve for poses that put keypoints at peaks.

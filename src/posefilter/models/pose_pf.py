@@ -48,6 +48,16 @@ class PoseScene(NamedTuple):
             )
         return torch.sigmoid(self.coordinates.logit)[:, None]
 
+    @property
+    def measured_depth(self) -> Tensor:
+        """The z-depth (B, H, W) [m]; 0 unknown."""
+        return self.image.values[..., 3].unflatten(1, self.image.size)
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """The camera matrices (B, 3, 3) [px]."""
+        return self.image.intrinsics
+
     def with_quasi_monte_carlo(self) -> "PoseScene":
         """Return the same images, whose poses are scored by points that are drawn evenly."""
         return self._replace(image=self.image._replace(even=True))
@@ -75,7 +85,7 @@ class PosePF(PoseParticles):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = ("pose", "pose_space", "score_poses")
+    provides: ClassVar[Capabilities] = ("depth", "pose", "pose_space", "score_poses")
     # training rolls out no filter
     test_only_settings = ("filter", "train_filter", "pixels", "quasi_monte_carlo")
     # for comparing the scores of estimate and truth: image points, noise level [m]

@@ -10,7 +10,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.protocols import Scene
-from posefilter.types import Batch, ParticleOutput, Particles, Step
+from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 _NEEDED = ("pose_space", "score_poses", "propose_poses", "objectness")
 
@@ -68,6 +68,11 @@ class Glance:
         space = self.method.space
         assert isinstance(space, PoseSpace)
         return space
+
+    @property
+    def model(self) -> ObjectModel:
+        """The object."""
+        return self.method.model
 
     def encode(self, batch: Batch) -> Scene:
         """Return the frame, which is encoded already."""

@@ -68,6 +68,8 @@ class TrackerSettings:
         rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
             mean as it is.
         fit_pixels: Image points that a pose is scored from in these fits.
+        icp_prior: Standard deviation of that estimate, as the prior of ICP with the measured depth
+            [m on the object's surface]; 0: no ICP. A method that keeps no depth has none.
         jump_penalty: Log odds against a jump to what the network proposes, while the object is
             tracked [nat]; so that it does not flip between faces that look alike.
         kld_epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -97,6 +99,7 @@ class TrackerSettings:
     move_scale: float = 0.4
     rounds: int = 1
     fit_pixels: int = 128
+    icp_prior: float = 0.004
     jump_penalty: float = 5.0
     kld_epsilon: float = 0.15
     kld_quantile: float = 0.95
@@ -115,11 +118,11 @@ class TrackerSettings:
         """Check the numbers."""
         check_whole(self, rounds=0, fit_pixels=1, patience=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0)
-        least = min(self.move_scale, self.smoothing_noise, self.jump_penalty)
+        least = min(self.move_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
         if not (least >= 0 and self.window_scale >= 1):
             raise UserError(
-                "tracker: move_scale, smoothing_noise and jump_penalty must be 0 or more, "
-                "window_scale 1 or more"
+                "tracker: move_scale, smoothing_noise, jump_penalty and icp_prior must be 0 or "
+                "more, window_scale 1 or more"
             )
         if not 0 <= self.search_above <= 1:
             raise UserError(f"tracker: search_above={self.search_above} must lie in [0, 1]")

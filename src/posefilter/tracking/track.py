@@ -11,8 +11,10 @@ from torch import Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.data.resize import network_size
+from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.loop import ParticleFilter, inherit, make_particles
 from posefilter.filters.propagate import Gaussian
+from posefilter.filters.refine import Compose
 from posefilter.filters.resample import Multinomial, Systematic
 from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
@@ -20,6 +22,7 @@ from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images
 from posefilter.models.base import PoseEstimator
+from posefilter.protocols import Refine
 from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
@@ -260,10 +263,17 @@ class Track:
             resample=Systematic(),
             propagate=Gaussian(settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=QuadraticFit(rounds, pixels=settings.fit_pixels),
+            refine=self._refine(rounds),
         )
         glance = Glance(self.method, scene, budget.pixels, budget.proposals, against)
         return self._weigh(batch, filter(batch, glance, self.generator))
+
+    def _refine(self, rounds: int) -> Refine:
+        """Return what improves a frame's estimate: the likelihood, then the measured depth."""
+        fit = QuadraticFit(rounds, pixels=self.settings.fit_pixels)
+        if not self.settings.icp_prior or "depth" not in self.method.capabilities:
+            return fit
+        return Compose([fit, PointToPlaneIcp(prior=self.settings.icp_prior)])
 
     def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State | None:
         """Return the state after a frame; `belief` is None where what it shows is not trusted.

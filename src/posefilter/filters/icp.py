@@ -1,0 +1,183 @@
+"""Refinement by the measured depth: the iterative closest point method, with a prior."""
+
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
+from posefilter.geometry.camera import back_project, project
+from posefilter.geometry.lookup import nearest_pixel
+from posefilter.geometry.pose import origin_of, rotation_of, transform
+from posefilter.geometry.pose_statistics import twist_between
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.protocols import HasDepth, Method, Scene
+from posefilter.types import Belief, ObjectModel
+
+_FEW = 10.0  # surface points, by their weights: fewer say nothing
+_GRAZING = 0.3  # cosine of the angle between a measured surface and the way to the camera
+_FAR = 2.5  # widths of the loss, beyond which a measured point is not the surface point's
+_NEAREST = 0.05  # [m] from the camera's plane
+_STEP = 0.004  # [focal lengths] from a pixel to the neighbors that its normal is taken from
+_BEND = (0.006, 0.01)  # [m, share of depth] between a pixel and its neighbors' mean: an edge
+
+
+class Surface(NamedTuple):
+    """What is measured at pixels."""
+
+    points: Tensor  # (B, P, 3) [m]
+    normals: Tensor  # (B, P, 3) unit, towards the camera
+    known: Tensor  # (B, P) bool: there is depth, and no edge of it
+
+
+class PointToPlaneIcp:
+    """Lay the estimate's surface on the measured depth: point-to-plane ICP (Chen and Medioni 1992).
+
+    Each surface point that faces the camera is paired with what is measured at its pixel
+    (projective data association, Blais and Levine 1995), where that is near. Gauss-Newton steps
+    minimize the distances along the measured normals under Tukey's robust loss, whose width falls.
+    Depth does not determine every pose: a plane may slide along itself. The estimate before is
+    therefore a Gaussian prior, and the result the most probable pose given both.
+
+    Args:
+        iterations: Gauss-Newton steps.
+        initial_gate: Distance beyond which a pair does not count in the first step [m].
+        final_gate: In the last step; geometric between.
+        prior: Standard deviation of the estimate before [m on the object's surface].
+        noise: Standard deviation of a distance along the normal [m].
+        effective: Points count as this many independent ones at most, since errors of depth are
+            alike at neighboring pixels, and as errors of the mesh are.
+        points: Surface points at most.
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    requires: ClassVar[Capabilities] = ("depth", "pose")
+
+    def __init__(
+        self,
+        iterations: int = 5,
+        initial_gate: float = 0.015,
+        final_gate: float = 0.006,
+        prior: float = 0.004,
+        noise: float = 0.004,
+        effective: float = 120.0,
+        points: int = 500,
+    ) -> None:
+        least = min(iterations, final_gate, prior, noise, effective, points)
+        if not least > 0 or final_gate > initial_gate:
+            raise UserError(
+                "refine: ICP needs numbers above 0, final_gate no larger than initial_gate; got "
+                f"iterations={iterations}, initial_gate={initial_gate}, final_gate={final_gate}, "
+                f"prior={prior}, noise={noise}, effective={effective}, points={points}"
+            )
+        self.iterations = iterations
+        self.initial_gate, self.final_gate = initial_gate, final_gate
+        self.prior, self.noise, self.effective = prior, noise, effective
+        self.points = points
+
+    @torch.no_grad()
+    def __call__(
+        self, belief: Belief, scene: Scene, method: Method, generator: Generator
+    ) -> Belief:
+        """Return the belief with the estimate moved; the score stays.
+
+        Raises:
+            UserError: The method has no depth.
+        """
+        model: ObjectModel | None = getattr(method, "model", None)
+        if not isinstance(scene, HasDepth) or model is None:
+            raise UserError(
+                f"filter/refine: {type(method).__name__} keeps no depth to align poses with; "
+                "choose filter/refine=mean_shift or none"
+            )
+        first = belief.best
+        x, y, z = model.center.tolist()
+        space = PoseSpace((x, y, z), model.radius)
+        center, own = model.center.to(first), self.choose_points(model.points).to(first)
+        precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
+        pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
+        for index in range(self.iterations):
+            part = index / max(self.iterations - 1, 1)
+            width = self.initial_gate * (self.final_gate / self.initial_gate) ** part
+            rows, offsets, weights = self._pair(pose, own, center, scene, width)
+            total = weights.sum(-1)
+            known = total > _FEW
+            share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
+            weighted = rows.mT * (weights * share[:, None])[:, None]
+            moved = twist_between(first, pose, center).double()[..., None]
+            slope = weighted @ offsets[..., None] - precision @ moved
+            step = torch.linalg.solve(weighted @ rows + precision, slope)[..., 0].to(pose)
+            pose = torch.where(known[:, None, None], space.move(pose, step), pose)
+        # without enough points in the last step what was paired before was something else
+        return belief._replace(best=torch.where(known[:, None, None], pose, first))
+
+    def choose_points(self, points: Tensor) -> Tensor:
+        """Return every so many of an object's surface points.  (P, 3) -> (`points` at most, 3)."""
+        return points[:: -(-len(points) // self.points)]
+
+    def _pair(
+        self, pose: Tensor, own: Tensor, center: Tensor, scene: HasDepth, width: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Pair surface points with what is measured at their pixels.
+
+        Args:
+            pose: (B, 4, 4) camera_from_object [m].
+            own: (P, 3) surface points [m].
+            center: (3,) the object's center [m].
+            scene: Depth and camera.
+            width: Of the loss [m].
+
+        Returns:
+            Derivatives (B, P, 6) of each point's place along the measured normal by the twist, how
+            far it has to go (B, P) [m], and its weight (B, P); in float64.
+        """
+        points, middle = transform(pose, own), origin_of(pose, center)[:, None]
+        ahead = points[..., 2] > _NEAREST
+        pixels = nearest_pixel(project(points, scene.intrinsics))
+        seen = look_up(scene.measured_depth, scene.intrinsics, pixels)
+        view = torch.nn.functional.normalize(points, dim=-1)
+        facing = ((points - middle) * view).sum(-1) < 0
+        frontal = (seen.normals * view).sum(-1) < -_GRAZING
+        way = seen.points - points
+        near = way.norm(dim=-1) < _FAR * width
+        along = (way * seen.normals).sum(-1)
+        tukey = (1 - (along / width).square()).clamp_min(0).square()
+        counted = seen.known & ahead & facing & frontal & near
+        turn = torch.linalg.cross(points - middle, seen.normals) @ rotation_of(pose)
+        rows = torch.cat([seen.normals, turn], dim=-1)
+        return rows.double(), along.double(), (tukey * counted).double()
+
+
+def look_up(depth: Tensor, K: Tensor, pixels: Tensor) -> Surface:
+    """Return the measured points and normals at pixels.
+
+    A normal is that of the differences between a pixel's neighbors on either side; there is none at
+    an edge of depth, beside missing depth, or at the image's rim.
+
+    Args:
+        depth: (B, H, W) z-depth [m]; 0 unknown.
+        K: (B, 3, 3) [px].
+        pixels: (B, P, 2) int64 as (u, v); may lie outside.
+
+    Returns:
+        The surface (B, P).
+    """
+    H, W = depth.shape[-2:]
+    step = max(1, round(_STEP * float(K[:, 0, 0].mean())))
+    sides = pixels.new_tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * step
+    around = pixels[:, :, None] + sides
+    u, v = around.unbind(-1)
+    inside = (u >= 0) & (u < W) & (v >= 0) & (v < H)
+    index = v.clamp(0, H - 1) * W + u.clamp(0, W - 1)
+    z = depth.flatten(1).gather(1, index.flatten(1)).view(index.shape) * inside
+    at = back_project(around.flatten(1, 2).to(z), z.flatten(1), K).view(*z.shape, 3)
+    middle, right, left, below, above = at.unbind(2)
+    normal = torch.linalg.cross(below - above, right - left)
+    normal = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    normal = torch.where((normal * middle).sum(-1, keepdim=True) > 0, -normal, normal)
+    bend = torch.stack([z[..., 1] + z[..., 2], z[..., 3] + z[..., 4]]) / 2 - z[..., 0]
+    flat = (bend.abs() < (_BEND[0] + _BEND[1] * z[..., 0]) / 2).all(0)
+    return Surface(middle, normal, (z > 0).all(-1) & flat)
