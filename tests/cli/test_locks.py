@@ -1,6 +1,7 @@
 """One run a folder: the lock of a run that was killed is free, that of one that lives is not."""
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -115,3 +116,17 @@ def test_a_file_that_grows_is_on_the_disk_after_a_second(
     with pytest.raises(UserError, match="a: cannot be written"):  # of another: it is not touched
         GrowingFile(tmp_path / "a").add("x")
     assert (tmp_path / "a").read_text() == "abcd"
+
+
+def test_a_checkpoint_of_a_training_that_runs_is_not_calibrated_in_place(
+    tmp_path: Path, holder: Callable[[Path], int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It would write an older one over a better one that the training has written meanwhile."""
+    file = tmp_path / "run" / "checkpoints" / "best.ckpt"
+    file.parent.mkdir(parents=True)
+    shutil.copy(HOME / "weights" / "003_cracker_box.ckpt", file)
+    before = file.read_bytes()
+    holder(tmp_path / "run")
+    assert run_command("calibrate", HOME, [f"checkpoint={file}", "replace=true"]) == 2
+    assert f"{tmp_path / 'run'}: is in use by another run" in capfd.readouterr().err
+    assert file.read_bytes() == before

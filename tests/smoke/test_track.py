@@ -204,6 +204,18 @@ def test_what_was_tracked_before_a_kill_is_kept(
         assert np.array_equal(row.camera_from_native, line["camera_from_object"])
 
 
+@pytest.mark.parametrize("name", ["poses.partial.csv", "poses.partial.jsonl"])
+def test_what_a_killed_one_has_left_is_not_touched_whatever_it_is(
+    name: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_bytes(b"\xff\n" * 3)
+    assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 2
+    assert "of a track.py that was killed" in capsys.readouterr().err
+    assert [file.name for file in out.iterdir()] == [name]
+
+
 def test_what_was_tracked_before_a_sigterm_is_kept(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]

@@ -1,5 +1,6 @@
 """What has been tracked so far, in two files that a killed `track.py` leaves behind."""
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -75,7 +76,7 @@ def check_unused(folder: Path) -> None:
     if (folder / POSES).is_file():
         raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
     lines, poses = folder / _LINES, folder / _CSV
-    if lines.is_file():
+    if os.path.lexists(lines) or os.path.lexists(poses):
         raise UserError(
             f"out={folder}: holds {_count_frames(lines)} frames of a track.py that was killed, in "
             f"{lines.name} and {poses.name}; choose another folder, or move these files away"
@@ -84,6 +85,8 @@ def check_unused(folder: Path) -> None:
 
 def _count_frames(lines: Path) -> int:
     """Return the number of frames in a poses.partial.jsonl; a line without an end is not one."""
+    if not lines.is_file():
+        return 0
     with lines.open("rb") as file:
         # what comes before a line's numbers names its video and frame
         return len({x.partition(b', "scene_id"')[0] for x in file if x.endswith(b"\n")})
