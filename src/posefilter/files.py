@@ -1,5 +1,8 @@
-"""Files that are whole or not there: written beside their target, synced, then renamed."""
+"""Files that are whole or not there: written beside their target, synced, then renamed; and files
+that grow, whose content so far survives.
+"""
 
+import errno
 import io
 import os
 import time
@@ -12,6 +15,7 @@ from typing import BinaryIO, TextIO
 from posefilter.errors import UserError
 
 _PARTS = (".*.part", ".*.part.mp4")  # a video's ending tells its encoder the format
+_SYNC_EVERY = 1.0  # of a file that grows [s]
 
 
 @contextmanager
@@ -58,6 +62,53 @@ def write_whole(path: Path, content: bytes | memoryview | str, sync: bool = Fals
     """Write a file, all of it or nothing; as `open_whole`."""
     with open_whole(path, sync) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+class GrowingFile:
+    """A file that grows by whole pieces, and keeps them whatever ends its process.
+
+    A piece outlives a SIGKILL from the moment that it is added, and a loss of power after a second.
+    The file is made with the first piece; what has its name before is not touched.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file: io.FileIO | None = None
+        self._size, self._synced = 0, 0.0
+
+    def add(self, piece: str) -> None:
+        """Add a piece, all of it or nothing.
+
+        Raises:
+            UserError: It cannot be written, as on a full disk.
+        """
+        content = piece.encode()
+        try:
+            if self._file is None:
+                self._file = io.FileIO(self.path, "x")
+                _sync_folder(self.path.parent)
+            # one call without a buffer: no signal comes between its first byte and its last
+            if self._file.write(content) != len(content):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._size += len(content)
+            if time.monotonic() - self._synced >= _SYNC_EVERY:
+                os.fsync(self._file.fileno())
+                self._synced = time.monotonic()
+        except OSError as error:
+            if self._file is not None:
+                with suppress(OSError):
+                    self._file.truncate(self._size)
+                    if not self._size:
+                        self.path.unlink()
+            raise UserError(f"{self.path}: cannot be written ({error.strerror})") from error
+
+    def close(self) -> None:
+        """Close the file, which stays."""
+        if self._file is not None:
+            self._file.close()
 
 
 def remove_parts(folder: Path, places: Sequence[str], seconds: float = 0.0) -> None:

@@ -1,6 +1,9 @@
 """Command lines that make no sense end in one line that names what is wrong, and leave nothing."""
 
+import io
 import json
+import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,7 +12,8 @@ import torch
 from posefilter.cli import run_command
 from posefilter.cli.build import make_trainer
 from posefilter.cli.command import compose_job
-from posefilter.cli.explain import explain_hydra
+from posefilter.cli.console import say
+from posefilter.cli.explain import explain, explain_hydra
 from posefilter.cli.folders import read_metrics
 from posefilter.cli.instantiate import instantiate
 from posefilter.errors import UserError
@@ -132,3 +136,70 @@ def test_a_launcher_that_fails_is_named() -> None:
         with pytest.raises(RuntimeError) as caught:
             exec(compile("raise RuntimeError('no srun\\nhere')", file, "exec"))
         assert explain_hydra(caught.value, HOME / "conf", typed) == told
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("raise ValueError('a\\nb')", "ValueError: a)"),
+        ("import sys; sys.exit(0)", "SystemExit: 0)"),
+        ("def (", "SyntaxError: "),
+        ("def f(): f()\nf()", "RecursionError: "),
+    ],
+)
+def test_a_plugin_that_cannot_be_imported_is_one_line(
+    content: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "broken_plugin.py").write_text(content)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("posefilter.cli.command.trust", lambda package: None)
+    typed = ["checkpoint=003_cracker_box", "out=a.ckpt", "plugins=[broken_plugin]"]
+    assert run_command("export", HOME, typed) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"export: plugins=broken_plugin: could not be imported ({told}")
+
+
+@pytest.mark.parametrize("name", ["a,b", "x'y", "[z]", 'q"r', "$w'", "{q}", "~t"])
+def test_a_name_that_hydra_cannot_read_is_told_as_it_is_typed(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["checkpoint=003_cracker_box", "intrinsics=1,1,1,1", f"out={tmp_path / 'out'}"]
+    argument = f"frames=/nope/{name}"
+    if name != "~t":  # which is quoted for its user
+        assert run_command("track", HOME, [*typed, argument]) == 2
+        (line,) = capfd.readouterr().err.splitlines()
+        assert line.startswith(f"track: {argument}: ")
+        (argument,) = shlex.split(line.partition("as one text it is typed ")[2])
+    assert run_command("track", HOME, [*typed, argument]) == 2
+    assert capfd.readouterr().err == f"track: frames=/nope/{name}: no such folder\n"
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_console_that_lacks_a_sign_ends_no_run(
+    encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = io.BytesIO()
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(shown, encoding, write_through=True))
+    monkeypatch.setattr("posefilter.cli.generate.generate", lambda job: say("rich", "", "日本"))
+    assert run_command("generate", HOME, [f"out={tmp_path / 'out'}"]) == 0
+    assert shown.getvalue().endswith(b"\\u65e5\\u672c\n")
+
+
+def test_an_export_overwrites_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The file may be the training's own, with its optimizer."""
+    own = tmp_path / "own.ckpt"
+    shutil.copy(HOME / "weights" / "003_cracker_box.ckpt", own)
+    before = own.read_bytes()
+    (tmp_path / "link.ckpt").symlink_to(own)
+    for out in (own, tmp_path / "link.ckpt"):
+        assert run_command("export", HOME, [f"checkpoint={own}", f"out={out}"]) == 2
+        assert f"out={out}: is there already" in capfd.readouterr().err
+    assert own.read_bytes() == before
+
+
+def test_a_closed_pipe_is_told_as_one() -> None:
+    assert "what it prints to was closed" in explain(BrokenPipeError(32, "x"), "track", HOME, [])

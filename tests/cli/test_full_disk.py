@@ -20,6 +20,7 @@ from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image
 from posefilter.figures.video import VideoWriter
+from posefilter.files import GrowingFile
 from posefilter.metrics.bop_results import PoseRow, write_poses_csv
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.synthetic.fat_format import write_image
@@ -100,3 +101,18 @@ def test_a_full_disk_leaves_no_video(full_disk: Path, capfd: pytest.CaptureFixtu
         film(full_disk / "video")
     assert not [*full_disk.glob("*video*")]
     assert capfd.readouterr().err == ""
+
+
+def test_a_full_disk_ends_a_file_that_grows_at_a_whole_piece(full_disk: Path) -> None:
+    file, piece = GrowingFile(full_disk / "grown"), "0123456\n" * 1250
+    fitting = KILOBYTES * 1024 // len(piece)
+    for _ in range(fitting):
+        file.add(piece)
+    with pytest.raises(UserError, match=r"grown: cannot be written \(No space left on device\)"):
+        file.add(piece)
+    file.close()
+    assert (full_disk / "grown").read_text() == piece * fitting
+    (full_disk / "grown").unlink()
+    with pytest.raises(UserError, match="cannot be written"):
+        GrowingFile(full_disk / "none").add("0" * 1024 * KILOBYTES * 2)
+    assert not (full_disk / "none").exists()

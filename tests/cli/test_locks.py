@@ -1,6 +1,7 @@
 """One run a folder: the lock of a run that was killed is free, that of one that lives is not."""
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ import pytest
 
 from posefilter.cli import run_command
 from posefilter.errors import UserError
-from posefilter.files import open_whole, remove_parts
+from posefilter.files import GrowingFile, open_whole, remove_parts
 from posefilter.locks import LOCK, hold, release
 
 HOME = Path(__file__).parents[2]
@@ -98,3 +99,34 @@ def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:
     assert part.exists()  # too young
     remove_parts(tmp_path, [".", "checkpoints"])
     assert not list((tmp_path / "checkpoints").iterdir())
+
+
+def test_a_file_that_grows_is_on_the_disk_after_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, synced = [100.0], list[str]()
+    file = GrowingFile(tmp_path / "a")
+    monkeypatch.setattr("posefilter.files.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("os.fsync", lambda _: synced.append((tmp_path / "a").read_text()))
+    for piece in "abcd":
+        file.add(piece)
+        now[0] += 0.6
+    assert "a" in synced  # its name is on the disk, and its first piece
+    assert synced[-1] == "abc"
+    with pytest.raises(UserError, match="a: cannot be written"):  # of another: it is not touched
+        GrowingFile(tmp_path / "a").add("x")
+    assert (tmp_path / "a").read_text() == "abcd"
+
+
+def test_a_checkpoint_of_a_training_that_runs_is_not_calibrated_in_place(
+    tmp_path: Path, holder: Callable[[Path], int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It would write an older one over a better one that the training has written meanwhile."""
+    file = tmp_path / "run" / "checkpoints" / "best.ckpt"
+    file.parent.mkdir(parents=True)
+    shutil.copy(HOME / "weights" / "003_cracker_box.ckpt", file)
+    before = file.read_bytes()
+    holder(tmp_path / "run")
+    assert run_command("calibrate", HOME, [f"checkpoint={file}", "replace=true"]) == 2
+    assert f"{tmp_path / 'run'}: is in use by another run" in capfd.readouterr().err
+    assert file.read_bytes() == before

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from posefilter.filters.agreement import Agreement
-from posefilter.geometry.pose import make_pose
+from posefilter.geometry.pose import fit_rigid, invert, make_pose, transform
 from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
-from posefilter.types import Fragments, ObjectModel, ParticleOutput, Particles
+from posefilter.types import Belief, Fragments, ObjectModel, ParticleOutput, Particles
 
 MODEL = ObjectModel(
     "cube",
@@ -161,3 +161,66 @@ def test_a_particle_agrees_within_two_scales() -> None:
     output = ParticleOutput(log_p, torch.zeros(1, N, 2), own, empty)
     belief = Agreement(scale)(particles, output, None, Points(point), g)  # type: ignore[arg-type]
     assert float(belief.score) == pytest.approx(57 / 60 * math.exp(-0.5), rel=1e-4)
+
+
+def noisy(count: int = 40, off: float = 0.012) -> tuple[torch.Tensor, ParticleOutput, Particles]:
+    """Return measured points, and particles whose poses are each some way off; one image."""
+    g = torch.Generator().manual_seed(5)
+    truth = make_pose(random_rotation(1, generator=g), torch.tensor([[0.1, 0.0, 0.9]]))
+    thing = torch.rand(1, count, 3, generator=g) * 0.2 - 0.1
+    point = (truth[:, None, :3, :3] @ thing[..., None])[..., 0] + truth[:, None, :3, 3]
+    own = truth[:, None].repeat(1, count, 1, 1)
+    own[..., :3, 3] += off * torch.randn(1, count, 3, generator=g)
+    log_p, empty = -torch.rand(1, count, generator=g), torch.zeros(1, count, 0)
+    particles = Particles(
+        torch.zeros(1, count, 2), empty, log_p.log_softmax(1), torch.arange(count)[None]
+    )
+    return point, ParticleOutput(log_p, torch.zeros(1, count, 2), own, empty), particles
+
+
+def agree(count: int = 40, **settings: float) -> Belief:
+    point, output, particles = noisy(count)
+    g = torch.Generator().manual_seed(6)
+    return Agreement(**settings)(particles, output, None, Points(point), g)  # type: ignore[arg-type]
+
+
+def weigh(pose: torch.Tensor, scale: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return each particle's own object point, its measured one, and its weight under a pose."""
+    point, output, _ = noisy()
+    told = transform(invert(output.pose), point[:, :, None])[:, :, 0]
+    square = (transform(pose, told) - point).square().sum(-1)
+    return told, point, output.log_likelihood.exp() / (1 + square / scale**2) ** 2
+
+
+@pytest.mark.parametrize(("iterations", "scales"), [(1, [4]), (2, [4, 1]), (3, [4, 2, 1])])
+def test_the_scale_of_the_refit_falls_from_four_to_one(iterations: int, scales: list[int]) -> None:
+    best = agree(iterations=0, scale_m=0.01).best
+    for scale in scales:
+        best = fit_rigid(*weigh(best, 0.01 * scale))
+    found = agree(iterations=iterations, scale_m=0.01).best
+    torch.testing.assert_close(found, best, atol=1e-5, rtol=0)
+
+
+def test_a_vote_counts_by_its_inliers_to_the_power_of_the_counts() -> None:
+    belief = agree(scale_m=0.01, counts=3.0)
+    inliers = torch.stack([weigh(pose[None], 0.02)[2].sum() for pose in belief.poses[0]])
+    torch.testing.assert_close(
+        belief.log_weights[0], (3 * inliers.log()).log_softmax(0), atol=1e-3, rtol=0
+    )
+    assert float(belief.log_weights.std()) > 0.1
+
+
+def test_where_no_point_is_known_all_count() -> None:
+    point, output, particles = noisy()
+
+    class Unknown(Points):
+        def surface_points(
+            self, scene: None, state: torch.Tensor
+        ) -> tuple[torch.Tensor, torch.Tensor]:
+            return self.point, torch.zeros_like(self.point[..., 0], dtype=torch.bool)
+
+    g = torch.Generator().manual_seed(6)
+    found = Agreement()(particles, output, None, Unknown(point), g)  # type: ignore[arg-type]
+    middle = output.pose[0, :, :3, 3].mean(0)
+    assert float((found.best[0, :3, 3] - middle).norm()) < 0.01
+    assert 0.5 < float(found.score) <= 1

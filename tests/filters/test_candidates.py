@@ -4,6 +4,7 @@ frame.
 
 import math
 
+import pytest
 import torch
 from tests.models.toy import scenes, square
 
@@ -14,6 +15,7 @@ from posefilter.filters.candidates import (
     sample_from_depth,
 )
 from posefilter.filters.propagate import HalfTurns, half_turns
+from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
@@ -131,3 +133,30 @@ def test_a_resumed_run_has_the_same_particles_and_levels() -> None:
     )
     resumed.restore({})
     assert resumed.state() == {}
+
+
+def test_after_the_last_level_a_frames_own_particles_are_gone() -> None:
+    batch = scenes(1)
+    kept = PersistentParticles(particles=4, levels=2, sharpest=0.01)
+    fresh = [sample_from_depth(batch, SPACE, 4, generator(seed)) for seed in range(3)]
+    found = []
+    for one in fresh:
+        poses, sigma = kept.recall(batch, one, 0.1)
+        found.append(poses)
+        kept.advance(
+            batch, poses, torch.zeros(1, 4), sigma, torch.tensor([True]), SPACE, generator()
+        )
+    assert torch.equal(found[0], fresh[0])
+    assert not torch.equal(found[1], fresh[1])
+    assert torch.equal(found[2], fresh[2])
+
+
+def test_candidates_on_the_object_are_now_and_then_beside_it() -> None:
+    """A pixel of the object has 51 times the weight of another."""
+    batch, count = scenes(1), 8000
+    poses = sample_around_truth(batch, MODEL, SPACE, count, (0.01, 0.1), generator(), HalfTurns())
+    pixels = project(origin_of(poses[:, 1 + count : 1 + 2 * count], MODEL.center), batch.intrinsics)
+    u, v = pixels[0].round().long().unbind(-1)
+    on = batch.mask[0, 0, v, u].double().mean()
+    seen, all_of_them = int(batch.mask.sum()), batch.mask.numel()
+    assert float(on) == pytest.approx(51 * seen / (51 * seen + all_of_them - seen), abs=0.015)

@@ -53,10 +53,14 @@ def moments(belief: Belief) -> tuple[Tensor, Tensor]:
     return mean, covariance_about(origin, poses, weights, CENTER)
 
 
-@pytest.mark.parametrize("temperature", [1.0, 2.0])
-def test_the_new_particles_have_the_moments_of_the_posterior(temperature: float) -> None:
+@pytest.mark.parametrize(
+    ("options", "temperature"), [({}, 1.0), ({"temperature": 2.0}, 2.0)], ids=["default", "hot"]
+)
+def test_the_new_particles_have_the_moments_of_the_posterior(
+    options: dict[str, float], temperature: float
+) -> None:
     before = search_result()
-    sampling = ImportanceSampling(400, rounds=2, temperature=temperature)
+    sampling = ImportanceSampling(400, rounds=2, **options)  # type: ignore[arg-type]
     after = sampling(before, None, Known(), torch.Generator().manual_seed(1))  # type: ignore[arg-type]
     mean, covariance = moments(after)
     scale = SCALE * math.sqrt(temperature)
@@ -110,3 +114,38 @@ def test_widened_turns_end_before_they_wrap_round() -> None:
 def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="importance sampling needs"):
         ImportanceSampling(**wrong)  # type: ignore[arg-type]
+
+
+def test_only_the_density_of_the_search_is_widened() -> None:
+    seen: list[float] = []
+
+    class Watched(ImportanceSampling):
+        def propose(
+            self, poses: Tensor, weights: Tensor, method: Any, widening: float, generator: Generator
+        ) -> tuple[Tensor, Tensor]:
+            seen.append(widening)
+            return super().propose(poses, weights, method, widening, generator)
+
+    Watched(20, 3, widening=1.5)(search_result(), None, Known(), Generator().manual_seed(0))  # type: ignore[arg-type]
+    assert seen == [1.5, 1.0, 1.0]
+
+
+def test_kernels_are_of_their_own_mode_though_it_has_few_poses() -> None:
+    """Three images of two modes with twenty poses each, half a turn apart: a kernel over both would
+    seldom hit one, and few of its draws would have any weight.
+    """
+    turn = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    half = make_pose(turn, CENTER - turn @ CENTER)
+
+    class Two(Known):
+        def score_poses(self, scene: Any, poses: Tensor, *rest: Any) -> Tensor:
+            ends = torch.stack([poses.double(), poses.double() @ half])
+            return super().score_poses(scene, ends, *rest).logsumexp(0)
+
+    g = torch.Generator().manual_seed(0)
+    noise = torch.randn(3, 40, 6, generator=g).double() * SCALE
+    poses = move_about(torch.eye(4).double().expand(3, 40, 4, 4), noise, CENTER)
+    poses[:, 20:] = poses[:, 20:] @ half
+    before = Belief(poses, torch.full((3, 40), -math.log(40)), poses[:, 0], torch.zeros(3))
+    after = ImportanceSampling(400, 1, widening=1.0)(before, None, Two(), g)  # type: ignore[arg-type]
+    assert float((-after.log_weights.mul(2).logsumexp(1)).exp().mean()) > 35

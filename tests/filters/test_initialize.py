@@ -202,3 +202,18 @@ def test_the_seed_decides_where_and_how_poses_are_turned() -> None:
     one, same, other = (run(FromDepth(), Poses(), particles=20, seed=s) for s in (3, 3, 4))
     assert torch.equal(one, same)
     assert not torch.equal(rotation_of(one), rotation_of(other))
+
+
+@pytest.mark.parametrize(("fraction", "near"), [(0.0, 0), (0.5, 1), (1.0, 2)])
+def test_none_one_or_all_of_two_start_at_the_object(fraction: float, near: int) -> None:
+    piece = Informed(UniformPixels(), object_fraction=fraction, sigma_px=0.0).train()
+    state = run(piece, Pixels(), particles=2)
+    plain = run(UniformPixels(), Pixels(), particles=2)
+    assert torch.equal(state[:, near:], plain[:, near:])
+    assert overlaps_mask(images().mask, state)[0, :near].all()
+    assert not overlaps_mask(images().mask, state)[0, near:].any()
+
+
+def test_an_informed_start_is_of_pixels() -> None:
+    with pytest.raises(UserError, match="filter/initialize=informed draws pixels"):
+        run(Informed(FromDepth()).train(), Poses())

@@ -1,14 +1,16 @@
 """The loop: what goes from step to step, what stays apart, and what is the same again."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
+from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.estimate import Argmax, Mean
-from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.loop import ParticleFilter, inherit
 from posefilter.filters.propagate import Compose, Gaussian, Identity, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import BelowESS, NoResampling, Soft, Systematic
@@ -18,7 +20,7 @@ from posefilter.filters.transport import EnsembleTransform, SampledTransport
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import distinct
 from posefilter.protocols import Resample
-from posefilter.types import ParticleOutput, Particles, Step
+from posefilter.types import ParticleOutput, Particles, Resampled, Step
 
 EYE = torch.eye(4)
 
@@ -256,6 +258,8 @@ def test_annealed_weights_are_the_last_scores_alone() -> None:
         trace.particles[-1].log_weights, trace.outputs[-1].log_likelihood.log_softmax(1)
     )
     torch.testing.assert_close(trace.belief.score, trace.outputs[-1].log_likelihood.amax(1))
+    assert torch.equal(trace.belief.log_weights, trace.particles[-1].log_weights)
+    assert torch.equal(trace.belief.poses, trace.outputs[-1].pose)
 
 
 def test_copies_of_a_particle_stay_together_until_noise_parts_them() -> None:
@@ -274,3 +278,53 @@ def test_copies_of_a_particle_stay_together_until_noise_parts_them() -> None:
         ends[name] = distinct(trace.particles[-1].state)
     assert (ends["alone"] < 0.5).all()
     assert (ends["with noise"] > 0.9).all()
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3])
+@pytest.mark.parametrize("layout", ["whole rows", "one for all", "every second", "with gradient"])
+def test_a_child_has_what_its_ancestor_has_however_it_lies_in_memory(
+    rows: int, layout: str
+) -> None:
+    g = Generator().manual_seed(0)
+    values = torch.randn(rows, 5, 2, 3, generator=g)
+    if layout == "one for all":
+        values = values[:, :1].expand(rows, 5, 2, 3)
+    elif layout == "every second":
+        values = torch.randn(rows, 10, 2, 3, generator=g)[:, ::2]
+    elif layout == "with gradient":
+        values = values.requires_grad_()
+    ancestors = torch.randint(5, (rows, 7), generator=g)
+    found = inherit(values, Resampled(ancestors, torch.zeros(rows, 7)))
+    for row in range(rows):
+        for child in range(7):
+            assert torch.equal(found[row, child], values[row, ancestors[row, child]])
+
+
+def test_auxiliary_resampling_knows_the_images_of_its_run() -> None:
+    """The upper half of the image is relevant: from the second step on most particles are there,
+    and weights make up for it.
+    """
+
+    class Seen(Hill):
+        objectness = torch.ones(1, 1, 2, 1)
+        objectness[:, :, 1] = 0.1
+
+        def encode(self, batch: object) -> "Seen":  # type: ignore[override]
+            return self
+
+        def measure(
+            self, scene: object, particles: Particles, step: Step, generator: Generator
+        ) -> ParticleOutput:
+            flat = super().measure(torch.zeros(1, 2), particles, step, generator)
+            return flat._replace(log_likelihood=torch.zeros_like(flat.log_likelihood))
+
+    def spread(batch: object, scene: object, method: Hill, count: int, g: Generator) -> Tensor:
+        return torch.rand(1, count, 2, generator=g) * torch.tensor([30.0, 20.0]) - 0.5
+
+    batch = SimpleNamespace(rgb=torch.zeros(1, 3, 20, 30))
+    run = build(AuxiliaryResampling(Systematic()), 2000, initialize=spread, propagate=Identity())
+    trace = run(batch, Seen(torch.zeros(1, 2)), Generator().manual_seed(0))  # type: ignore[arg-type]
+    upper = trace.particles[1].state[0, :, 1] < 9.5
+    assert float(upper.double().mean()) == pytest.approx(10 / 11, abs=0.02)
+    weight = trace.particles[1].log_weights[0].exp()
+    assert float(weight[upper].sum()) == pytest.approx(0.5, abs=0.08)

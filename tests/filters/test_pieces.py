@@ -18,7 +18,7 @@ from posefilter.filters.propagate import (
 )
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
-from posefilter.geometry.rotation import angle_between, random_rotation
+from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.types import ParticleOutput, Particles, Step
 
@@ -213,3 +213,22 @@ def test_mean_is_the_spaces() -> None:
     )
     assert belief.score.tolist() == pytest.approx([0.25 + 0.4 + 0.45 + 1.6] * 2)
     assert is_rigid(Mean()(particles, output, None, Pixels(), Generator()).best)
+
+
+def test_a_mean_of_poses_that_pixels_predict_is_about_the_origin_of_the_object() -> None:
+    particles, output = two_clusters()
+    found = Mean()(particles, output, None, Pixels(), Generator())
+    weights = particles.log_weights.exp()[..., None]
+    torch.testing.assert_close(found.best[:, :3, 3], (weights * output.pose[..., :3, 3]).sum(1))
+
+
+def test_a_turn_counts_as_the_shift_at_the_radius_by_hand() -> None:
+    """Two poses at one place, 0.2 rad apart: 20 mm at 0.1 m, one bandwidth of 20 mm."""
+    pose = torch.eye(4).repeat(1, 2, 1, 1)
+    pose[0, 1, :3, :3] = exp_so3(torch.full((3,), 0.2 / 3**0.5))
+    pose[..., :3, 3] = torch.tensor([0.3, -0.2, 1.0])
+    weights = torch.tensor([[0.75, 0.25]]).log()
+    particles = Particles(pose, torch.zeros(1, 2, 0), weights, torch.arange(2)[None])
+    output = ParticleOutput(torch.zeros(1, 2), torch.zeros(1, 2, 6), pose, particles.latent)
+    found = DensestPose(0.02)(particles, output, None, Pixels(), Generator())
+    assert float(found.score.exp()) == pytest.approx(0.75 + 0.25 * math.exp(-0.5), abs=1e-4)

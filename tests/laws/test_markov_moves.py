@@ -148,3 +148,28 @@ def test_steps_of_a_turn_are_about_the_axes() -> None:
 def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="resample-move needs"):
         ResampleMove(**wrong)  # type: ignore[arg-type]
+
+
+def test_without_a_sweep_particles_are_resampled_by_their_weights() -> None:
+    """Systematically: of a weight w there are floor(N w) or ceil(N w), and N w on average."""
+    before = draw(0.7)
+    g = torch.Generator().manual_seed(5)
+    log_w = torch.randn(1, COUNT, generator=g).double().log_softmax(1).expand(RUNS, -1)
+    after = move(before._replace(log_weights=log_w), 0.7, sweeps=0)
+    same = after.poses[:, :, None, 0, 3] == before.poses[:, None, :, 0, 3]
+    counts, wanted = same.double().sum(1), COUNT * log_w.exp()
+    assert bool(((counts - wanted).abs() < 1).all())
+    torch.testing.assert_close(counts.mean(0), wanted[0], atol=5 * 0.5 / math.sqrt(RUNS), rtol=0)
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_near_and_far_pairs_are_as_likely_in_either_order(far: bool) -> None:
+    places = torch.arange(30).double() ** 2 / 100  # ascending, so that an order is a direction
+    poses = make_pose(torch.eye(3).double().expand(30, 3, 3), torch.nn.functional.pad(
+        places[:, None], (0, 2)
+    ))[None]  # fmt: skip
+    g = torch.Generator().manual_seed(3)
+    steps = draw_differences(poses, 40_000, TwoModes.space, g)[0, :, 0]
+    middle = steps.abs().median()
+    own = steps[(steps.abs() > middle) == far]
+    assert abs(float(own.sign().mean())) < 5 / math.sqrt(len(own))

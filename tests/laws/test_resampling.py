@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
+from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.loop import inherit, make_particles
 from posefilter.filters.resample import (
     BelowESS,
@@ -265,3 +266,25 @@ def test_islands_keep_a_mode_that_one_population_loses() -> None:
 def test_an_island_is_not_empty() -> None:
     with pytest.raises(UserError, match="size=0"):
         Islands(Systematic(), 0)
+
+
+def test_a_point_that_rounding_brings_to_one_has_an_ancestor_with_weight() -> None:
+    """(n - 1 + u) / n is 1 in single precision for u near 1."""
+    log_w = torch.tensor([[-math.inf, 0.0, -math.inf]])
+    assert (inverse_cdf(log_w, torch.ones(1, 3)) == 1).all()
+
+
+def test_transport_of_even_weights_leaves_each_particle_where_it_is() -> None:
+    particles = make_particles(torch.randn(2, 12, 2, generator=Generator().manual_seed(0)), 0)
+    for scheme in (SampledTransport(0.002, 500), EnsembleTransform(0.002, 500)):
+        new = scheme(particles, 12, SPACE, Generator().manual_seed(1))
+        assert torch.equal(new.ancestors, torch.arange(12).expand(2, 12))
+
+
+def test_what_needs_one_ancestor_a_child_refuses_mixtures() -> None:
+    particles = cloud_of(2, 20)
+    with pytest.raises(UserError, match="needs a scheme that draws ancestors"):
+        Islands(EnsembleTransform(), 5)(particles, 20, SPACE, Generator())
+    auxiliary = AuxiliaryResampling(EnsembleTransform())
+    with pytest.raises(UserError, match="children have one ancestor"):
+        auxiliary.draw(particles, torch.zeros(2, 20), 20, SPACE, Generator())

@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +17,11 @@ import pytest
 from omegaconf import OmegaConf
 
 from posefilter.cli.command import compose_job, run_command
-from posefilter.cli.track import make_settings, to_pose_row
+from posefilter.cli.track import make_settings
+from posefilter.cli.track_log import to_pose_row
 from posefilter.data.sequences import VideoFrame
 from posefilter.locks import LOCK, hold
+from posefilter.metrics.bop_results import read_poses_csv
 from posefilter.tracking.records import TrackRow
 from posefilter.tracking.settings import TrackerSettings
 
@@ -135,6 +138,94 @@ def test_what_was_tracked_before_an_interruption_is_kept(
     assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 130
     with (out / "poses.csv").open() as file:
         assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9"]
+
+
+def run_forked(arguments: list[str], patched: str, work: Callable[..., Any]) -> int:
+    """Run the command in a process of its own with one of its functions replaced; its status."""
+    number = os.fork()
+    if number == 0:
+        status = 70
+        try:
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(f"posefilter.cli.track.{patched}", work)
+                status = run_command("track", HOME, arguments)
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+
+
+def signal_in_third_frame(number: int) -> Callable[..., np.ndarray]:
+    """Return what draws frames, and sends this process a signal in the third one."""
+    seen: list[str] = []
+
+    def draw(frame: VideoFrame, *_: object) -> np.ndarray:
+        seen.append(frame.name)
+        if len(seen) == 3:
+            os.kill(os.getpid(), number)
+        return frame.rgb
+
+    return draw
+
+
+def kill(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("patched", "work", "frames"),
+    [
+        ("draw_frame", signal_in_third_frame(signal.SIGKILL), ["8", "9"]),
+        ("write_rows", kill, ["8", "9", "10", "11"]),
+    ],
+    ids=["in a frame", "while it writes the results"],
+)
+def test_what_was_tracked_before_a_kill_is_kept(
+    patched: str,
+    work: Callable[..., Any],
+    frames: list[str],
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "video=none"]
+    assert run_forked(typed, patched, work) == -signal.SIGKILL
+    lines, poses = out / "poses.partial.jsonl", out / "poses.partial.csv"
+    left = {file: file.read_bytes() for file in (lines, poses)}
+    assert {file.name for file in out.iterdir()} == {LOCK, lines.name, poses.name}
+    assert run_command("track", HOME, typed) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert f"out={out}: holds {len(frames)} frames of a track.py that was killed" in told
+    assert left == {file: file.read_bytes() for file in (lines, poses)}
+    rows = [json.loads(line) for line in left[lines].splitlines()]
+    kept = read_poses_csv(poses)
+    assert [str(row.im_id) for row in kept] == [str(row["im_id"]) for row in rows] == frames
+    for row, line in zip(kept, rows, strict=True):
+        assert np.array_equal(row.camera_from_native, line["camera_from_object"])
+
+
+@pytest.mark.parametrize("name", ["poses.partial.csv", "poses.partial.jsonl"])
+def test_what_a_killed_one_has_left_is_not_touched_whatever_it_is(
+    name: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_bytes(b"\xff\n" * 3)
+    assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 2
+    assert "of a track.py that was killed" in capsys.readouterr().err
+    assert [file.name for file in out.iterdir()] == [name]
+
+
+def test_what_was_tracked_before_a_sigterm_is_kept(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]
+    work = signal_in_third_frame(signal.SIGTERM)
+    assert run_forked(typed, "draw_frame", work) == 128 + signal.SIGTERM
+    assert [row.im_id for row in read_poses_csv(out / "poses.csv")] == [8, 9]
+    assert cv2.VideoCapture(str(out / "video.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
+    assert {file.name for file in out.iterdir()} == {
+        "metrics.json", "poses.csv", "poses.jsonl", "tracks.csv", "video.mp4",
+    }  # fmt: skip
 
 
 def test_a_broken_frame_can_be_left_out(

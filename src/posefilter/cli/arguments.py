@@ -33,7 +33,7 @@ def quoted(arguments: Sequence[str]) -> list[str]:
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
-        odd = re.search(r"[^\x20-\x7e]|[=#&;!^`]", value) is not None
+        odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
         if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
             parts = (part.replace("'", "\\'") for part in value.split(","))
             argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)

@@ -25,6 +25,7 @@ from posefilter.data.absent import hide_annotation
 from posefilter.data.dataset import FrameDataset
 from posefilter.data.loaders import make_loader
 from posefilter.errors import UserError
+from posefilter.locks import hold
 from posefilter.metrics.confidence import Confidence
 from posefilter.metrics.credibility import score_truth
 from posefilter.metrics.errors import add_up_to_symmetry
@@ -46,8 +47,11 @@ def calibrate(job: Job) -> None:
             "filter: a calibration is of the filter as the checkpoint has it; export.py writes a "
             "checkpoint with another"
         )
-    checkpoint, file = read_checkpoint(cfg.checkpoint), find_checkpoint(cfg.checkpoint)
+    file = find_checkpoint(cfg.checkpoint)
     out = file if cfg.out is None else Path(str(cfg.out))
+    if out.exists():  # a training that still runs may write a better one meanwhile, which is kept
+        hold(file.parent.parent if file.parent.name == "checkpoints" else file.parent)
+    checkpoint = read_checkpoint(cfg.checkpoint)
     check_out(checkpoint, file, out, cfg.replace)
     method = method_of(checkpoint, lightning=False)
     name = method.model.name

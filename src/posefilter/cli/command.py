@@ -1,6 +1,7 @@
 """From a command line to a job, and from a mistake to one readable line."""
 
 import importlib
+import io
 import math
 import os
 import sys
@@ -85,6 +86,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()
+    show_all_signs()
     before, begun = sys.argv, list[Job]()
     try:
         if {"--help", "-h"} & {*arguments}:
@@ -120,6 +122,15 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         sys.argv = before
         release_all()
     return 0
+
+
+def show_all_signs() -> None:
+    """Have a console whose encoding lacks a sign, such as an umlaut of a folder, show its number:
+    no run may end for it.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
@@ -183,6 +194,11 @@ def use_plugins(cfg: DictConfig) -> None:
         except ModuleNotFoundError as error:
             raise UserError(
                 f"plugins={package}: there is no package '{error.name}' (is it installed?)"
+            ) from error
+        except (Exception, SystemExit) as error:  # a plug-in may not end the run as if it were done
+            raise UserError(
+                f"plugins={package}: could not be imported ({type(error).__name__}: "
+                f"{first_line(error)}); debug=traceback shows where"
             ) from error
 
 

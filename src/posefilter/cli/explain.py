@@ -1,12 +1,18 @@
 """From a mistake in a command line to one readable line."""
 
 import re
+import shlex
 import traceback
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
@@ -20,6 +26,8 @@ _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
 def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -> str:
     """Return a mistake as one line that names the key and the nearest valid one."""
     text = str(error)
+    if isinstance(error, BrokenPipeError):
+        return "has ended, since what it prints to was closed (as by `| head`)"
     if isinstance(error, OSError) and error.strerror:
         place = "a file" if error.filename is None else str(error.filename)
         return f"{place}: cannot be read or written ({error.strerror})"
@@ -49,11 +57,32 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             if new is not None:
                 return f"{key}: is now {section}.{new}"
             return f"{key}: there is no such setting{near(key, known_keys(cfg, key))}"
+    if isinstance(error, OverrideParseException):
+        return (
+            f"{error.override}: cannot be read ({first_line(error)}){_tell_quotes(error.override)}"
+        )
+    if found := re.match(r"Ambiguous value for argument '(.*)'$", first_line(error)):
+        listed = found[1].replace("=", "=[", 1) + "]"
+        return (
+            f"{found[1]}: is a list of values, which only a sweep takes (-m); one setting that is "
+            f"a list is typed '{listed}'{_tell_quotes(found[1])}"
+        )
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key}: is missing; give {error.full_key}=..."
     if isinstance(error, OmegaConfBaseException) and getattr(error, "full_key", None):
         return f"{error.full_key}: {first_line(error)}"
     return first_line(error)
+
+
+def _tell_quotes(argument: str) -> str:
+    """Return how an argument is typed whose value is one text, with signs that Hydra reads."""
+    key, found, value = argument.partition("=")
+    if not found:
+        return ""
+    escaped = value.replace("'", "\\'")
+    text = f"{key}='{escaped}'"
+    typed = shlex.quote(text) if re.search(r'["$`\\!]', text) else f'"{text}"'
+    return f"; as one text it is typed {typed}"
 
 
 def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str:

@@ -2,6 +2,7 @@
 of the filter chosen anew, if wished); or write its networks for programs of others.
 """
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ def export(job: Job) -> None:
         return
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
+    if os.path.lexists(out):  # it may be a training's own
+        raise UserError(f"out={out}: is there already; choose another file, or remove it")
     stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.quantize)
     recipe = stripped["recipe"]
     before = recipe["settings"]

@@ -1,9 +1,12 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import re
+import signal
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -18,19 +21,19 @@ from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
+from posefilter.cli.track_log import POSES, TrackLog, check_unused
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.sequences import FolderVideo, SceneVideo, Video, VideoFrame, list_groups
-from posefilter.errors import UserError
+from posefilter.errors import Stopped, UserError
 from posefilter.estimator import Estimator
 from posefilter.figures.detections import Drawn, draw_detections
 from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import check_viewer
 from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
-from posefilter.metrics.bop_results import PoseRow, choose_score, to_native, write_poses_csv
+from posefilter.metrics.bop_results import write_poses_csv
 from posefilter.tracking.motion import RandomWalk
 from posefilter.tracking.records import (
-    TrackRow,
     compute_figures,
     describe_row,
     make_row,
@@ -40,20 +43,18 @@ from posefilter.tracking.settings import FrameBudget, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
 
-POSES = "poses.csv"
-
 
 def track(job: Job) -> None:
     """Write poses.csv, poses.jsonl, tracks.csv, metrics.json, and a video of each scene.
 
-    What was tracked before a frame that cannot be read, or before Ctrl-C, is written, too.
+    What was tracked before a frame that cannot be read, or before Ctrl-C, is written, too; and
+    what was before a SIGKILL is in the files of `TrackLog`.
 
     Raises:
         UserError: A frame cannot be read, and `on_error` is not "skip".
     """
     cfg, folder = job.cfg, job.folder
-    if (folder / POSES).is_file():
-        raise UserError(f"out={folder}: holds tracks already; choose another folder: out=DIR")
+    check_unused(folder)
     if cfg.view:
         check_viewer()
     settle(cfg.threads, cfg.seed)
@@ -64,8 +65,8 @@ def track(job: Job) -> None:
     store = open_shapes(cfg, estimator.objects)
     shapes = {model.name: load_shape(store, model) for model in estimator.models}
     folder.mkdir(parents=True, exist_ok=True)
-    rows: list[TrackRow] = []
-    broken: UserError | KeyboardInterrupt | None = None
+    log = TrackLog(folder, native)
+    broken: UserError | KeyboardInterrupt | Stopped | None = None
     files: dict[str, Path] = {"poses": folder / POSES, "lines": folder / "poses.jsonl"}
     for video in videos:
         name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
@@ -73,8 +74,9 @@ def track(job: Job) -> None:
         view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.view else None
         recorder = TrackRecorder(view, shapes)
         try:
-            follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, rows)
-        except (UserError, KeyboardInterrupt) as error:
+            with stopped_by_sigterm():
+                follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, log)
+        except (UserError, KeyboardInterrupt, Stopped) as error:
             broken = error
         if view is not None:
             files[view.stem] = view
@@ -82,18 +84,21 @@ def track(job: Job) -> None:
             files[name] = writer.path
         if broken is not None:
             break
+    log.close()
+    rows = log.rows
     if not rows:
         raise broken or UserError("no frame could be read; leave on_error=skip out to see why")
     for name in estimator.objects:
         _say_all_lost(name, [row.result for row in rows if row.result.object == name], cfg)
     write_rows(folder, [finite(describe_row(row)) for row in rows])
-    write_poses_csv(folder / POSES, [to_pose_row(row, native) for row in rows if row.result.found])
+    write_poses_csv(folder / POSES, log.list_poses(rows))
     metrics = {
         model.name: compute_figures(own, model)
         for model in estimator.models
         if (own := [row for row in rows if row.result.object == model.name])
     }
     write_json(folder / "metrics.json", metrics)
+    log.remove()
     files |= {"tracks": folder / "tracks.csv", "metrics": folder / "metrics.json"}
     if cfg.console != JSON:
         for name, figures in metrics.items():
@@ -115,9 +120,9 @@ def follow(
     recorder: TrackRecorder,
     shapes: dict[str, Shape],
     threads: int,
-    rows: list[TrackRow],
+    log: TrackLog,
 ) -> None:
-    """Track the objects through one video, write its pictures, and add to `rows` as they come."""
+    """Track the objects through one video, write its pictures, and log its rows as they come."""
     methods = [
         m for m in estimator.methods if video.objects is None or m.model.name in video.objects
     ]
@@ -131,6 +136,7 @@ def follow(
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
             writer.add(draw_frame(frame, results, shapes))
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
+            rows = []
             for number, result in enumerate(results):
                 ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
                 truth = frame.truth.get(result.object)
@@ -141,6 +147,24 @@ def follow(
                     said = f"warning: frame {frame.name}: {'; '.join(result.warnings)}"
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
                 rows.append(make_row(video.name, frame.name, ids, result, truth))
+            log.add(rows)
+
+
+@contextmanager
+def stopped_by_sigterm() -> Iterator[None]:
+    """Raise Stopped at a SIGTERM, so that it ends as Ctrl-C does: what was tracked is written."""
+
+    def stop(number: int, _: FrameType | None) -> None:
+        raise Stopped(number)
+
+    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[VideoFrame]:
@@ -268,13 +292,6 @@ def _is_scene(group: str, scene: Any) -> bool:
     """Tell whether a scene is meant: by its name, or by its number where that is a number."""
     same = group.isdigit() and str(scene).isdigit() and int(group) == int(scene)
     return group == str(scene) or same
-
-
-def to_pose_row(row: TrackRow, native_from_mesh: Any) -> PoseRow:
-    """Return a row of the results file, in the dataset's own object frame."""
-    pose = to_native(row.result.pose, native_from_mesh(row.result.object))
-    score = choose_score(row.result.probability, row.result.score)
-    return PoseRow(row.scene_id, row.im_id, row.obj_id, score, pose, row.result.seconds)
 
 
 def list_figures(figures: dict[str, Any]) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from cv2.utils import logging
 
-from posefilter.errors import UserError
+from posefilter.errors import Stopped, UserError
 from posefilter.figures.gif import encode_gif
 from posefilter.files import write_whole
 
@@ -74,7 +74,7 @@ class VideoWriter:
         Raises:
             UserError: It cannot be written, as on a full disk.
         """
-        keep = kind is None or issubclass(kind, UserError | KeyboardInterrupt)
+        keep = kind is None or issubclass(kind, UserError | KeyboardInterrupt | Stopped)
         try:
             if self._writer is not None:
                 self._writer.release()

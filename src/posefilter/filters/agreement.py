@@ -34,9 +34,10 @@ class Agreement:
     Each particle predicts which object point its own measured point is: by its pose, or by its
     `top_fragments` most probable fragments where the method predicts fragments. The hypotheses are
     the poses of the particles of highest likelihood, and as many rigid fits to a few particles'
-    points (RANSAC, Fischler and Bolles 1981). A hypothesis is scored by the weight of its inliers.
-    The best one is refitted to all particles by iteratively reweighted least squares: Kabsch's fit
-    (1976) with Geman-McClure weights and a falling scale.
+    points (RANSAC, Fischler and Bolles 1981). A hypothesis is scored by the weight of its inliers,
+    at the scale 2 `scale_m`. The best one is refitted to all particles by iteratively reweighted
+    least squares: Kabsch's fit (1976) with Geman-McClure weights, whose scale falls from 4
+    `scale_m` to `scale_m`.
 
     The belief is the set of fitted poses, each weighted by its share of inliers to the power of
     `effective_particles`.

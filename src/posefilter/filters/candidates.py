@@ -28,9 +28,7 @@ def sample_from_depth(
     return draw_from_depth(batch.depth, batch.intrinsics, space, count, generator, prior)
 
 
-def perturb(
-    poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator, turn: float = 1.0
-) -> Tensor:
+def perturb(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator) -> Tensor:
     """Perturb poses by Gaussian noise in the space's tangent.
 
     Args:
@@ -38,13 +36,11 @@ def perturb(
         sigma: (B, N) noise level [m].
         space: The space of the poses.
         generator: Source of randomness.
-        turn: Factor on the rotations' noise.
 
     Returns:
         Perturbed poses (B, N, 4, 4).
     """
     scale = space.noise_scale(sigma)
-    scale = torch.cat([scale[..., :3], scale[..., 3:] * turn], dim=-1)
     return space.move(
         poses, scale * torch.randn(scale.shape, generator=generator, device=poses.device)
     )
@@ -91,7 +87,7 @@ def sample_around_truth(
     on_object = sample_from_depth(batch, space, per_kind, generator, batch.mask.float() + 0.02)
     anywhere = sample_from_depth(batch, space, per_kind, generator)
     half = per_kind // 2
-    shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator, turn=0.0)
+    shifted = perturb(truth.expand(B, half, 4, 4), size[:, :half] * 0.5, space, generator)
     rotated = pose_about(
         random_rotation(B, half, generator=generator, device=device),
         origin_of(shifted, center),

@@ -82,13 +82,14 @@ class ParticleFilter(nn.Module):
         first_particles: int | None = None,
     ) -> None:
         super().__init__()
-        if min(particles, steps, first_particles or 1) < 1:
+        first = particles if first_particles is None else first_particles
+        if min(particles, steps, first) < 1:
             raise UserError(
                 f"filter: particles={particles}, first_particles={first_particles} and "
                 f"steps={steps} must be 1 or more"
             )
         self.particles, self.steps = particles, steps
-        self.first_particles = first_particles or particles
+        self.first_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
         self.estimate, self.refine = estimate, refine

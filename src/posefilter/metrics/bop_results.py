@@ -55,29 +55,22 @@ def to_mesh(camera_from_native: np.ndarray, native_from_mesh: np.ndarray) -> np.
 
 
 def write_poses_csv(path: Path, rows: Sequence[PoseRow]) -> None:
-    """Write a BOP results file: R row by row, t in millimeters, every digit kept, so that reading
-    gives the same numbers.
-    """
+    """Write a BOP results file."""
     with open_whole_text(path) as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(HEADER)
-        for row in rows:
-            pose = np.asarray(row.camera_from_native, np.float64)
-            R = " ".join(repr(float(x)) for x in pose[:3, :3].reshape(-1))
-            t_mm = " ".join(
-                format(Decimal(repr(float(x))).scaleb(3), "f") for x in pose[:3, 3]
-            )  # moves the point, rounds nothing
-            writer.writerow(
-                [
-                    row.scene_id,
-                    row.im_id,
-                    row.obj_id,
-                    repr(float(row.score)),
-                    R,
-                    t_mm,
-                    repr(float(row.seconds)),
-                ]
-            )
+        file.write(",".join(HEADER) + "\n")
+        file.writelines(map(format_pose_row, rows))
+
+
+def format_pose_row(row: PoseRow) -> str:
+    """Return a line of a BOP results file: R row by row, t in millimeters, every digit kept, so
+    that reading gives the same numbers.
+    """
+    pose = np.asarray(row.camera_from_native, np.float64)
+    R = " ".join(repr(float(x)) for x in pose[:3, :3].reshape(-1))
+    # moves the point, rounds nothing
+    t_mm = " ".join(format(Decimal(repr(float(x))).scaleb(3), "f") for x in pose[:3, 3])
+    ids, numbers = row[:3], (repr(float(row.score)), R, t_mm, repr(float(row.seconds)))
+    return ",".join([*map(str, ids), *numbers]) + "\n"
 
 
 def read_poses_csv(path: Path) -> list[PoseRow]:

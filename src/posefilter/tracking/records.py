@@ -151,8 +151,13 @@ def write_rows(folder: Path, rows: Sequence[dict[str, Any]]) -> None:
     Numbers that are none are null in the one, and empty in the other.
     """
     with open_whole_text(folder / "poses.jsonl") as file:
-        file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+        file.writelines(map(format_row, rows))
     with open_whole_text(folder / "tracks.csv") as file:
         writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def format_row(row: dict[str, Any]) -> str:
+    """Return a line of poses.jsonl."""
+    return json.dumps(row, allow_nan=False) + "\n"
