@@ -38,11 +38,12 @@ KEYS = (
     "diagnostics/line_share/first",
     "diagnostics/line_share/last",
     "diagnostics/auroc",
+    "credibility/log_density",
 )
 NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # have columns, or none
 # these change no result
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads")
-SILENT_KEYS = ("data.root", "data.meshes", "data.workers")
+SILENT_KEYS = ("data.root", "data.meshes", "data.workers", "data.generate.workers")
 ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
 Run = dict[str, Any]
 

@@ -39,6 +39,14 @@ TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
+# no loss on a part: the pose's head has no fragments, whose choice passes no gradient
+END_TO_END = (
+    "loss=belief_nll_pose loss/aux/displacement=none loss/aux/likelihood=none loss/aux/pose=none "
+    "model.objectness_weight=0.0 model/train_rollout=resampled"
+)
+# kernels of the true pose three and four times as wide as the default's
+WIDE = "loss.terms.pose.translation_mm=60 loss.terms.pose.rotation_deg=40"
+TRAIN_RESAMPLE = "filter/resample@model.train_filter.resample"
 POSE = "model=pose_pf data/augment=strong seed=0"  # its row is of the default of that time
 
 
@@ -132,6 +140,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("untrained", f"{memorize} variant=paper {UNTRAINED} seed=1,2,3,4"),
         Line("memorize", f"{memorize} variant=paper seed=1,2,3,4"),
         *list_units(),
+        *list_end_to_end(),
         Line("held_out", f"{FOUR} seed=1,2"),
         Line(
             "held_out_less",
@@ -180,6 +189,50 @@ def list_units() -> list[Line]:
             else "sweep=ablation"
         )
         lines.append(Line("unit", f"model={model} {paper} {size} {UNITS} seed=0,1,2"))
+    return lines
+
+
+def list_end_to_end() -> list[Line]:
+    """Return trainings by the density of the truth under the particles against those by a loss on
+    each part, with the same head and number of steps; all are tested with the same filter.
+    """
+    lines = []
+    for table, data, steps in (
+        ("end_to_end", "experiment=memorize", 200),
+        (
+            "end_to_end_held_out",
+            "data.generate.frames=400 data.split.train=0.6 data.split.val=0.1 data.split.test=0.3",
+            300,
+        ),
+    ):
+        patch = f"model=patch_pf {data} " + (
+            "variant=working model/pose_head=surface_point scheduler.warmup_steps=50 "
+            f"trainer.max_steps={steps} trainer.val_check_interval={steps} callbacks=checkpoints "
+            "seed=0,1,2"
+        )
+        whole = f"{patch} {END_TO_END} {TRAIN_RESAMPLE}"
+        parts = f"{patch} loss=confidence model/train_rollout"
+        both = f"{patch} loss=belief_nll_pose model/train_rollout=resampled"
+        if table == "end_to_end":
+            every = f"{whole}=systematic,soft,optimal_transport"
+            pixel = (
+                line.replace("patch_pf", "pixel_pf") for line in (f"{parts}=short", f"{whole}=soft")
+            )
+            lines += [
+                Line(table, every),
+                Line(table, f"{parts}=short,resampled", into="parts"),
+                Line(table, f"{every} loss.steps=last", into="last"),
+                Line(table, both, into="both"),
+                *(Line(table, line, into="pixel_pf") for line in pixel),
+            ]
+        else:
+            lines += [
+                Line(table, f"{parts}=short"),
+                Line(table, f"{parts}=resampled", into="parts"),
+                Line(table, f"{whole}=soft", into="whole"),
+                Line(table, f"{whole}=soft {WIDE}", into="wide"),
+                Line(table, both, into="both"),
+            ]
     return lines
 
 

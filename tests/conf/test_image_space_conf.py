@@ -33,9 +33,12 @@ KINDS: dict[str, type[ImageSpace]] = {
     "cnn_patch": CnnPatch,
     "downsized": Downsized,
 }
-DETECTING = ("chamfer", "chamfer_rgbd", "offset", "bce", "balanced_bce", "focal")
+DETECTING = ("chamfer", "chamfer_rgbd", "offset", "bce", "balanced_bce", "focal", "belief_nll")
 # losses by what a method requires of its heads
-FITTING = {(): DETECTING, ("pose",): ("add", "add_s", "confidence", *DETECTING)}
+FITTING = {
+    (): DETECTING,
+    ("pose",): ("add", "add_s", "confidence", "belief_nll_pose", *DETECTING),
+}
 SMALL = ["filter.particles=12", "filter.steps=2"]
 
 
@@ -102,6 +105,8 @@ REMEDIES = [
     "loss/aux/likelihood=focal",
     "loss/schedule=three_stages",
     "model/train_rollout=full",
+    "model/train_rollout=resampled loss=belief_nll",
+    "model/train_rollout=resampled filter/resample@model.train_filter.resample=optimal_transport",
     "filter/resample=none",
     "filter/resample=auxiliary",
     "filter/initialize=from_objectness",

@@ -214,6 +214,25 @@ def test_an_ensemble_keeps_the_mean_exactly_and_passes_gradients() -> None:
     assert state.grad.abs().sum() > 1e-3
 
 
+@pytest.mark.parametrize("space", [SPACE, PoseSpace((0.01, 0.0, 0.02), 0.1)], ids=["px", "poses"])
+def test_the_gradient_of_an_ensemble_is_whole(space: PixelSpace | PoseSpace) -> None:
+    """By finite differences: the weights shape the plan, and the states by its costs, too."""
+    g = Generator().manual_seed(0)
+    logits = torch.randn(1, 5, generator=g).double().requires_grad_()
+    moves = (0.5 * torch.randn(1, 5, space.dimensions, generator=g).double()).requires_grad_()
+    start = torch.zeros(2) if space is SPACE else torch.eye(4)
+
+    def children(logits: Tensor, moves: Tensor) -> Tensor:
+        state = space.move(start.double().expand(1, 5, *start.shape), moves)
+        particles = make_particles(state, 0)._replace(log_weights=logits.log_softmax(1))
+        resampled = EnsembleTransform(0.2, 20)(particles, 5, space, g)
+        return torch.cat(
+            [inherit(state, resampled, space).flatten(2), resampled.log_weights[..., None]], 2
+        )
+
+    assert torch.autograd.gradcheck(children, (logits, moves))
+
+
 def test_the_ancestor_of_a_mixture_is_its_largest_part() -> None:
     resampled = EnsembleTransform(0.02, 20)(cloud_of(2, 30), 30, SPACE, Generator())
     assert resampled.shares is not None

@@ -7,6 +7,7 @@ import torch
 
 from posefilter.labels.displacement import TowardsObject
 from posefilter.labels.membership import OnObject, Quality
+from posefilter.losses.belief import BeliefNll, MaskDensity, PoseDensity
 from posefilter.losses.displacement import Chamfer, DirectDisplacement, Offset, Sides
 from posefilter.losses.likelihood import BalancedBce, Bce, Focal
 from posefilter.losses.pose_loss import Add, AddS, Confidence, SurfacePointLoss
@@ -18,7 +19,8 @@ LOSSES = [
     Bce(OnObject()), Bce(OnObject(), "last"), BalancedBce(OnObject()), Focal(OnObject()),
     Focal(Quality()), Add(), Add("likelihood"), AddS(), Confidence(OnObject()), SurfacePointLoss(),
     Sides(OnObject()), Offset(), Chamfer(3), Chamfer(3, max_pixels=5), RgbdChamfer(3),
-    DirectDisplacement(TowardsObject()),
+    DirectDisplacement(TowardsObject()), BeliefNll({"mask": MaskDensity()}),
+    BeliefNll({"pose": PoseDensity()}),
 ]  # fmt: skip
 
 

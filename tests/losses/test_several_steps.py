@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from posefilter.labels.membership import OnObject
+from posefilter.losses.belief import BeliefNll, MaskDensity, PoseDensity
 from posefilter.losses.displacement import Chamfer, Offset, Sides
 from posefilter.losses.likelihood import Bce, Focal
 from posefilter.losses.pose_loss import Confidence, SurfacePointLoss
@@ -14,6 +15,7 @@ from posefilter.losses.pose_loss import Confidence, SurfacePointLoss
     [
         Bce(OnObject()), Focal(OnObject()), Confidence(OnObject()), SurfacePointLoss(),
         Sides(OnObject()), Offset(), Chamfer(size=3),
+        BeliefNll({"mask": MaskDensity(), "pose": PoseDensity()}),
     ],
     ids=lambda loss: type(loss).__name__,
 )  # fmt: skip

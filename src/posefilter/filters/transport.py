@@ -61,19 +61,17 @@ class SampledTransport:
         return Resampled(inverse_cdf(rows, u.flatten()[:, None]).view_as(u), log_weights)
 
     def plan(self, particles: Particles, count: int, space: Space) -> Tensor:
-        """Return the log plan (B, N, M), differentiable in the weights.
+        """Return the log plan (B, N, M), differentiable in the weights and in the states.
 
         Its columns sum to the weights, its rows nearly to 1 / N. The rows' error remains in the
         children's weights, so means are kept.
         """
-        # detached: a distance has no gradient where a child is its own ancestor
-        with torch.no_grad():
-            M = particles.state.shape[1]
-            targets = particles.state[
-                :, torch.linspace(0, M - 1, count, device=particles.state.device).round().long()
-            ]
-            cost = space.distance(targets[:, :, None], particles.state[:, None]).square()
-            cost = cost / cost.mean((1, 2), keepdim=True).clamp_min(1e-12)
+        M = particles.state.shape[1]
+        targets = particles.state[
+            :, torch.linspace(0, M - 1, count, device=particles.state.device).round().long()
+        ]
+        cost = space.distance(targets[:, :, None], particles.state[:, None]).square()
+        cost = cost / cost.mean((1, 2), keepdim=True).clamp_min(1e-12)
         # the potential of a particle without weight would be infinite
         log_b = torch.log_softmax(particles.log_weights.clamp_min(-80.0), dim=1)
         log_a = torch.full_like(cost[..., 0], -math.log(count))

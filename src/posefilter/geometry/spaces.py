@@ -105,4 +105,5 @@ class PoseSpace:
         c = a.new_tensor(self.center)
         shift = (origin_of(a, c) - origin_of(b, c)).norm(dim=-1)
         turn = angle_between(rotation_of(a), rotation_of(b)) * self.radius
-        return (shift * shift + turn * turn).sqrt()
+        # so that the gradient at equal poses is 0 and not NaN
+        return (shift * shift + turn * turn).clamp_min(1e-30).sqrt()
