@@ -35,7 +35,7 @@ PRESETS = [
     (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
 ]
 EXPERIMENTS = list_choices(CONF / "experiment")
-SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect"]
+SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect", "ablation_pose"]
 BUILT = (
     *(f"filter/{step}" for step in ("initialize", "schedule", "reweight", "resample")),
     *(f"filter/{step}" for step in ("propagate", "estimate", "refine")),
