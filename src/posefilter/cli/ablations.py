@@ -302,17 +302,17 @@ POSE_SPACE_ABLATIONS = (
         "pose_pf_s7_proposals", "Paper, with poses voted by a dense network first.", "paper", _DENSE
     ),
     Ablation(
-        "pose_pf_s10_augment", "Paper, with augmented images.", "paper", ("data/augment=camera",)
-    ),
-    Ablation(
-        "pose_pf_s11_turns",
+        "pose_pf_s10_turns",
         "Paper, with particles that also turn about the object's axes (and noise of 0.4 noise "
         "levels in place of 0.5).",
         "paper",
         (_TURNS,),
     ),
     Ablation(
-        "pose_pf_s13_refine", "Paper, with a refined estimate.", "paper", ("filter/refine=mean_shift",)
+        "pose_pf_s12_refine",
+        "Paper, with a refined estimate.",
+        "paper",
+        ("filter/refine=mean_shift",),
     ),
     Ablation(
         "pose_pf_c1_contrast",
@@ -365,19 +365,16 @@ POSE_SPACE_ABLATIONS = (
         ("model/likelihood=surface",),
     ),
     Ablation(
-        "pose_pf_c10_augment", "Also augmented images.", "pose_pf_c9_surface", ("data/augment=camera",)
-    ),
-    Ablation(
-        "pose_pf_c11_turns",
+        "pose_pf_c10_turns",
         "Also particles that turn about the object's axes (and noise of 0.4 noise levels in place "
         "of 0.5).",
-        "pose_pf_c10_augment",
+        "pose_pf_c9_surface",
         (_TURNS,),
     ),
     Ablation(
-        "pose_pf_c12_even_points",
+        "pose_pf_c11_even_points",
         "Also evenly drawn image points. With the refinement it is the working method.",
-        "pose_pf_c11_turns",
+        "pose_pf_c10_turns",
         ("model.even_points=true",),
     ),
     Ablation(
@@ -413,7 +410,10 @@ POSE_SPACE_ABLATIONS = (
     ),
     Ablation("pose_pf_m5_muon", "Working, with Adam.", "working", ("optimizer=adam",)),
     Ablation(
-        "pose_pf_m6_scheduler", "Working, with a constant learning rate.", "working", ("scheduler=none",)
+        "pose_pf_m6_scheduler",
+        "Working, with a constant learning rate.",
+        "working",
+        ("scheduler=none",),
     ),
     Ablation(
         "pose_pf_m7_start",
@@ -443,21 +443,20 @@ POSE_SPACE_ABLATIONS = (
         "working",
         ("model/likelihood=contextual",),
     ),
-    Ablation("pose_pf_m10_augment", "Working, without augmentation.", "working", ("data/augment=none",)),
     Ablation(
-        "pose_pf_m11_turns",
+        "pose_pf_m10_turns",
         "Working, with particles that do not turn about the object's axes.",
         "working",
         ("filter/propagate=gaussian",),
     ),
     Ablation(
-        "pose_pf_m12_even_points",
+        "pose_pf_m11_even_points",
         "Working, with independent image points.",
         "working",
         ("model.even_points=false",),
     ),
     Ablation(
-        "pose_pf_m13_refine", "Working, without refinement.", "working", ("filter/refine=none",)
+        "pose_pf_m12_refine", "Working, without refinement.", "working", ("filter/refine=none",)
     ),
 )
 ABLATIONS = (*IMAGE_SPACE_ABLATIONS, *POSE_SPACE_ABLATIONS)
