@@ -21,6 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from posefilter.cli.ablations import list_pose_space_ablations
+
 HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
@@ -193,6 +195,19 @@ def list_units() -> list[Line]:
     return lines
 
 
+def list_pose_rows(seeds: str) -> list[Line]:
+    """Return the ablations of pose_pf in three lines, which share a folder and so their trainings:
+    what is taken from the working variant, what is added to the paper's, and alone.
+    """
+    names = list_pose_space_ablations()
+    series = [[n for n in names if n.startswith(f"pose_pf_{kind}")] for kind in "mcs"]
+    first = ["working", "paper", *series[0]]
+    return [
+        Line("ablation_pose", f"{POSE_ROWS} ablation={','.join(some)} {seeds}")
+        for some in (first, *series[1:])
+    ]
+
+
 def list_pose_space() -> list[Line]:
     """Return the runs of pose_pf on held-out scenes at the size of `experiment=small_scenes`: every
     ablation; and of one run, sizes of the filter.
@@ -200,7 +215,7 @@ def list_pose_space() -> list[Line]:
     working, paper = (POSE_RUN.format(variant) for variant in ("working", "paper"))
     counts = "25,50,100,200,400,1000"
     return [
-        Line("ablation_pose", f"{POSE_ROWS} seed=0"),
+        *list_pose_rows("seed=0"),
         Line("pose_filter", f"filter.particles={counts}", working, "kept"),
         Line("pose_filter", f"filter.first_particles={counts}", working, "first"),
         Line(
@@ -236,10 +251,11 @@ def list_choices() -> list[Line]:
         Line("choices", f"{patch} {unit} model.net.displacement_reads=logit,likelihood {seeds}"),
         Line("choices", f"{patch} loss=add loss.weighting=likelihood {seeds}"),
         Line("choices", f"{detector} loss=chamfer_rgbd {seeds}"),
+        Line("choices", f"{detector} loss.max_pixels=null {seeds}"),
         Line("choices", f"{detector} model.net.kernel=1,5 {seeds}"),
         Line("choices", f"{SMALL_BOX} optimizer.lr=0.0001,0.01 {seeds}"),
-        Line("choices", f"{pose} model.likelihood.anchor=center {seeds}"),
-        Line("choices", f"{pose} model.likelihood.spread=0.3,1.2 {seeds}"),
+        Line("choices", f"{pose} model.likelihood.anchor=center seed=0"),
+        Line("choices", f"{pose} model.likelihood.spread=0.3,1.2 seed=0"),
     ]
 
 
@@ -254,14 +270,13 @@ def list_long() -> list[Line]:
     augment = "data/augment=strong,camera seed=0,1,2"
     sizes = "model.glimpse.size=6 filter.particles=50,100"
     return [
-        Line("ablation_pose", f"{POSE_ROWS} seed=1,2"),
+        *list_pose_rows("seed=1,2"),
         Line("paper_offset", f"{boxes} loss=offset seed=0,1,2", into="full"),
         Line("pose_longer", f"{POSE_ROWS} ablation=paper,working {longer}"),
         Line("pose_augment", f"{POSE_ROWS} ablation=working {augment}"),
         Line("paper_add", f"{paper} loss=add seed=0", into="full"),
         Line("paper_informed", f"{paper} filter/initialize=informed seed=0", into="full"),
         Line("choices", f"{pose} model.candidate_sampler.rays=16,256 seed=0"),
-        Line("choices", f"{SMALL_BOX} model.displacement.unit=1 loss.max_pixels=null seed=0,1,2"),
         Line("paper_patch", f"{paper} {sizes} seed=0", into="full"),
         Line(
             "paper_patch", f"{paper} model.glimpse.size=3 filter.particles=100 seed=0", into="full"
