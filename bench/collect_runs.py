@@ -60,6 +60,8 @@ def read_column(key: str) -> Callable[[Run], float | None]:
 
 COLUMNS: dict[str, Callable[[Run], float | None]] = {
     **{find_metric(key).column: read_column(key) for key in KEYS},
+    "median mm": read_column("add/median_mm"),
+    "outscored %": read_column("belief/truth_outscored_by_wrong"),
     "CPU min": lambda run: run["training"]["steps"] * run["training"]["cpu_seconds_per_step"] / 60,
     "s / image": read_column("seconds_per_image"),
     "seed": lambda run: run["seed"],

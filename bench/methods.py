@@ -21,6 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from posefilter.cli.ablations import list_pose_space_ablations
+
 HOME = Path(__file__).parents[1]
 FOUR = "model=downsized,cnn_patch,pixel_pf,patch_pf"
 WITH_POSE, DETECTORS = ("patch_pf", "pixel_pf"), ("cnn_patch", "downsized")
@@ -39,6 +41,16 @@ TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
+POSE_ROWS = "model=pose_pf sweep=ablation_pose"
+POSE_RUN = "ablation_pose/ablation={},model=pose_pf,seed=0,sweep=ablation_pose"
+# the paper's variant small enough for many rows; detectors at the unit at which they gain, since
+# where nothing works no choice can tell
+SMALL = "model={} experiment=memorize sweep=ablation ablation=paper callbacks=checkpoints"
+SMALL_BOX = (
+    "model=downsized experiment=memorize sweep=ablation_detect ablation=paper filter.particles=8 "
+    "model.net.width=16 callbacks=checkpoints"
+)
+POSE = "model=pose_pf data/augment=strong seed=0"  # its row is of the default of that time
 # no loss on a part: the pose's head has no fragments, whose choice passes no gradient
 END_TO_END = (
     "loss=belief_nll_pose loss/aux/displacement=none loss/aux/likelihood=none loss/aux/pose=none "
@@ -47,7 +59,6 @@ END_TO_END = (
 # kernels of the true pose three and four times as wide as the default's
 WIDE = "loss.terms.pose.translation_mm=60 loss.terms.pose.rotation_deg=40"
 TRAIN_RESAMPLE = "filter/resample@model.train_filter.resample"
-POSE = "model=pose_pf data/augment=strong seed=0"  # its row is of the default of that time
 
 
 class Line(NamedTuple):
@@ -150,6 +161,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         ablation("held_out_less", "filter/resample=none", HELD_OUT, "patch_pf"),
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
+    lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
     if meshes:
         lines += [
             Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")
@@ -234,6 +246,97 @@ def list_end_to_end() -> list[Line]:
                 Line(table, both, into="both"),
             ]
     return lines
+
+
+def list_pose_rows(seeds: str) -> list[Line]:
+    """Return the ablations of pose_pf in three lines, which share a folder and so their trainings:
+    what is taken from the working variant, what is added to the paper's, and alone.
+    """
+    names = list_pose_space_ablations()
+    series = [[n for n in names if n.startswith(f"pose_pf_{kind}")] for kind in "mcs"]
+    first = ["working", "paper", *series[0]]
+    return [
+        Line("ablation_pose", f"{POSE_ROWS} ablation={','.join(some)} {seeds}")
+        for some in (first, *series[1:])
+    ]
+
+
+def list_pose_space() -> list[Line]:
+    """Return the runs of pose_pf on held-out scenes at the size of `experiment=small_scenes`: every
+    ablation; and of one run, sizes of the filter.
+    """
+    working, paper = (POSE_RUN.format(variant) for variant in ("working", "paper"))
+    counts = "25,50,100,200,400,1000"
+    return [
+        *list_pose_rows("seed=0"),
+        Line("pose_filter", f"filter.particles={counts}", working, "kept"),
+        Line("pose_filter", f"filter.first_particles={counts}", working, "first"),
+        Line(
+            "pose_filter", f"filter.first_particles=null filter.particles={counts}", working, "both"
+        ),
+        Line("pose_filter", "filter.steps=1,2,3,5,10,20,50", working, "steps"),
+        Line("pose_filter", "filter.particles=100,400 filter.steps=10,30", paper, "paper"),
+    ]
+
+
+def list_paper() -> list[Line]:
+    """Return the paper's experiments that the other tables lack, at the small size."""
+    patch, seeds = SMALL.format("patch_pf"), "seed=0,1,2"
+    units = "model.displacement.unit=half_frame,1"
+    return [
+        Line("paper_add", f"{patch} loss=add {units} {seeds}"),
+        Line("paper_offset", f"{SMALL_BOX} loss=offset {units} {seeds}"),
+        Line("paper_informed", f"{patch} filter/initialize=informed {units} {seeds}"),
+        Line("paper_patch", f"{patch} model.glimpse.size=3,6 filter.particles=50,100 {seeds}"),
+    ]
+
+
+def list_choices() -> list[Line]:
+    """Return the runs over what the paper leaves open, the cheapest size at which one can tell:
+    rows of docs/methods/choices.md. What they are held against is in `unit`, `paper_add` and
+    `ablation_pose`.
+    """
+    unit, seeds = "model.displacement.unit=1", "seed=0,1,2"
+    detector, patch = f"{SMALL_BOX} {unit}", SMALL.format("patch_pf")
+    pose, pixel = f"{POSE_ROWS} ablation=paper", SMALL.format("pixel_pf")
+    return [
+        Line("choices", f"{pixel} loss=add loss.weighting=mean,likelihood {seeds}"),
+        Line("choices", f"{patch} {unit} model.net.displacement_input=logit,likelihood {seeds}"),
+        Line("choices", f"{patch} loss=add loss.weighting=likelihood {seeds}"),
+        Line("choices", f"{detector} loss=chamfer_rgbd {seeds}"),
+        Line("choices", f"{detector} loss.max_pixels=null {seeds}"),
+        Line("choices", f"{detector} model.net.kernel=1,5 {seeds}"),
+        Line("choices", f"{SMALL_BOX} optimizer.lr=0.0001,0.01 {seeds}"),
+        Line("choices", f"{pose} model.likelihood.anchor=center seed=0"),
+        Line("choices", f"{pose} model.likelihood.spread=0.3,1.2 seed=0"),
+    ]
+
+
+def list_long() -> list[Line]:
+    """Return what takes an hour or more a line: more seeds of pose_pf's ablations, its variants for
+    longer and with augmentation; the paper's experiments at its size; and its samples, all of them.
+    """
+    paper = "model=patch_pf experiment=memorize variant=paper callbacks=checkpoints"
+    boxes = "model=cnn_patch,downsized experiment=memorize variant=paper callbacks=checkpoints"
+    pose = f"{POSE_ROWS} ablation=paper"
+    longer = "trainer.max_steps=3000 trainer.val_check_interval=600 seed=0"
+    augment = "data/augment=strong,camera seed=0,1,2"
+    sizes = "model.glimpse.size=6 filter.particles=50,100"
+    return [
+        *list_pose_rows("seed=1,2"),
+        Line("paper_offset", f"{boxes} loss=offset seed=0,1,2", into="full"),
+        Line("pose_longer", f"{POSE_ROWS} ablation=paper,working {longer}"),
+        Line("pose_augment", f"{POSE_ROWS} ablation=working {augment}"),
+        Line("paper_add", f"{paper} loss=add seed=0", into="full"),
+        Line("paper_informed", f"{paper} filter/initialize=informed seed=0", into="full"),
+        Line("choices", f"{pose} model.candidate_sampler.rays=16,256 seed=0"),
+        Line("paper_patch", f"{paper} {sizes} seed=0", into="full"),
+        Line(
+            "paper_patch", f"{paper} model.glimpse.size=3 filter.particles=100 seed=0", into="full"
+        ),
+        Line("paper_add", f"{paper} loss=add seed=1,2", into="full"),
+        Line("paper_informed", f"{paper} filter/initialize=informed seed=1,2", into="full"),
+    ]
 
 
 def ablation(table: str, swept: str, run: str, model: str) -> Line:

@@ -12,7 +12,8 @@ A table stands between two comments of a page:
 differ in their seed alone become one row: the mean, and the sample standard deviation over seeds;
 with `spread=interval` the 95 % confidence interval of the mean (Student's t) in its place.
 `omit` leaves settings out of the column `changed` by shell patterns: those that a command above the
-table has for all rows. Rows keep the order of the file. A table of more than ten rows is refused.
+table has for all rows. Rows keep the order of the file. A table of more than ten rows is refused,
+and one without runs, unless bench/methods.py plans it: then the page says that it is not made yet.
 `--check` writes nothing, and fails where a page is not up to date.
 """
 
@@ -26,11 +27,14 @@ from fnmatch import fnmatch
 from pathlib import Path
 from statistics import mean, stdev
 
+from methods import plan
 from scipy.stats import t as student_t
 
 HOME = Path(__file__).parents[1]
 RUNS = HOME / "docs" / "results" / "runs.csv"
 MOST_ROWS = 10
+PLANNED = {line.table for line in plan("DIR", "DIR")}
+NOT_MADE = "*Not made yet.*"
 INTERVAL = "interval"
 MARK = re.compile(
     r"(?P<mark><!-- runs (?P<words>.*?) -->)\n(?P<body>.*?)(?P<end><!-- end -->)", re.DOTALL
@@ -130,12 +134,10 @@ def fill_page(text: str, rows: list[Row]) -> str:
     def fill(found: re.Match[str]) -> str:
         try:
             settings = parse_mark(found["words"])
-            table = make_table(
-                select_runs(rows, settings),
-                settings["show"].split("|"),
-                "spread" in settings,
-                settings.get("omit", ""),
-            )
+            runs = select_runs(rows, settings)
+            show, omit = settings["show"].split("|"), settings.get("omit", "")
+            waits = not runs and settings["table"] in PLANNED
+            table = NOT_MADE if waits else make_table(runs, show, "spread" in settings, omit)
         except ValueError as error:
             raise ValueError(f"{found['mark']}: {error}") from error
         return f"{found['mark']}\n\n{table}\n\n{found['end']}"

@@ -79,6 +79,18 @@ def test_what_cannot_be_shown_is_refused(tables: ModuleType, mark: str, words: s
         tables.fill_page(f"<!-- runs {mark} -->\n<!-- end -->", rows)
 
 
+def test_what_is_planned_and_not_made_is_said_to_be_so(
+    tables: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = "<!-- runs table=later show=auc -->\n<!-- end -->"
+    with pytest.raises(ValueError, match="no run fits"):
+        tables.fill_page(page, [make_row(auc=1.0)])
+    monkeypatch.setattr(tables, "PLANNED", {"later"})
+    assert "Not made yet" in tables.fill_page(page, [make_row(auc=1.0)])
+    made = {**make_row(auc=1.0), "table": "later"}
+    assert "Not made yet" not in tables.fill_page(page, [made])
+
+
 def test_a_page_filled_twice_stays_as_it_is(tables: ModuleType) -> None:
     page = "a\n\n<!-- runs table=t show=auc -->\nold\n<!-- end -->\n\nb\n"
     once = tables.fill_page(page, [make_row(auc=5.0)])

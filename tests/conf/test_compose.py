@@ -35,7 +35,7 @@ PRESETS = [
     (model, variant) for model in MODELS for variant in list_choices(CONF / "preset" / model)
 ]
 EXPERIMENTS = list_choices(CONF / "experiment")
-SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect"]
+SWEEPS = [*list_choices(CONF / "sweep"), "ablation", "ablation_detect", "ablation_pose"]
 BUILT = (
     *(f"filter/{step}" for step in ("initialize", "schedule", "reweight", "resample")),
     *(f"filter/{step}" for step in ("propagate", "estimate", "refine")),
@@ -125,7 +125,8 @@ def test_every_experiment_builds(experiment: str, model: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("sweep", SWEEPS)
 def test_every_point_of_every_sweep_composes(sweep: str) -> None:
-    model = "cnn_patch" if "detect" in sweep else "patch_pf"
+    kinds = {"ablation_detect": "cnn_patch", "ablation_pose": "pose_pf"}
+    model = kinds.get(sweep, "patch_pf")
     with initialize_config_dir(str(CONF.resolve()), version_base="1.3"):
         swept = hydra_compose(
             "train", [f"model={model}", f"sweep={sweep}"], return_hydra_config=True

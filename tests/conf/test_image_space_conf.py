@@ -16,6 +16,7 @@ from posefilter.cli.ablations import (
     Ablation,
     list_detector_ablations,
     list_pose_ablations,
+    list_pose_space_ablations,
 )
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
@@ -184,13 +185,20 @@ SEVERAL = {  # ablations that are more than one change
     "pose_c15_noise": 2,
     "pose_m14_surface_point": 3,
     "pose_m18_noise": 2,
+    "pose_pf_s7_proposals": 2,
+    "pose_pf_c1_contrast": 3,
+    "pose_pf_c7_proposals": 2,
+    "pose_pf_m1_contrast": 3,
+    "pose_pf_m7_proposals": 3,
+    "pose_pf_m8_context": 2,
 }
 
 
 @pytest.mark.parametrize("ablation", ABLATIONS, ids=[a.name for a in ABLATIONS])
 def test_each_ablation_changes_what_it_says(ablation: Ablation) -> None:
     """Its choices and settings are its parent's, but for its own overrides."""
-    model = "cnn_patch" if ablation.name.startswith("box_") else "patch_pf"
+    kinds = {"box_": "cnn_patch", "pose_pf_": "pose_pf"}
+    model = next((m for k, m in kinds.items() if ablation.name.startswith(k)), "patch_pf")
     parent = ablation.parent if "=" in ablation.parent else f"ablation={ablation.parent}"
     before, after = (
         compose_once(f"model={model}", typed) for typed in (parent, f"ablation={ablation.name}")
@@ -208,9 +216,17 @@ def test_each_ablation_changes_what_it_says(ablation: Ablation) -> None:
     for override in ablation.overrides:
         key, _, value = override.partition("=")
         now = OmegaConf.select(after.cfg, key) if "." in key else after.choices[key]
-        assert str(now).lower() == value.replace("${model}", model), override
+        expected = value.replace("${model}", model)
+        assert ("null" if now is None else str(now).lower()) == expected, override
         if "." in key:
             assert OmegaConf.select(before.cfg, key) != now, override
+
+
+@pytest.mark.parametrize("name", list_pose_space_ablations())
+def test_each_ablation_of_the_pose_filter_fits_together(name: str) -> None:
+    job = compose_once("model=pose_pf", "sweep=ablation_pose", f"ablation={name}")
+    method = build_method(recipe(job))
+    assert (method.filter.particles, method.filter.steps, method.pixels) == (100, 10, 32)
 
 
 @pytest.mark.parametrize(

@@ -51,11 +51,12 @@ def make_likelihood(context: int | None, octaves: int = 4) -> PoseLikelihood:
 
 
 @pytest.mark.parametrize(("context", "octaves"), [(None, 4), (FEATURES, 4), (FEATURES, 0)])
-@pytest.mark.parametrize("sigma", [0.004, 0.1])
-def test_both_ways_agree(context: int | None, octaves: int, sigma: float) -> None:
+@pytest.mark.parametrize(("sigma", "ray"), [(0.004, True), (0.1, True), (0.1, False)])
+def test_both_ways_agree(context: int | None, octaves: int, sigma: float, ray: bool) -> None:
     g = torch.Generator().manual_seed(0)
     image, poses = make_images(g, context is not None), make_poses(g)
     likelihood = make_likelihood(context, octaves)
+    likelihood.ray = ray
     with torch.enable_grad():  # the reference
         exact = likelihood(
             image, poses, torch.tensor(sigma), CENTER, RADIUS, 50, torch.Generator().manual_seed(1)

@@ -95,6 +95,16 @@ def test_the_noise_level_changes_the_score() -> None:
     )
 
 
+def test_without_its_ray_a_point_is_judged_by_where_it_lies_alone() -> None:
+    scene = flatten_images(*image(), K)
+    points = sample_points(scene, pose(), CENTER, RADIUS, torch.randn(1, 1, 50, 2))
+    turned = points._replace(ray=-points.ray)
+    for ray in (True, False):
+        net = PoseLikelihood(width=32, blocks=1, ray=ray)
+        seen, other = (net.score_points(p, 0.02, CENTER, RADIUS) for p in (points, turned))
+        assert torch.equal(seen, other) is not ray
+
+
 def test_gradients_reach_the_pose() -> None:
     scene = flatten_images(*image(), K)
     shift = torch.zeros(3, requires_grad=True)

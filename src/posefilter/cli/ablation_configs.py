@@ -17,6 +17,7 @@ from posefilter.cli.ablations import (
     find_parent,
     list_detector_ablations,
     list_pose_ablations,
+    list_pose_space_ablations,
 )
 
 
@@ -60,6 +61,7 @@ def register_ablations() -> None:
     All runs of `sweep=ablation` have the size of the working preset, so that a row differs from the
     next in its modification alone. All runs of `sweep=ablation_detect` have 32 particles, for time;
     those that start from the paper keep its 30 steps, since shorter roll-outs are a modification.
+    All runs of `sweep=ablation_pose`, for pose_pf, are of `experiment=small_scenes`.
     """
     store = ConfigStore.instance()
     for ablation in ABLATIONS:
@@ -69,6 +71,7 @@ def register_ablations() -> None:
     sweeps = {
         "ablation": _sweep(list_pose_ablations(), {SIZE: "${model}"}),
         "ablation_detect": _sweep(list_detector_ablations(), {}, filter={"particles": 32}),
+        "ablation_pose": _sweep(list_pose_space_ablations(), {"experiment": "small_scenes"}),
     }
     for name, node in sweeps.items():
         store.store(group="sweep", name=name, node=node, package="_global_")

@@ -2,7 +2,8 @@
 
 Each row is a name, what it changes, the row that it builds on, and overrides. Names begin with `s`
 for one modification of the paper's method alone, `c` for one more modification each, `m` for the
-working method without one of them; `pose_` and `box_` are for methods with a pose and detectors.
+working method without one of them; `pose_` and `box_` before it are for image-space methods with a
+pose and for detectors, `pose_pf_` for the pose-space method.
 """
 
 from typing import NamedTuple
@@ -25,7 +26,7 @@ _DETACHED = "model.detach_position=true"
 _LAYER = "model.net.normalization=layer"
 _SMALL_NOISE = ("filter/propagate=learned_and_gaussian", "filter/schedule=pixels")
 
-ABLATIONS = (
+IMAGE_SPACE_ABLATIONS = (
     Ablation("paper", "The paper's.", "variant=paper"),
     Ablation("working", "All modifications.", "variant=working"),
     Ablation("s1_glimpse", "Paper, with bilinear glimpses.", "paper", ("model/glimpse=smooth",)),
@@ -275,6 +276,197 @@ ABLATIONS = (
     ),
 )
 
+_CANDIDATES = ("model/candidate_sampler=candidates", "loss=contrastive")
+_NO_NEGATIVES = "model.candidate_sampler.particles=0"
+_DENSE = ("model/proposals=dense", "filter/initialize=from_proposals")
+_TURNS = "filter/propagate=gaussian_and_turns"
+
+# Of the pose-space method. A viewing ray needs candidates (labels of single points train the
+# paper's network only), context needs the dense network, and the filter's own particles need
+# candidates: these have no row alone, and c1 is the row of candidates alone.
+POSE_SPACE_ABLATIONS = (
+    Ablation(
+        "pose_pf_s4_schedule",
+        "Paper, with a noise level that falls.",
+        "paper",
+        ("filter/schedule=geometric",),
+    ),
+    Ablation("pose_pf_s5_muon", "Paper, with Muon.", "paper", ("optimizer=muon",)),
+    Ablation(
+        "pose_pf_s6_scheduler",
+        "Paper, with a learning rate that falls.",
+        "paper",
+        ("scheduler=warmup_cosine",),
+    ),
+    Ablation(
+        "pose_pf_s7_proposals", "Paper, with poses voted by a dense network first.", "paper", _DENSE
+    ),
+    Ablation(
+        "pose_pf_s10_turns",
+        "Paper, with particles that also turn about the object's axes (and noise of 0.4 noise "
+        "levels in place of 0.5).",
+        "paper",
+        (_TURNS,),
+    ),
+    Ablation(
+        "pose_pf_s12_refine",
+        "Paper, with a refined estimate.",
+        "paper",
+        ("filter/refine=mean_shift_icp",),
+    ),
+    Ablation(
+        "pose_pf_c1_contrast",
+        "Paper, trained on candidate poses of one image, among which the truth must score highest, "
+        "in place of labels.",
+        "paper",
+        (*_CANDIDATES, _NO_NEGATIVES),
+    ),
+    Ablation(
+        "pose_pf_c2_network",
+        "Also a likelihood that is given the viewing ray and the noise level.",
+        "pose_pf_c1_contrast",
+        ("model/likelihood=contrastive",),
+    ),
+    Ablation(
+        "pose_pf_c3_negatives",
+        "Also wrong poses of the filter's own.",
+        "pose_pf_c2_network",
+        ("model.candidate_sampler.particles=16",),
+    ),
+    Ablation(
+        "pose_pf_c4_schedule",
+        "Also a noise level that falls.",
+        "pose_pf_c3_negatives",
+        ("filter/schedule=geometric",),
+    ),
+    Ablation("pose_pf_c5_muon", "Also Muon.", "pose_pf_c4_schedule", ("optimizer=muon",)),
+    Ablation(
+        "pose_pf_c6_scheduler",
+        "Also a learning rate that falls.",
+        "pose_pf_c5_muon",
+        ("scheduler=warmup_cosine",),
+    ),
+    Ablation(
+        "pose_pf_c7_proposals",
+        "Also poses voted by a dense network, first and among the candidates.",
+        "pose_pf_c6_scheduler",
+        _DENSE,
+    ),
+    Ablation(
+        "pose_pf_c8_context",
+        "Also the dense network's features at each image point.",
+        "pose_pf_c7_proposals",
+        ("model/likelihood=contextual",),
+    ),
+    Ablation(
+        "pose_pf_c9_surface",
+        "Also the term of the pose's own surface.",
+        "pose_pf_c8_context",
+        ("model/likelihood=surface",),
+    ),
+    Ablation(
+        "pose_pf_c10_turns",
+        "Also particles that turn about the object's axes (and noise of 0.4 noise levels in place "
+        "of 0.5).",
+        "pose_pf_c9_surface",
+        (_TURNS,),
+    ),
+    Ablation(
+        "pose_pf_c11_quasi_monte_carlo",
+        "Also image points of a low-discrepancy sequence. With the refinement it is `working`.",
+        "pose_pf_c10_turns",
+        ("model.quasi_monte_carlo=true",),
+    ),
+    Ablation(
+        "pose_pf_m1_contrast",
+        "Working, with the paper's likelihood trained on labeled points (so that there is no ray, "
+        "context or surface).",
+        "working",
+        ("model/likelihood=paper", "model/candidate_sampler=labeled_rays", "loss=regression"),
+    ),
+    Ablation(
+        "pose_pf_m2_network",
+        "Working, with the paper's likelihood trained on candidates.",
+        "working",
+        ("model/likelihood=paper",),
+    ),
+    Ablation(
+        "pose_pf_m2_ray",
+        "Working, without the viewing ray.",
+        "working",
+        ("model.likelihood.ray=false",),
+    ),
+    Ablation(
+        "pose_pf_m3_negatives",
+        "Working, without wrong poses of the filter's own in training.",
+        "working",
+        (_NO_NEGATIVES,),
+    ),
+    Ablation(
+        "pose_pf_m4_schedule",
+        "Working, with one noise level.",
+        "working",
+        ("filter/schedule=constant",),
+    ),
+    Ablation("pose_pf_m5_muon", "Working, with Adam.", "working", ("optimizer=adam",)),
+    Ablation(
+        "pose_pf_m6_scheduler",
+        "Working, with a constant learning rate.",
+        "working",
+        ("scheduler=none",),
+    ),
+    Ablation(
+        "pose_pf_m7_start",
+        "Working, with first poses anywhere on the measured surfaces; the dense network remains.",
+        "working",
+        ("filter/initialize=from_depth",),
+    ),
+    Ablation(
+        "pose_pf_m7_proposals",
+        "Working, without the dense network (so that there is no context).",
+        "working",
+        (
+            "model/proposals=none",
+            "filter/initialize=from_depth",
+            "model.likelihood.context=null",
+        ),
+    ),
+    Ablation(
+        "pose_pf_m8_context",
+        "Working, without the dense network's features at the image points.",
+        "working",
+        ("model.likelihood.context=null", "model.proposals.features=0"),
+    ),
+    Ablation(
+        "pose_pf_m9_surface",
+        "Working, without the term of the pose's own surface.",
+        "working",
+        ("model/likelihood=contextual",),
+    ),
+    Ablation(
+        "pose_pf_m10_turns",
+        "Working, with particles that do not turn about the object's axes.",
+        "working",
+        ("filter/propagate=gaussian",),
+    ),
+    Ablation(
+        "pose_pf_m11_quasi_monte_carlo",
+        "Working, with independent image points.",
+        "working",
+        ("model.quasi_monte_carlo=false",),
+    ),
+    Ablation(
+        "pose_pf_m12_refine", "Working, without refinement.", "working", ("filter/refine=none",)
+    ),
+    Ablation(
+        "pose_pf_m13_icp",
+        "Working, without the alignment with the measured depth.",
+        "working",
+        ("filter/refine=mean_shift",),
+    ),
+)
+ABLATIONS = (*IMAGE_SPACE_ABLATIONS, *POSE_SPACE_ABLATIONS)
+
 # Left out of the detectors' sweep: s5_position equals paper (a whole-pixel glimpse has no gradient
 # through its position), so s9 equals s4; s3, s6 and s8 say nothing about a detector; from
 # c3_bounded to c5_displacement_loss the gradient of 30 steps overflows.
@@ -295,14 +487,23 @@ def find_parent(ablation: Ablation) -> Ablation:
 
 
 def list_pose_ablations() -> list[str]:
-    """Return the names of the rows for methods with a pose, in order of the table's sweep."""
-    return _in_order([a.name for a in ABLATIONS if not a.name.startswith("box_")])
+    """Return the names of the rows for image-space methods with a pose, in order of the table's
+    sweep.
+    """
+    return _in_order([a.name for a in IMAGE_SPACE_ABLATIONS if not a.name.startswith("box_")])
 
 
 def list_detector_ablations() -> list[str]:
     """Return the names of the rows for detectors, in order of the table's sweep."""
-    own = [a.name for a in ABLATIONS if not a.name.startswith("pose_")]
+    own = [a.name for a in IMAGE_SPACE_ABLATIONS if not a.name.startswith("pose_")]
     return _in_order([name for name in own if name not in _NOT_OF_DETECTORS])
+
+
+def list_pose_space_ablations() -> list[str]:
+    """Return the names of the rows for the pose-space method, what tells most first."""
+    own = [a.name for a in POSE_SPACE_ABLATIONS]
+    series = [[name for name in own if name.startswith(f"pose_pf_{kind}")] for kind in "mcs"]
+    return ["working", "paper", *(name for names in series for name in names)]
 
 
 def _in_order(names: list[str]) -> list[str]:

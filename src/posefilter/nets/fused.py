@@ -263,6 +263,8 @@ class _Weights:
         enter = likelihood.enter
         weight = enter.weight * (1 + gain)[:, None]
         ways = 3 * (2 * likelihood.octaves + 1)
+        if not likelihood.ray:
+            weight[:, ways + 3 : ways + 6] = 0
         plain = ways + 7
         order = [*_columns(likelihood.octaves), *range(ways, plain)]
         rest: list[int] = []

@@ -153,6 +153,7 @@ class PoseLikelihood(nn.Module):
         sigma: Lowest and highest noise level [m].
         context: Features of the coordinate network for each point; None for points without context.
         surface: A term from the hypothesis's surface, added to the mean score; None for none.
+        ray: Whether the network is given the viewing ray (in an ablation it is 0).
     """
 
     provides: ClassVar[Capabilities] = ("score_points",)
@@ -166,9 +167,10 @@ class PoseLikelihood(nn.Module):
         sigma: tuple[float, float] = (0.003, 0.25),
         context: int | None = None,
         surface: SurfaceTerm | None = None,
+        ray: bool = True,
     ) -> None:
         super().__init__()
-        self.context, self.surface = context, surface
+        self.context, self.surface, self.ray = context, surface, ray
         self.octaves, self.scale, self.sigma = octaves, scale, (float(sigma[0]), float(sigma[1]))
         surroundings = 0 if context is None else 9 + context
         self.enter = Linear(3 * (2 * octaves + 1) + 7 + surroundings, width)
@@ -206,7 +208,8 @@ class PoseLikelihood(nn.Module):
         """Score points one by one.  Points (B, N, P), level (B, 9) -> (B, N, P)."""
         p = contract(points.position / radius)
         known = points.known[..., None].to(p.dtype)
-        inputs = [fourier(p / 2, self.octaves), points.color * 2 - 1, points.ray, known]
+        ray = points.ray if self.ray else torch.zeros_like(points.ray)
+        inputs = [fourier(p / 2, self.octaves), points.color * 2 - 1, ray, known]
         if self.context is not None:
             inputs.append(self.surroundings(points, radius))
         x = self.enter(torch.cat(inputs, dim=-1))
