@@ -3,8 +3,9 @@
     python bench/collect_runs.py [FOLDER] [--out docs/results/runs.csv]
 
 FOLDER (default: outputs/methods, where bench/methods.py puts its runs) has a folder a table,
-searched for metrics.json. The rows of a table that has runs there are replaced; those of other
-tables stay. `bench/tables.py` then fills the tables of the documents.
+searched for metrics.json. A run replaces the row of the same table, method, settings and seed; all
+other rows stay, so that a part of a table can be made by itself. `bench/tables.py` then fills the
+tables of the documents.
 """
 
 import argparse
@@ -45,6 +46,7 @@ NAMED = ("model", "variant", "experiment", "sweep", "seed", "checkpoint")  # hav
 SILENT = ("logger", "callbacks", "hydra", "out", "resume", "console", "threads")
 SILENT_KEYS = ("data.root", "data.meshes", "data.workers", "data.generate.workers")
 ORDER = {ablation.name: number for number, ablation in enumerate(ABLATIONS)}
+ROW = ("table", "method", "variant", "changed", "seed")  # what tells a row from others
 Run = dict[str, Any]
 
 
@@ -95,15 +97,15 @@ def describe(run: Run) -> tuple[str, str, str]:
     return method, variant, " ".join(sorted(rest))
 
 
-def order(run: Run) -> tuple[Any, ...]:
-    """Return what runs are sorted by: ablations as their table has them, numbers by their size."""
-    method, variant, rest = describe(run)
+def order(row: dict[str, str]) -> tuple[Any, ...]:
+    """Return what rows are sorted by: ablations as their table has them, numbers by their size."""
+    rest = row["changed"]
     ablation = re.search(r"\bablation=(\w+)", rest)
     numbers = [
         (0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", rest)
     ]
     step = ORDER.get(ablation[1], len(ORDER)) if ablation else -1
-    return method, step, variant, numbers, read_figure(run, COLUMNS["seed"]) or 0
+    return row["table"], row["method"], row["variant"], step, numbers, float(row["seed"] or 0)
 
 
 def read_figure(run: Run, read: Callable[[Run], float | None]) -> float | None:
@@ -118,7 +120,7 @@ def read_figure(run: Run, read: Callable[[Run], float | None]) -> float | None:
 def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
     """Return a table's runs as rows: figures to six digits, empty where a run has none."""
     rows = []
-    for run in sorted(runs, key=order):
+    for run in runs:
         figures = {name: read_figure(run, read) for name, read in COLUMNS.items()}
         rows.append(
             dict(
@@ -132,7 +134,7 @@ def make_rows(table: str, runs: Iterable[Run]) -> list[dict[str, str]]:
 
 
 def main() -> int:
-    """Read the runs, replace their tables' rows, and fill the tables of the documents."""
+    """Read the runs, replace their rows, and fill the tables of the documents."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -144,19 +146,18 @@ def main() -> int:
     if not tables:
         print(f"{options.folder}: holds no run", file=sys.stderr)
         return 1
-    kept = []
+    rows = {}
     if options.out.is_file():
         with options.out.open() as file:
-            kept = [row for row in csv.DictReader(file) if row["table"] not in tables]
+            rows = {tuple(row[name] for name in ROW): row for row in csv.DictReader(file)}
     for name, runs in tables.items():
         print(f"{name}: {len(runs)} runs")
-        kept += make_rows(name, runs)
-    kept.sort(key=lambda row: row["table"])  # stable: rows of a table keep their order
+        rows |= {tuple(row[key] for key in ROW): row for row in make_rows(name, runs)}
     with options.out.open("w", newline="") as file:
         header = ["table", "method", "variant", "changed", *COLUMNS, "device", "torch"]
         writer = csv.DictWriter(file, header, lineterminator="\n")
         writer.writeheader()
-        writer.writerows(kept)
+        writer.writerows(sorted(rows.values(), key=order))
     return subprocess.run([sys.executable, "bench/tables.py"], cwd=HOME, check=False).returncode
 
 

@@ -37,20 +37,22 @@ def test_what_decides_no_result_is_left_out(collect: ModuleType, tmp_path: Path)
 
 
 def test_rows_follow_the_table_of_ablations_and_numbers_their_size(collect: ModuleType) -> None:
-    def runs(*changes: str) -> list[dict]:
-        return [{"choices": dict([change.split("=")]), "model": "m"} for change in changes]
+    def rows(*changes: str) -> list[dict[str, str]]:
+        same = {"table": "t", "method": "m", "variant": "paper", "seed": "0"}
+        return [{**same, "changed": change} for change in changes]
+
+    def sort(*changes: str) -> list[str]:
+        return [row["changed"].split("=")[1] for row in sorted(rows(*changes), key=collect.order)]
 
     names = ["paper", "s1_glimpse", "c2_glimpse", "c10_resample", "working", "m3_bounded"]
-    ablations = runs(*(f"ablation={name}" for name in sorted(names)))
-    ordered = [run["choices"]["ablation"] for run in sorted(ablations, key=collect.order)]
+    ordered = sort(*(f"ablation={name}" for name in sorted(names)))
     assert sorted(ordered, key=collect.ORDER.get) == ordered
     assert ordered.index("c2_glimpse") < ordered.index("c10_resample")
-    counts = runs(*(f"filter.particles={n}" for n in (1000, 50, 100)))
-    ordered = [run["choices"]["filter.particles"] for run in sorted(counts, key=collect.order)]
+    ordered = sort(*(f"filter.particles={n}" for n in (1000, 50, 100)))
     assert ordered == ["50", "100", "1000"]
 
 
-def test_only_tables_with_runs_are_replaced(
+def test_a_run_replaces_its_own_row_and_no_other(
     collect: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_run(tmp_path / "runs" / "memorize" / "a", 0.9, "model=patch_pf", "variant=working")
@@ -64,10 +66,12 @@ def test_only_tables_with_runs_are_replaced(
     (tmp_path / "runs" / "memorize" / "a" / "metrics.json").unlink()
     (tmp_path / "runs" / "other" / "deep" / "b" / "metrics.json").unlink()
     write_run(tmp_path / "runs" / "other" / "c", 0.3, "model=patch_pf", "variant=paper")
+    more = ("model=patch_pf", "variant=paper", "loss=add")
+    write_run(tmp_path / "runs" / "other" / "d", 0.2, *more)
     assert collect.main() == 0
     rows = list(csv.DictReader(into.open()))
-    found = [(row["table"], row["variant"], row["on object %"]) for row in rows]
-    assert found == [("memorize", "working", "90"), ("other", "paper", "30")]
+    found = [tuple(row[name] for name in ("table", "changed", "on object %")) for row in rows]
+    assert found == [("memorize", "", "90"), ("other", "", "30"), ("other", "loss=add", "20")]
     assert rows[0]["AUROC"] == "", "a figure that a run has not"
 
 
