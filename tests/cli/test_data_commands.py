@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from posefilter.cli.build import build_data
 from posefilter.cli.check_data import check_data
@@ -44,6 +45,17 @@ def test_a_split_that_is_typed_replaces(
 ) -> None:
     job = compose_job(command, CONF, overrides, tmp_path)
     assert job.cfg.data.split == split
+
+
+@pytest.mark.parametrize("command", ["evaluate", "calibrate"])
+def test_a_split_that_is_typed_replaces_the_checkpoints(tmp_path: Path, command: str) -> None:
+    root = f"data.root={tmp_path / 'scenes'}"
+    trained = compose_job("train", CONF, [root], tmp_path).cfg
+    own = {"data": {**OmegaConf.to_container(trained.data, resolve=True), "augment": {}}}
+    job = compose_job(command, CONF, [f"++{root}", "++data.split={val: 1.0}"], tmp_path)
+    assert data_settings(job, own, None).split == {"val": 1.0}
+    job = compose_job(command, CONF, [f"++{root}", "++data.split.val=0.2"], tmp_path)
+    assert data_settings(job, own, None).split == {**DEFAULTS, "val": 0.2}
 
 
 def test_the_next_commands_of_few_frames_run(

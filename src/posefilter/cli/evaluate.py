@@ -227,6 +227,8 @@ def data_settings(
     settings = (
         dict(said) if chosen else changed({"data": own}, {"data": said} if said else {})["data"]
     )
+    if "split" in typed:  # typed whole, it replaces the checkpoint's
+        settings["split"] = said["split"]
     settings["augment"] = {}
     tree = {**trained, "data": settings, "seed": trained.get("seed", 0)}
     if chosen and own:
