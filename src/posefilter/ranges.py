@@ -195,6 +195,7 @@ RANGES: dict[str, Range] = {
     "trainer.devices[]": _whole(0, 1023),  # a list names them, from 0
     "every_n_validations": COUNT,
     "save_top_k": _whole(-1, 1000),
+    "budget.seconds": Range(0, 1e9, above=True),
     "last.minutes": Range(0, 1e6),
     # optimizer, scheduler
     "lr": Range(0, 10),

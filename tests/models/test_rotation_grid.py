@@ -157,5 +157,5 @@ def test_a_checkpoint_holds_the_codes_of_its_weights_and_needs_no_mesh() -> None
 
 
 def test_too_few_cells_are_refused() -> None:
-    with pytest.raises(UserError, match="model.cells=5: fewer than model.near_cells=6"):
+    with pytest.raises(UserError, match=r"model\.cells=5: fewer than model\.near_cells=6"):
         RotationGrid(CropEncoder(), 5, filter=None, loss=None, optimizer=None)  # type: ignore[arg-type]
