@@ -3,7 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
-MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized dense_coordinates keypoints
+MODELS := pose_pf pixel_pf patch_pf cnn_patch downsized dense_coordinates keypoints rotation_grid
 
 .DEFAULT_GOAL := help
 .PHONY: help setup train test test-all coverage check format smoke bench methods board report tour pictures weights docs tables clean

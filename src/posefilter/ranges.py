@@ -196,6 +196,7 @@ RANGES: dict[str, Range] = {
     "trainer.devices[]": _whole(0, 1023),  # a list names them, from 0
     "every_n_validations": COUNT,
     "save_top_k": _whole(-1, 1000),
+    "budget.seconds": Range(0, 1e9, above=True),
     "last.minutes": Range(0, 1e6),
     # optimizer, scheduler
     "lr": Range(0, 10),
@@ -305,6 +306,13 @@ RANGES: dict[str, Range] = {
     "model.peaks": _whole(1, 100),
     "model.subset": _whole(4, 9),
     "model.inlier_px": Range(0, MOST_SIDE, above=True),
+    "net.code": _whole(1, 65_536),
+    "net.side": _whole(16, 1024),
+    "model.reach": Range(0, 10, above=True),
+    "model.distance": Range(1, 1e6, above=True),
+    "model.crops": _whole(2, 100_000),
+    "model.train_cells": COUNT,
+    "model.near_cells": _whole(1, 1000),
     "train_filter.steps": _whole(1, 10_000),
     # loss
     "loss.points": COUNT,

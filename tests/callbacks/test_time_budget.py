@@ -44,7 +44,8 @@ def run(
     folder: Path, monkeypatch: pytest.MonkeyPatch, steps: int, budget: TimeBudget, **more: object
 ) -> Line:
     clock = [0.0]
-    monkeypatch.setattr(time_budget.time, "perf_counter", lambda: clock[0])
+    name = {"wall": "perf_counter", "cpu": "process_time"}[budget.clock]
+    monkeypatch.setattr(time_budget.time, name, lambda: clock[0])
     line, data = Line(steps, clock), DataLoader(TensorDataset(torch.ones(4, 1)), batch_size=1)
     trainer = Trainer(
         default_root_dir=folder,
@@ -81,6 +82,15 @@ def test_a_slow_machine_ends_on_time_with_the_rate_decayed(
     assert line.rates[-1] < 0.1
     assert line.rates[1:] == sorted(line.rates[1:], reverse=True)
     assert line.validations == 4  # once, as after the last step
+
+
+def test_processor_time_is_a_clock_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = run(tmp_path, monkeypatch, 20, TimeBudget(8.0, clock="cpu"))
+    assert len(line.rates) == 8
+    with pytest.raises(UserError, match="clock sun: choose wall or cpu"):
+        TimeBudget(8.0, clock="sun")
 
 
 def test_time_of_an_earlier_sitting_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli import run_command
-from posefilter.cli.arguments import defer_settings
+from posefilter.cli.arguments import defer_settings, quoted
 from posefilter.cli.job import Job
 
 HOME = Path(__file__).parents[2]
@@ -40,3 +41,20 @@ def test_a_sweep_over_numbers_is_left_as_typed() -> None:
     typed = ["-m", "filter.particles=50,100", "model.net.width=16", "model=patch_pf"]
     assert defer_settings(typed, HOME / "conf") == typed
     assert defer_settings(typed[3:] + typed[2:3], HOME / "conf") == ["model=patch_pf", typed[2]]
+
+
+@pytest.mark.parametrize(
+    ("typed", "value"),
+    [
+        ("out=a/b,c=1", None),  # a sweep over two values, each of them quoted
+        (r"out=a/seed\=0\,model\=x_160\,/y.ckpt", "a/seed=0,model=x_160,/y.ckpt"),
+        ("out='a/seed=0,b'", "a/seed=0,b"),
+        ("out=a/ü=1", "a/ü=1"),
+    ],
+)
+def test_a_folder_named_after_settings_can_be_typed(typed: str, value: str | None) -> None:
+    parsed = OverridesParser.create().parse_override(quoted([typed])[0])
+    if value is None:
+        assert [str(part) for part in parsed.sweep_string_iterator()] == ["'a/b'", "'c=1'"]
+    else:
+        assert parsed.value() == value

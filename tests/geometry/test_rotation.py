@@ -20,6 +20,7 @@ from posefilter.geometry.rotation import (
     project_to_so3,
     quat_xyzw_from_matrix,
     random_rotation,
+    spread_rotations,
 )
 
 V = torch.cat(
@@ -115,3 +116,14 @@ def test_gradients_of_fits_and_projections() -> None:
     source, target = V[:10], V[10:20].clone().requires_grad_()
     weights = V[20:30, 0].abs().clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda t, w: fit_rigid(source, t, w), (target, weights))
+
+
+def test_spread_rotations_leave_no_gap_and_no_two_are_close() -> None:
+    count = 1000
+    R = spread_rotations(count)
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).expand(count, 3, 3), atol=1e-5, rtol=0)
+    cell = (6 * math.pi / count) ** (1 / 3)  # angle of a ball of a cell's volume
+    apart = angle_between(R[:, None], R) + 9 * torch.eye(count)
+    assert apart.min() > cell
+    gaps = angle_between(random_rotation(2000, generator=Generator().manual_seed(0))[:, None], R)
+    assert gaps.amin(1).max() < 1.5 * cell

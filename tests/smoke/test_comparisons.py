@@ -13,9 +13,11 @@ from posefilter.cli.job import Job
 from posefilter.cli.train import train
 from posefilter.metrics.image_errors import read_errors
 
+FEWER_CELLS = ["model.cells=50", "model.train_cells=16", "filter/refine=none"]
 FEW = {
     "dense_coordinates": ["model.proposals.widths=[16,24,32,32]", "model.proposals.fragments=8"],
     "keypoints": ["model.net.widths=[16,24,32,32]", "model.net.width=16"],
+    "rotation_grid": ["model.net.widths=[16,24,32,32]", *FEWER_CELLS],
 }
 
 

@@ -92,7 +92,7 @@ def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
         weights = log_weights.exp()
         row = {"ess": 1 / weights.square().sum(1) / weights.shape[1]}
         if isinstance(space, PoseSpace):
-            row["spread_m"], row["spread_rad"] = spread(state, log_weights, space)
+            row["spread_m"], row["spread_rad"] = spread(output.pose.detach(), log_weights, space)
         else:
             mean = space.mean(state, weights)[:, None]
             row["spread_px"] = (weights * space.distance(state, mean).square()).sum(1).sqrt()

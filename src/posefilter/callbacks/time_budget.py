@@ -7,6 +7,9 @@ from lightning import Callback, LightningModule, Trainer
 
 from posefilter.errors import UserError
 
+# looked up at each call
+_CLOCKS = {"wall": lambda: time.perf_counter(), "cpu": lambda: time.process_time()}
+
 
 class TimeBudget(Callback):
     """Let the learning-rate schedule keep pace with the clock, and stop when the time is up.
@@ -17,22 +20,30 @@ class TimeBudget(Callback):
 
     Args:
         seconds: For all steps, validations not counted as steps but as time.
+        clock: "wall", or "cpu" for the process's own processor time, the sum over its threads: on a
+            machine that others use, too, it gives every training as much.
 
     Raises:
-        UserError: `seconds` is not positive.
+        UserError: `seconds` is not positive, or there is no such clock.
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, clock: str = "wall") -> None:
         if not seconds > 0:
             raise UserError(f"time budget of {seconds} s: must be positive")
-        self.seconds = seconds
+        if clock not in _CLOCKS:
+            raise UserError(f"time budget by the clock {clock}: choose {' or '.join(_CLOCKS)}")
+        self.seconds, self.clock = seconds, clock
         self.spent = 0.0  # in earlier sittings [s]
-        self._began = time.perf_counter()
+        self._began = self.now()
+
+    def now(self) -> float:
+        """Return what the clock says [s]."""
+        return _CLOCKS[self.clock]()
 
     @property
     def elapsed(self) -> float:
         """Time of all sittings [s]."""
-        return self.spent + time.perf_counter() - self._began
+        return self.spent + self.now() - self._began
 
     def state_dict(self) -> dict[str, Any]:
         """Return the time that was spent."""
@@ -44,7 +55,7 @@ class TimeBudget(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock."""
-        self._began = time.perf_counter()
+        self._began = self.now()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
         """Advance the schedule to where the clock is; stop if the time is up."""

@@ -42,10 +42,12 @@ def quoted(arguments: Sequence[str]) -> list[str]:
 
 
 def _written(value: str) -> bool:
-    """Tell whether a value is written in Hydra's grammar: quoted, a list, or one that refers to
-    another.
+    """Tell whether a value is written in Hydra's grammar: quoted, a list, one that refers to
+    another, or with escapes.
     """
-    return value.startswith(("'", '"', "[", "{")) or "${" in value or value.rstrip().endswith(")")
+    if value.startswith(("'", '"', "[", "{")) or "${" in value or value.rstrip().endswith(")"):
+        return True
+    return re.search(r"\\[=,]", value) is not None
 
 
 def check_choices(arguments: list[str], conf: Path) -> None:

@@ -107,12 +107,13 @@ class Animation:
         """Return chosen particles' dots (N, 2), and the corners of others' outlines (n, V, 2), none
         for pixels.  [px]
         """
-        state = self.trace.particles[number].state[0].detach().cpu().double()
         if not isinstance(self.space, PoseSpace):
+            state = self.trace.particles[number].state[0].detach().cpu().double()
             return state[dots].numpy(), np.zeros((len(lines), 0, 2))
+        poses = self.trace.outputs[number].pose[0].detach().cpu().double()
         center = torch.tensor(self.space.center, dtype=torch.float64)
-        corners = project_hulls(state[lines], self.hull, self.camera.numpy())
-        return project(origin_of(state[dots], center), self.camera).numpy(), corners
+        corners = project_hulls(poses[lines], self.hull, self.camera.numpy())
+        return project(origin_of(poses[dots], center), self.camera).numpy(), corners
 
     def frame(
         self, dots: np.ndarray, corners: np.ndarray, weights: np.ndarray, caption: str

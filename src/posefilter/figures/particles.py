@@ -208,17 +208,17 @@ class PoseStep:
     ) -> None:
         camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
         center = torch.tensor(space.center, dtype=torch.float64)
-        state = trace.particles[number].state[image].detach().cpu().double()
+        poses = trace.outputs[number].pose[image].detach().cpu().double()
         weights = normalize_weights(trace.particles[number], image)
         self.weights = weights.numpy()
-        self.pixels = project(origin_of(state, center), camera).numpy()
+        self.pixels = project(origin_of(poses, center), camera).numpy()
         self.axes = project_axes(
-            state[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
+            poses[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
         )
         self.reach = (
             space.radius
             * float(camera[0, 0])
-            / max(float(weights @ origin_of(state, center)[:, 2]), 0.05)
+            / max(float(weights @ origin_of(poses, center)[:, 2]), 0.05)
         )
         self.caption = describe_step(trace, image, number, "mm")
 

@@ -99,9 +99,8 @@ def draw_silhouettes(
     parts: list[np.ndarray] = []
     for number in choose_steps(len(trace.particles), 4):
         weights = normalize_weights(trace.particles[number], 0)
-        chosen = (
-            trace.particles[number].state[0].detach().cpu().double()[choose_by_weight(weights, 64)]
-        )
+        poses = trace.outputs[number].pose[0].detach().cpu().double()
+        chosen = poses[choose_by_weight(weights, 64)]
         pixels = project_hulls(chosen, hull, K)
         tiles = []
         for view, ground in zip((frame, near), grounds, strict=True):

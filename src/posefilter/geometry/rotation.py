@@ -100,6 +100,20 @@ def random_rotation(
     return matrix_from_quat_xyzw(torch.randn(*shape, 4, generator=generator, device=device))
 
 
+def spread_rotations(count: int) -> Tensor:
+    """Return rotations that cover SO(3) evenly: super-Fibonacci spirals (Alexa 2022).
+
+    -> (count, 3, 3).
+    """
+    psi = 1.533751168755204288118041  # the real root of x^4 = x + 4 above 1
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    share, turn = index / count, 2 * math.pi * index
+    a, b = turn / math.sqrt(2), turn / psi
+    r, s = share.sqrt(), (1 - share).sqrt()
+    quat = torch.stack([r * a.sin(), r * a.cos(), s * b.sin(), s * b.cos()], dim=-1)
+    return matrix_from_quat_xyzw(quat).float()
+
+
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
     """Return the geodesic angle between rotations.  (*, 3, 3) x 2 -> (*), 0 to pi [rad].
 

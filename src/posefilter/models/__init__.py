@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from posefilter.models.patch_pf import PatchPF
     from posefilter.models.pixel_pf import PixelPF
     from posefilter.models.pose_pf import PosePF
+    from posefilter.models.rotation_grid import RotationGrid
 
 __all__ = [
     "CnnPatch",
@@ -25,6 +26,7 @@ __all__ = [
     "PatchPF",
     "PixelPF",
     "PosePF",
+    "RotationGrid",
 ]
 
 _HOMES = {
@@ -35,6 +37,7 @@ _HOMES = {
     "PatchPF": "patch_pf",
     "PixelPF": "pixel_pf",
     "PosePF": "pose_pf",
+    "RotationGrid": "rotation_grid",
 }
 
 

@@ -1,0 +1,71 @@
+"""The loss of a posterior over crops and rotations of a grid."""
+
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.geometry.crops import look_at
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.types import Batch, ObjectModel, Trace
+
+
+class HasGridScores(Protocol):
+    """An encoded image whose crops are scored against rotations."""
+
+    @property
+    def scores(self) -> Tensor:
+        """Log likelihoods (B, C, M) of rotation m, given that crop c is about the object."""
+        ...
+
+    @property
+    def centers(self) -> Tensor:
+        """(B, C, 3) where the crops are about [m]."""
+        ...
+
+    @property
+    def rotations(self) -> Tensor:
+        """(M, 3, 3) of the object, relative to a camera that looks at its center."""
+        ...
+
+
+def squared_distances(
+    centers: Tensor, rotations: Tensor, truth: Tensor, model: ObjectModel
+) -> Tensor:
+    """Return how far the pose of each center and rotation is from the truth, squared.
+
+    Shift, and angle x radius, to the nearest of the poses that a symmetry makes equal.
+
+    (B, C, 3) [m], (M, 3, 3), (B, 4, 4) -> (B, C, M) [m^2].
+    """
+    shift = (centers - origin_of(truth, model.center.to(truth))[:, None]).square().sum(-1)
+    seen = look_at(centers).mT @ rotation_of(truth)[:, None]
+    alike = seen[:, :, None] @ rotation_of(model.symmetries.to(truth))
+    trace = torch.einsum("bcsij,mij->bcsm", alike, rotations).amax(2)
+    angle = ((trace - 1) / 2).clamp(-1, 1).acos()
+    return shift[..., None] + (model.radius * angle).square()
+
+
+class GridPosterior:
+    """Divergence of the posterior over (crop, rotation) from a Gaussian about the true pose.
+
+    One softmax over all pairs of an image learns both what a particle's likelihood must tell: which
+    translation is right, and which rotation, given one.
+
+    Args:
+        sigma: Standard deviation of the Gaussian, in radii of the object.
+    """
+
+    requires: ClassVar[Capabilities] = ("grid_scores",)
+
+    def __init__(self, sigma: float = 0.15) -> None:
+        self.sigma = sigma
+
+    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+        """Return the loss of each image, (B,); the trace's scene is `HasGridScores`."""
+        scene: HasGridScores = trace.scene
+        far = squared_distances(scene.centers, scene.rotations, batch.camera_from_object, model)
+        wanted = (-0.5 * far / (self.sigma * model.radius) ** 2).flatten(1).log_softmax(1)
+        found = scene.scores.flatten(1).log_softmax(1)
+        return (wanted.exp() * (wanted - found)).sum(1)
