@@ -22,10 +22,10 @@ def trace_of(
         B, N = w.shape
         history.append(Particles(state, torch.zeros(B, N, 0), w.log(), torch.zeros(B, N).long()))
         likely = torch.arange(N).float().expand(B, N) * (t + 1)
+        # what particles that are poses predict
+        predicted = state if state.dim() == 4 else torch.eye(4).expand(B, N, 4, 4)
         outputs.append(
-            ParticleOutput(
-                likely, torch.zeros(B, N, 2), torch.eye(4).expand(B, N, 4, 4), torch.zeros(B, N, 0)
-            )
+            ParticleOutput(likely, torch.zeros(B, N, 2), predicted, torch.zeros(B, N, 0))
         )
         steps.append(Step(t, len(states), sigma))
     poses = torch.eye(4).expand(len(weights[0]), 1, 4, 4)

@@ -42,6 +42,8 @@ def trace_of(states: list[torch.Tensor], ancestors: list[list[int]]) -> Trace:
     history, outputs = [], []
     for state, own in zip(states, ancestors, strict=True):
         N = len(state)
+        # what particles that are poses predict
+        predicted = state if state.dim() == 3 else torch.eye(4).expand(N, 4, 4)
         history.append(
             Particles(
                 state[None],
@@ -54,7 +56,7 @@ def trace_of(states: list[torch.Tensor], ancestors: list[list[int]]) -> Trace:
             ParticleOutput(
                 torch.zeros(1, N),
                 torch.zeros(1, N, 2),
-                torch.eye(4).expand(1, N, 4, 4),
+                predicted[None],
                 torch.zeros(1, N, 0),
             )
         )

@@ -34,7 +34,8 @@ def trace_of(states: torch.Tensor, weights: torch.Tensor) -> Trace:
         )
         for t in range(T)
     )
-    poses = torch.eye(4).expand(1, N, 4, 4)
+    # what particles that are poses predict
+    poses = states[-1][None] if states.dim() == 4 else torch.eye(4).expand(1, N, 4, 4)
     output = ParticleOutput(torch.zeros(1, N), torch.zeros(1, N, 2), poses, torch.zeros(1, N, 0))
     steps = tuple(Step(t, T, torch.tensor(0.04 / (t + 1))) for t in range(T))
     return Trace(
