@@ -3,6 +3,7 @@
 import ctypes
 import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 
 from posefilter.belief import Belief
 from posefilter.callbacks.records import write_beliefs
+from posefilter.cli import run_command
 from posefilter.cli.files import save_whole
 from posefilter.cli.results import write_json
 from posefilter.data.cache import DiskCache
@@ -25,20 +27,30 @@ from posefilter.metrics.bop_results import PoseRow, write_poses_csv
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.synthetic.fat_format import write_image
 
+HOME = Path(__file__).parents[2]
 KILOBYTES = 64
+_READ_ONLY = 1  # of mount(2)
 NOISE = np.random.default_rng(0).integers(0, 256, (300, 300, 3), dtype=np.uint8)
+
+
+@contextmanager
+def mounted(folder: Path, flags: int = 0) -> Iterator[Path]:
+    """Mount a file system of 64 kB at a folder; skip where none can be mounted."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    size = f"size={KILOBYTES}k".encode()
+    if libc.mount(b"tmpfs", os.fsencode(folder), b"tmpfs", flags, size) != 0:
+        pytest.skip("no file system can be mounted here")
+    try:
+        yield folder
+    finally:
+        libc.umount2(os.fsencode(folder), 2)
 
 
 @pytest.fixture(scope="module")
 def full_disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return the folder of a file system of 64 kB; skip where none can be mounted."""
-    folder = tmp_path_factory.mktemp("disk")
-    libc = ctypes.CDLL(None, use_errno=True)
-    size = f"size={KILOBYTES}k".encode()
-    if libc.mount(b"tmpfs", os.fsencode(folder), b"tmpfs", 0, size) != 0:
-        pytest.skip("no file system can be mounted here")
-    yield folder
-    libc.umount2(os.fsencode(folder), 2)
+    """Return the folder of a file system of 64 kB."""
+    with mounted(tmp_path_factory.mktemp("disk")) as folder:
+        yield folder
 
 
 def belief(path: Path) -> None:
@@ -116,3 +128,17 @@ def test_a_full_disk_ends_a_file_that_grows_at_a_whole_piece(full_disk: Path) ->
     with pytest.raises(UserError, match="cannot be written"):
         GrowingFile(full_disk / "none").add("0" * 1024 * KILOBYTES * 2)
     assert not (full_disk / "none").exists()
+
+
+@pytest.mark.parametrize("command", ["predict", "track", "check_data", "evaluate"])
+def test_a_folder_on_a_disk_that_may_only_be_read_is_one_line(
+    command: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scene = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed"
+    settings = {"check_data": ["data=fat", "data.object=003_cracker_box", f"data.root={scene}"]}
+    typed = settings.get(command, ["checkpoint=003_cracker_box"])
+    with mounted(tmp_path, _READ_ONLY) as folder:
+        assert run_command(command, HOME, [*typed, f"out={folder}"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith(f"{command}: {tmp_path}")
+    assert line.endswith("(Read-only file system)")

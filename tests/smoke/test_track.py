@@ -195,7 +195,7 @@ def test_what_was_tracked_before_a_kill_is_kept(
     assert {file.name for file in out.iterdir()} == {LOCK, lines.name, poses.name}
     assert run_command("track", HOME, typed) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"out={out}: holds {len(frames)} frames of a track.py that was killed" in told
+    assert f"out={out}: holds {len(frames)} frames of a track.py that was cut off" in told
     assert left == {file: file.read_bytes() for file in (lines, poses)}
     rows = [json.loads(line) for line in left[lines].splitlines()]
     kept = read_poses_csv(poses)
@@ -212,7 +212,7 @@ def test_what_a_killed_one_has_left_is_not_touched_whatever_it_is(
     out.mkdir()
     (out / name).write_bytes(b"\xff\n" * 3)
     assert run_command("track", HOME, [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]) == 2
-    assert "of a track.py that was killed" in capsys.readouterr().err
+    assert "of a track.py that was cut off" in capsys.readouterr().err
     assert [file.name for file in out.iterdir()] == [name]
 
 

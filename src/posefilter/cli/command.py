@@ -7,7 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +167,8 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
             if not isinstance(error, EXPECTED):
                 raise
             release(job.folder)
-            remove_if_empty(job.folder, job.name)
+            with suppress(OSError):  # nothing of ours is in a folder that may not be written
+                remove_if_empty(job.folder, job.name)
             raise Carrier(error) from error
         finally:
             if job.swept:

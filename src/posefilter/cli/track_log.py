@@ -78,7 +78,7 @@ def check_unused(folder: Path) -> None:
     lines, poses = folder / _LINES, folder / _CSV
     if os.path.lexists(lines) or os.path.lexists(poses):
         raise UserError(
-            f"out={folder}: holds {_count_frames(lines)} frames of a track.py that was killed, in "
+            f"out={folder}: holds {_count_frames(lines)} frames of a track.py that was cut off, in "
             f"{lines.name} and {poses.name}; choose another folder, or move these files away"
         )
 
