@@ -13,7 +13,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import NoResampling, Soft, Systematic
-from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, Sequential
+from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.filters.schedule import Constant
 from posefilter.filters.transport import EnsembleTransform
 from posefilter.geometry.pose import make_pose
@@ -170,7 +170,7 @@ def roll_out(resample: Any, reweight: Any = None, steps: str = "last") -> Any:
         return torch.rand(1, 16, 2, generator=g).double() * torch.tensor([20.0, 10.0])
 
     filter = ParticleFilter(
-        16, 3, start, Constant(1.0), reweight or Sequential(), resample, LearnedDisplacement(),
+        16, 3, start, Constant(1.0), reweight or SequentialBayes(), resample, LearnedDisplacement(),
         Argmax(), NoRefine(),
     )  # fmt: skip
 
@@ -207,7 +207,7 @@ def test_the_last_belief_teaches_the_first_likelihood(resample, batch, model) ->
 @pytest.mark.parametrize("resample", [Soft(0.5), Systematic()], ids=["soft", "systematic"])
 @pytest.mark.parametrize(
     "reweight",
-    [Sequential(), CurrentLikelihood(), LikelihoodRatio()],
+    [SequentialBayes(), CurrentLikelihood(), LikelihoodRatio()],
     ids=lambda r: type(r).__name__,
 )
 def test_what_stops_the_gradient_to_the_first_likelihood(resample, reweight, batch, model) -> None:
@@ -218,7 +218,7 @@ def test_what_stops_the_gradient_to_the_first_likelihood(resample, reweight, bat
     loss = roll_out(resample, reweight)(taste, pull, batch, model).sum()
     slopes = torch.autograd.grad(loss, (taste, pull), allow_unused=True)
     reached = 0.0 if slopes[0] is None else float(slopes[0].norm())
-    if isinstance(resample, Soft) and isinstance(reweight, Sequential):
+    if isinstance(resample, Soft) and isinstance(reweight, SequentialBayes):
         assert reached > 0.01
     elif not isinstance(reweight, LikelihoodRatio) or isinstance(resample, Soft):
         assert reached == pytest.approx(0, abs=1e-12)
