@@ -34,6 +34,16 @@ LINES = {
         ["checkpoint=003_cracker_box", "out=0.5"],
         "out=0.5: must end in .ckpt",
     ),
+    "a text that is made of a number": (
+        "export",
+        ["checkpoint=003_cracker_box", "out=a.ckpt", "points=${seed}.5"],
+        "points=0.5: must be a whole number",
+    ),
+    "a part that is made of a number": (
+        "track",
+        ["checkpoint=003_cracker_box", "frames=.", "tracker.follow.points=${seed}"],
+        "tracker.follow.points=0: must be a whole number",
+    ),
     "a number as a copy": (
         "calibrate",
         ["checkpoint=003_cracker_box", "out=0.5"],

@@ -1,12 +1,14 @@
 """What a command is asked to do."""
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.errors import UserError
 from posefilter.ranges import check_ranges
@@ -93,6 +95,19 @@ def check_out(cfg: DictConfig) -> None:
         raise UserError(f"out={out}: names no folder; give one, or leave it out")
 
 
+def _resolve(cfg: DictConfig) -> dict[str, Any]:
+    """Return settings with what they refer to; without those that refer to nothing, which is told
+    where they are read.
+    """
+    out: dict[str, Any] = {}
+    for key in cfg:
+        with suppress(OmegaConfBaseException):
+            value = cfg[key]
+            node = OmegaConf.is_config(value)
+            out[str(key)] = OmegaConf.to_container(value, resolve=True) if node else value
+    return out
+
+
 def check_settings(cfg: DictConfig, command: str) -> None:
     """Check what needs nothing but the settings, before torch is imported.
 
@@ -110,8 +125,7 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
             raise UserError(f"{key}=null: {command} cannot do without; leave it out")
-    for key in ("seed", "threads", "depth_scale"):
-        check_ranges({key: cfg.get(key)}, command)  # where it is made of other settings
+    check_ranges(_resolve(cfg), command)  # what is made of other settings, too
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:
         raise UserError(
