@@ -41,8 +41,8 @@ LINES = {
     ),
     "a part that is made of a number": (
         "track",
-        ["checkpoint=003_cracker_box", "frames=.", "tracker.follow.points=${seed}"],
-        "tracker.follow.points=0: must be a whole number",
+        ["checkpoint=003_cracker_box", "frames=.", "tracker.follow.pixels=${seed}"],
+        "tracker.follow.pixels=0: must be a whole number",
     ),
     "a number as a copy": (
         "calibrate",
