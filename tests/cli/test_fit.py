@@ -75,11 +75,16 @@ REFUSED = {
     "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrastive"),
     "model=patch_pf loss=contrastive": (
         "candidate poses",
-        "choose loss=add, add_s, balanced_bce, bce, chamfer, chamfer_rgbd, confidence, focal or "
-        "offset",
+        "choose loss=add, add_s, balanced_bce, bce, belief_nll, belief_nll_pose, chamfer, "
+        "chamfer_rgbd, confidence, focal or offset",
     ),
-    "model=cnn_patch loss=add": ("loss=balanced_bce, bce, chamfer, chamfer_rgbd, focal or offset",),
-    "model=patch_pf filter/refine=rescore": ("filter/refine=rescore", "choose filter/refine=none"),
+    "model=cnn_patch loss=add": (
+        "loss=balanced_bce, bce, belief_nll, chamfer, chamfer_rgbd, focal or offset",
+    ),
+    "model=patch_pf filter/refine=rescore": (
+        "filter/refine=rescore",
+        "choose filter/refine=icp or none",
+    ),
     "model=pose_pf model/proposals=none": (
         "filter/initialize=from_depth",
         "or model/proposals=dense",

@@ -202,7 +202,7 @@ def test_the_scale_of_the_refit_falls_from_four_to_one(iterations: int, scales: 
 
 
 def test_a_vote_counts_by_its_inliers_to_the_power_of_the_counts() -> None:
-    belief = agree(scale_m=0.01, counts=3.0)
+    belief = agree(scale_m=0.01, effective_particles=3.0)
     inliers = torch.stack([weigh(pose[None], 0.02)[2].sum() for pose in belief.poses[0]])
     torch.testing.assert_close(
         belief.log_weights[0], (3 * inliers.log()).log_softmax(0), atol=1e-3, rtol=0

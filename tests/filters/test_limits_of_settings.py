@@ -35,7 +35,7 @@ def make_islands(size: int) -> Islands:
         (make_filter, {"first_particles": 1}, {"first_particles": 0}),
         (make_filter, {"steps": 1}, {"steps": 0}),
         (Agreement, {"hypotheses": 1}, {"hypotheses": 0}),
-        (Agreement, {"options": 1}, {"options": 0}),
+        (Agreement, {"top_fragments": 1}, {"top_fragments": 0}),
         (Agreement, {"scale_m": 1e-6}, {"scale_m": 0.0}),
         (PersistentParticles, {"particles": 1}, {"particles": 0}),
         (PersistentParticles, {"levels": 2}, {"levels": 1}),
@@ -45,8 +45,12 @@ def make_islands(size: int) -> Islands:
         (ImportanceSampling, {"temperature": 1e-6}, {"temperature": 0.0}),
         (MeanShift, {"iterations": 1}, {"iterations": 0}),
         (MeanShift, {"antithetic_pairs": 1}, {"antithetic_pairs": 0}),
-        (MeanShift, {"start": 0.01, "end": 0.01}, {"start": 0.01, "end": 0.011}),
-        (MeanShift, {"end": 1e-6}, {"end": 0.0}),
+        (
+            MeanShift,
+            {"initial_scale": 0.01, "final_scale": 0.01},
+            {"initial_scale": 0.01, "final_scale": 0.011},
+        ),
+        (MeanShift, {"final_scale": 1e-6}, {"final_scale": 0.0}),
         (make_islands, {"size": 1}, {"size": 0}),
         (Soft, {"alpha": 0.0}, {"alpha": -0.01}),
         (Soft, {"alpha": 1.0}, {"alpha": 1.01}),
@@ -56,8 +60,16 @@ def make_islands(size: int) -> Islands:
         (ResampleMove, {"uniform_angle_probability": 0.0}, {"uniform_angle_probability": -0.01}),
         (ResampleMove, {"uniform_angle_probability": 1.0}, {"uniform_angle_probability": 1.01}),
         (ResampleMove, {"temperature": 1e-6}, {"temperature": 0.0}),
-        (Geometric, {"start": 1e-6, "stop": 0.1}, {"start": 0.0, "stop": 0.1}),
-        (Geometric, {"start": 0.1, "stop": 1e-6}, {"start": 0.1, "stop": 0.0}),
+        (
+            Geometric,
+            {"initial_sigma": 1e-6, "final_sigma": 0.1},
+            {"initial_sigma": 0.0, "final_sigma": 0.1},
+        ),
+        (
+            Geometric,
+            {"initial_sigma": 0.1, "final_sigma": 1e-6},
+            {"initial_sigma": 0.1, "final_sigma": 0.0},
+        ),
     ],
 )
 def test_the_end_of_a_range_is_legal_and_what_lies_beyond_is_not(
