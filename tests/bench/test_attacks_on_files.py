@@ -52,13 +52,21 @@ def test_what_nobody_notices_is_told(
 
 
 @pytest.mark.slow
-def test_killed_trainings_end_with_the_same_bits(load: Load, tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", ["0", "2"])
+@pytest.mark.parametrize("model", ["pose_pf", "patch_pf", "pixel_pf", "cnn_patch", "downsized"])
+def test_killed_trainings_end_with_the_same_bits(
+    load: Load, tmp_path: Path, model: str, workers: str
+) -> None:
+    """Twenty kills in all."""
     kills = load("kills")
     kills.prepare()
-    counts = kills.kill_many(tmp_path, [("cnn_patch", "0")], 2, seed=3)
+    counts = kills.kill_many(tmp_path, [(model, workers)], 2, seed=3)
     assert sum(counts.values()) == 2
     assert all(what.startswith("the same bits, killed") for what in counts), counts
-    assert kills.list_differing({"a": [1, 2]}, {"a": [1, 3]}) == [".a[1]"]
+
+
+def test_bits_that_differ_are_told(load: Load) -> None:
+    assert load("kills").list_differing({"a": [1, 2]}, {"a": [1, 3]}) == [".a[1]"]
 
 
 @pytest.mark.slow
