@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+from posefilter.data.readers.naming import choose_objects
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
 
@@ -49,3 +50,9 @@ def test_an_option_of_another_kind_is_named(
 def test_one_camera_or_several_are_chosen(typed: Any, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no FAT scenes here"):  # the options are right
         open_reader("fat", tmp_path, cameras=typed)
+
+
+def test_a_name_that_reads_as_a_number_is_a_name() -> None:
+    assert choose_objects(7, ["7", "8"], Path("bin")) == ("7",)  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="unknown class '0'"):
+        choose_objects(0, ["7", "8"], Path("bin"))  # type: ignore[arg-type]

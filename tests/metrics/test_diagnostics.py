@@ -139,3 +139,8 @@ def make_trace(state: torch.Tensor, log_likelihood: torch.Tensor) -> Trace:
         (Step(0, 1, torch.tensor(0.0)),),
         Belief(pose, log_likelihood, pose[:, 0], pose[:, 0, 0]),
     )
+
+
+def test_no_image_has_no_diagnostics() -> None:
+    """As after a test on no frames (`data.split={train: 0.8, val: 0.2, test: 0}`)."""
+    assert FilterDiagnostics().compute() == {}

@@ -165,7 +165,9 @@ class FilterDiagnostics(Metric):
         self.lines.append(torch.stack(lines).T)  # (B, T)
 
     def compute(self) -> dict[str, Any]:
-        """Return the diagnostics by name."""
+        """Return the diagnostics by name; none where no image was seen."""
+        if not len(self.shares):
+            return {}
         shares = concat_state(self.shares).mean(0)
         offsets, scored = concat_state(self.offsets), concat_state(self.scored)
         names = ("on_object", "off_frame", "near_edge", "near_corner", "distinct")

@@ -19,7 +19,9 @@ def choose_objects(
     """
     if wanted is None:
         return tuple(known)
-    names = tuple(strip(str(name)) for name in ([wanted] if isinstance(wanted, str) else wanted))
+    several = isinstance(wanted, Sequence) and not isinstance(wanted, str)
+    listed = wanted if several else [wanted]  # a single name may read as a number
+    names = tuple(strip(str(name)) for name in listed)
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
