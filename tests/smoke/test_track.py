@@ -5,8 +5,9 @@ import importlib.util
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -140,48 +141,44 @@ def test_what_was_tracked_before_an_interruption_is_kept(
         assert [row["im_id"] for row in csv.DictReader(file)] == ["8", "9"]
 
 
-def run_forked(arguments: list[str], patched: str, work: Callable[..., Any]) -> int:
-    """Run the command in a process of its own with one of its functions replaced; its status."""
-    number = os.fork()
-    if number == 0:
-        status = 70
-        try:
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(f"posefilter.cli.track.{patched}", work)
-                status = run_command("track", HOME, arguments)
-        finally:
-            os._exit(status)
-    return os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+PATCHED = """
+import os, sys
+from pathlib import Path
+from posefilter.cli import track
+from posefilter.cli.command import run_command
+
+calls = []
+def send(*arguments):
+    calls.append(arguments)
+    if len(calls) == {call}:
+        os.kill(os.getpid(), {number})
+    return arguments[0].rgb
+
+track.{patched} = send
+os._exit(run_command("track", Path({home!r}), sys.argv[1:]))
+"""
 
 
-def signal_in_third_frame(number: int) -> Callable[..., np.ndarray]:
-    """Return what draws frames, and sends this process a signal in the third one."""
-    seen: list[str] = []
+def run_interrupted(arguments: list[str], patched: str, call: int, number: int) -> int:
+    """Run the command in a process of its own, which gets a signal in a call of one of its
+    functions, the first, third and so on; return its status.
 
-    def draw(frame: VideoFrame, *_: object) -> np.ndarray:
-        seen.append(frame.name)
-        if len(seen) == 3:
-            os.kill(os.getpid(), number)
-        return frame.rgb
-
-    return draw
-
-
-def kill(*_: object) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
+    It is no fork of this one: a fork has none of the threads that earlier tests have started, and
+    may wait for one of them forever.
+    """
+    code = PATCHED.format(patched=patched, call=call, number=number, home=str(HOME))
+    done = subprocess.run([sys.executable, "-c", code, *arguments], check=False, timeout=120)
+    return done.returncode
 
 
 @pytest.mark.parametrize(
-    ("patched", "work", "frames"),
-    [
-        ("draw_frame", signal_in_third_frame(signal.SIGKILL), ["8", "9"]),
-        ("write_rows", kill, ["8", "9", "10", "11"]),
-    ],
+    ("patched", "call", "frames"),
+    [("draw_frame", 3, ["8", "9"]), ("write_rows", 1, ["8", "9", "10", "11"])],
     ids=["in a frame", "while it writes the results"],
 )
 def test_what_was_tracked_before_a_kill_is_kept(
     patched: str,
-    work: Callable[..., Any],
+    call: int,
     frames: list[str],
     folder: Path,
     tmp_path: Path,
@@ -189,7 +186,7 @@ def test_what_was_tracked_before_a_kill_is_kept(
 ) -> None:
     out = tmp_path / "out"
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "video=none"]
-    assert run_forked(typed, patched, work) == -signal.SIGKILL
+    assert run_interrupted(typed, patched, call, signal.SIGKILL) == -signal.SIGKILL
     lines, poses = out / "poses.partial.jsonl", out / "poses.partial.csv"
     left = {file: file.read_bytes() for file in (lines, poses)}
     assert {file.name for file in out.iterdir()} == {LOCK, lines.name, poses.name}
@@ -219,8 +216,8 @@ def test_what_a_killed_one_has_left_is_not_touched_whatever_it_is(
 def test_what_was_tracked_before_a_sigterm_is_kept(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}"]
-    work = signal_in_third_frame(signal.SIGTERM)
-    assert run_forked(typed, "draw_frame", work) == 128 + signal.SIGTERM
+    status = run_interrupted(typed, "draw_frame", 3, signal.SIGTERM)
+    assert status == 128 + signal.SIGTERM
     assert [row.im_id for row in read_poses_csv(out / "poses.csv")] == [8, 9]
     assert cv2.VideoCapture(str(out / "video.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
     assert {file.name for file in out.iterdir()} == {
