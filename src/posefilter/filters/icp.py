@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project, project
-from posefilter.geometry.lookup import nearest_pixel
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
@@ -165,14 +165,10 @@ def look_up(depth: Tensor, K: Tensor, pixels: Tensor) -> Surface:
     Returns:
         The surface (B, P).
     """
-    H, W = depth.shape[-2:]
     step = max(1, round(_STEP * float(K[:, 0, 0].mean())))
     sides = pixels.new_tensor([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]]) * step
     around = pixels[:, :, None] + sides
-    u, v = around.unbind(-1)
-    inside = (u >= 0) & (u < W) & (v >= 0) & (v < H)
-    index = v.clamp(0, H - 1) * W + u.clamp(0, W - 1)
-    z = depth.flatten(1).gather(1, index.flatten(1)).view(index.shape) * inside
+    z = gather_pixels(depth[:, None], around.flatten(1, 2)).view(around.shape[:-1])
     at = back_project(around.flatten(1, 2).to(z), z.flatten(1), K).view(*z.shape, 3)
     middle, right, left, below, above = at.unbind(2)
     normal = torch.linalg.cross(below - above, right - left)
