@@ -2,14 +2,16 @@
 
     python bench/fuzz.py [COUNT] [--seed SEED] [--command NAME] [--list]
         [--first NUMBER] [--minutes MINUTES]
+    python bench/fuzz.py --each VALUE [--each VALUE ...]      # every setting of every command
 
 Each line is one that works, with one or two settings changed: to values that are no numbers, out
 of range, of another kind, or not in Hydra's grammar; to keys, choices, files and folders that there
 are not. It runs in a process of its own, forked from this one; trainings are cut to four steps. A
 line may be accepted, or be refused in one line with a status that is not 0. Prints the counts; the
 exit status is 1 where a line ended otherwise. Line n of a seed is always the same: a run that was
-stopped, by --minutes say, goes on with `--first` the number that it tells. Lines of `convert_bag`
-need the package rosbags.
+stopped, by --minutes say, goes on with `--first` the number that it tells. With --each, nothing is
+drawn: each setting of each command is set to each of the values. Lines of `convert_bag` need the
+package rosbags.
 """
 
 import argparse
@@ -62,6 +64,8 @@ GARBAGE = (
     "plugins=[1]", "tags=5", "tags={a:1}", "console=", "console=loud", "debug=nope", "debug=[1]",
     "~filter.particles", "filter=null", "filter={}", "data={}", "loss={}", "model={}", "trainer={}",
 )  # fmt: skip
+# Lightning types a process' command line for each of the others, which is this bench's here
+SPAWNING = ("trainer.devices", "5")
 PLACES = (
     "/proc/x", "/dev/null", "/dev/null/x", "", ".", "/nonexistent/\u00fc", "n" * 300, "5",
     "null", "[a]", "{}", "/sys/x", "/etc/hostname", "//", "~", "${nope}", "a/../b", "tar",
@@ -76,9 +80,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--command", help="one, or several: a,b")
     parser.add_argument("--list", action="store_true", help="print each line")
     parser.add_argument("--first", type=int, default=0, help="line to begin with")
+    parser.add_argument("--each", action="append", help="a value; can be repeated")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which it stops")
     given = parser.parse_args(arguments)
-    print(f"{given.count} command lines, seed {given.seed}")
     began = time.monotonic()
     prepare()
     counts: Counter[str] = Counter()
@@ -96,14 +100,26 @@ def main(arguments: list[str] | None = None) -> int:
                 if name in commands and name != "onboard"  # which would take minutes
             }
         )
-        for number in range(given.first, given.first + given.count):
+        every = [
+            (name, f"{key}={value}")
+            for name in dict.fromkeys(commands)
+            for key in keys[name]
+            for value in given.each or ()
+            if (key, value) != SPAWNING
+        ]
+        stop = len(every) if given.each else given.first + given.count
+        print(f"{stop - given.first} command lines, seed {given.seed}", flush=True)
+        for number in range(given.first, stop):
             if time.monotonic() - began > 60 * given.minutes:
                 print(f"stopped before line {number}")
                 break
             rng = random.Random(f"{given.seed} {number}")
-            command = commands[number % len(commands)]
+            command = every[number][0] if every else commands[number % len(commands)]
             own = [word.replace("NEW", f"new{number}") for word in lines[command]]
-            typed = change(own, keys[command], place, rng)
+            if every:
+                typed = [*own, every[number][1]]
+            else:
+                typed = change(own, keys[command], place, rng)
             with chdir(scratch):  # what is typed may name files of the working folder
                 ended = run(command, typed, place / "log", PATIENCE, limit)
             outcome = judge(ended)
@@ -294,8 +310,8 @@ def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -
                 "bag",
             )
             typed.append(f"{rng.choice([key for key in names if key in keys] or ['out'])}={place}")
-        else:
-            typed.append(f"{rng.choice(keys)}={rng.choice(ODD)}")
+        elif (pair := (rng.choice(keys), rng.choice(ODD))) != SPAWNING:
+            typed.append("=".join(pair))
     return typed
 
 

@@ -54,6 +54,25 @@ LINES = {
         ["checkpoint=003_cracker_box", "replace=no"],
         "replace=no: choose true or false",
     ),
+    "a list as an optimizer": (
+        "train",
+        ["debug=smoke", "model.optimizer=[1,2]"],
+        "model.optimizer=[1, 2]: must be what a _target_ builds",
+    ),
+    "a mapping as a loss": ("train", ["debug=smoke", "model.loss={a: 1}"], "must be a Loss"),
+    "no number of steps": (
+        "train",
+        ["debug=smoke", "trainer.max_steps=null"],
+        "trainer.max_steps: is",
+    ),
+    "no meshes": ("check_data", ["meshes=null", "data.root=."], "meshes: is missing"),
+    "a number as a dataset": ("check_data", ["data.root=5"], "data.root=5: no such folder"),
+    "true as a dataset": ("check_data", ["data.root=true"], "must be the name of a file or folder"),
+    "meshes by their other name": (
+        "check_data",
+        ["data.meshes=nowhere", "data.root=."],
+        "data.meshes=nowhere: no such folder",
+    ),
     "no model": ("train", ["model=null"], "model=null: cannot be read"),
     "no picture": ("predict", ["rgb=5", "depth=5", "intrinsics=1,1,1,1"], "rgb=5: no such file"),
     "an umlaut": (

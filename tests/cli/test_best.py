@@ -4,6 +4,7 @@ import logging
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader
 
 from posefilter.cli.best import Best, Last, check_kept
 from posefilter.cli.stopping import Stop
+from posefilter.cli.train import check_validated
 from posefilter.errors import Stopped, UserError
 
 
@@ -151,3 +153,34 @@ def test_a_signal_between_two_batches_waits_for_the_checkpoint() -> None:
     stop.on_train_batch_end(alone, None)  # type: ignore[arg-type]
     with pytest.raises(Stopped):
         stop.on_train_batch_start()
+
+
+@pytest.mark.parametrize(
+    ("every", "interval", "steps", "accumulated", "first"),
+    [
+        (2, 1.0, 8, 1, None),
+        (2, 1.0, 7, 1, 8),
+        (3, 0.5, 9, 1, 10),
+        (1, 4, 3, 1, 4),
+        (2, 1.0, 4, 2, None),
+        (9, 1.0, -1, 1, None),
+        (None, 50, 3, 1, None),  # in steps; build_trainer validates at the end
+    ],
+)
+def test_a_training_that_ends_before_its_first_validation_is_refused(
+    every: int | None, interval: float, steps: int, accumulated: int, first: int | None
+) -> None:
+    trainer = SimpleNamespace(
+        check_val_every_n_epoch=every,
+        val_check_interval=interval,
+        max_steps=steps,
+        accumulate_grad_batches=accumulated,
+    )
+    run: Any = SimpleNamespace(
+        trainer=trainer, data=SimpleNamespace(train_dataloader=lambda: range(4))
+    )
+    if first is None:
+        check_validated(run)
+    else:
+        with pytest.raises(UserError, match=f"first validation is after step {first},"):
+            check_validated(run)

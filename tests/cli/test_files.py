@@ -72,13 +72,14 @@ def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path) -> N
     """A process that may write no more than some bytes, as on a full disk."""
     file = tmp_path / "last.ckpt"
     save_whole({"weight": torch.ones(3)}, file)
+    many = torch.ones(100_000)  # made here: a fork lacks the threads that torch would wait for
     reader, writer = os.pipe()
     number = os.fork()
     if not number:
         try:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-            save_whole({"weight": torch.ones(100_000)}, file)
+            save_whole({"weight": many}, file)
         except UserError as error:
             os.write(writer, str(error).encode())
         finally:

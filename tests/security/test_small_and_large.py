@@ -54,6 +54,7 @@ def refuse(read: Callable[[], Any]) -> str:
 
 def _read_bounded(read: Callable[[], Any], tell: int) -> int:
     """Read under bounds; return an exit status, 0 for one line in time."""
+    torch.set_num_threads(1)  # a fork lacks the threads that torch would wait for
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         most = pages * resource.getpagesize() + 4 * BYTES  # that the machine is left alone

@@ -49,6 +49,8 @@ def build_trainer(job: Job) -> Trainer:
     cfg = job.cfg.copy()
     cfg.folder = str(job.folder)
     steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
+    if steps is None:
+        raise UserError("trainer.max_steps: is missing; a whole number is due, or -1 for no limit")
     # else it would never be validated, and have no best checkpoint
     if isinstance(interval, int) and 0 < steps < interval:
         log.info(

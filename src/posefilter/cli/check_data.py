@@ -25,7 +25,7 @@ def check_data(job: Job) -> None:
     cfg = job.cfg
     if cfg.data.root is None:
         raise UserError("data.root: is missing; name the dataset's folder")
-    store = open_meshes(cfg.meshes, cfg.mesh_scale, cfg.data.source, cfg.data.object)
+    store = open_meshes(cfg.data.meshes, cfg.data.mesh_scale, cfg.data.source, cfg.data.object)
     options = instantiate(cfg.data.options, "data.options") or {}
     reader = open_reader(cfg.data.source, cfg.data.root, cfg.data.object, store, "skip", **options)
     report = check_dataset(
@@ -70,9 +70,9 @@ def train_on(cfg: DictConfig, name: str, images: int) -> str:
     # what train.py takes by default
     rendered = cfg.data.source == "fat" and (Path(cfg.data.root) / GENERATOR).is_file()
     more: dict[str, Any] = {} if rendered else {"data": cfg.data.source}
-    more |= {"data__root": cfg.data.root, "data__object": name, "data__meshes": cfg.meshes}
-    if cfg.mesh_scale is not None:
-        more["data__mesh_scale"] = cfg.mesh_scale
+    more |= {"data__root": cfg.data.root, "data__object": name, "data__meshes": cfg.data.meshes}
+    if cfg.data.mesh_scale is not None:
+        more["data__mesh_scale"] = cfg.data.mesh_scale
     if images < _FEW_IMAGES:  # the one image of a part may show little of the object
         more |= {"data__min_visibility": 0.0, "data__min_visibility_test": 0.0}
     return typed("train", **more)

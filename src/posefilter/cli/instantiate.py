@@ -89,9 +89,9 @@ def _build(
     if target is None:
         return arguments
     partial = bool(node.get("_partial_", False))
-    check_arguments(target, arguments, given, where, partial)
     if twice := sorted(arguments.keys() & given.keys()):
         raise UserError(f"{where}.{twice[0]}: is not a setting; the program gives it itself")
+    check_arguments(target, arguments, given, where, partial)
     target = variant(target) if variant is not None else target
     made = functools.partial(target, **arguments, **given)
     if partial:
@@ -241,7 +241,15 @@ def fits(value: Any, wanted: Any) -> bool:
         return isinstance(value, list | tuple) and all(fits(item, inner[0]) for item in value)
     if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
         return isinstance(value, Mapping)
+    if isinstance(value, list | tuple | Mapping):  # no component: that is built from a _target_
+        kind = origin or wanted
+        return inspect.isclass(kind) and not is_protocol(kind) and isinstance(value, kind)
     return not isinstance(value, _PLAIN) and (value is not None or wanted is object)
+
+
+def is_protocol(kind: type) -> bool:
+    """Tell whether a class is a protocol of ours, rather than one of the abstract containers."""
+    return bool(getattr(kind, "_is_protocol", False)) and kind.__module__ != "collections.abc"
 
 
 def describe(wanted: Any) -> str:
@@ -261,6 +269,8 @@ def describe(wanted: Any) -> str:
         return "null"
     if wanted in words:
         return words[wanted]
+    if get_origin(wanted) is Callable:
+        return "what a _target_ builds, to be called"
     return (
         str(wanted).replace("typing.", "")
         if get_origin(wanted)

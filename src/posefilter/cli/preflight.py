@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from posefilter.errors import UserError
 from posefilter.weights import expand_weights, find_weights, is_several
@@ -14,7 +14,7 @@ _FILES = {"predict": ("rgb", "depth"), "evaluate": ("estimates",)}
 # by command: settings that name a folder to be read
 _FOLDERS = {
     "calibrate": ("data.root", "data.meshes", "absent"),
-    "check_data": ("data.root", "meshes"),
+    "check_data": ("data.root", "meshes", "data.meshes"),
     "evaluate": ("data.root", "data.meshes"),
     "generate": ("meshes",),
     "predict": ("meshes",),
@@ -74,6 +74,10 @@ def check_files(command: str, cfg: DictConfig) -> None:
             raise UserError(
                 f"{key}: is missing; predict needs rgb=, depth= and intrinsics=fx,fy,cx,cy"
             )
+    if command == "check_data" and cfg.data.meshes is None:
+        raise UserError("meshes: is missing; choose builtin, or name a folder of meshes")
+    for key in (*_FILES.get(command, ()), *_FOLDERS.get(command, ())):
+        _take_as_text(cfg, key)
     for key in _FILES.get(command, ()):
         if cfg[key] is not None and not Path(str(cfg[key])).is_file():
             raise UserError(f"{key}={cfg[key]}: no such file")
@@ -150,6 +154,18 @@ def _check_view(view: Any, several: bool) -> None:
         from posefilter.figures.recording import check_viewer  # slow to import, rarely asked for
 
         check_viewer()
+
+
+def _take_as_text(cfg: DictConfig, key: str) -> None:
+    """Make a text of a path that YAML reads as a number, such as 2024.
+
+    Raises UserError for what is neither.
+    """
+    value = _select(cfg, key)
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        OmegaConf.update(cfg, key, str(value))
+    elif not isinstance(value, str | None):
+        raise UserError(f"{_SHOWN.get(key, key)}={value}: must be the name of a file or folder")
 
 
 def _select(cfg: Any, key: str) -> Any:

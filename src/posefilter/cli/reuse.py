@@ -143,7 +143,7 @@ def start_from(job: Job) -> tuple[Path | None, int]:
     source = job.cfg.resume or (job.folder if begun else None)
     if source is None:
         return None, 0
-    last, *before = last_checkpoints(source)
+    last, *before = last_checkpoints(str(source))  # a folder's name may read as a number
     try:
         return last, step_of(last)
     except UserError as error:

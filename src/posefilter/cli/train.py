@@ -1,14 +1,17 @@
 """Train a method, test its best checkpoint, and write down what came of it."""
 
 import logging
+import math
 import shlex
 import time
+import traceback
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from lightning import Trainer
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch import loops
 from torch.utils.data import default_collate
 
 from posefilter.cli.best import check_kept
@@ -107,6 +110,7 @@ def fit(run: Run) -> dict[str, Any]:
         UserError: Lightning refuses a setting of the trainer or of a callback.
     """
     check_kept(run.trainer.callbacks, run.job.folder)  # type: ignore[attr-defined]
+    check_validated(run)
     start, before = start_from(run.job)
     began = time.perf_counter(), time.process_time()
     try:
@@ -114,10 +118,40 @@ def fit(run: Run) -> dict[str, Any]:
     except Stopped:
         say_stopped(run)
         raise
-    except MisconfigurationException as error:
+    except (MisconfigurationException, ValueError) as error:
+        if isinstance(error, ValueError) and not _is_lightnings(error):
+            raise
         raise UserError(f"trainer or callbacks: {' '.join(str(error).split())}") from error
     taken = cost(run.trainer.global_step, before, *began)
     return {**taken, "learned_from": learned_from(run.job)}
+
+
+def check_validated(run: Run) -> None:
+    """Refuse a training that would end before its first validation: it would have no best
+    checkpoint.
+
+    Raises:
+        UserError: The settings, and the step of the first validation.
+    """
+    trainer = run.trainer
+    every, interval = trainer.check_val_every_n_epoch, trainer.val_check_interval
+    if every is None or trainer.max_steps < 0:
+        return
+    batches = len(run.data.train_dataloader())
+    last = interval if isinstance(interval, int) else math.ceil(interval * batches)
+    step = ((every - 1) * batches + last) // trainer.accumulate_grad_batches
+    if step > trainer.max_steps:
+        raise UserError(
+            f"trainer.check_val_every_n_epoch={every}: an epoch has {batches} batches, so that the "
+            f"first validation is after step {step}, and trainer.max_steps={trainer.max_steps}; "
+            "null counts trainer.val_check_interval in steps"
+        )
+
+
+def _is_lightnings(error: Exception) -> bool:
+    """Tell whether Lightning's trainer has raised an error itself, rather than passed it on."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and Path(frames[-1].filename).is_relative_to(Path(loops.__file__).parent)
 
 
 def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
