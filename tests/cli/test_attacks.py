@@ -60,6 +60,11 @@ LINES = {
         "model.optimizer=[1, 2]: must be what a _target_ builds",
     ),
     "a mapping as a loss": ("train", ["debug=smoke", "model.loss={a: 1}"], "must be a Loss"),
+    "no interval, by a reference": (
+        "train",
+        ["debug=smoke", "trainer.val_check_interval=${seed}"],
+        "trainer.val_check_interval=0: must be",
+    ),
     "no number of steps": (
         "train",
         ["debug=smoke", "trainer.max_steps=null"],
