@@ -289,7 +289,9 @@ def change(line: list[str], keys: list[str], folder: Path, rng: random.Random) -
         elif way == "group":
             groups = sorted(p for p in (HOME / "conf").rglob("*") if p.is_dir())
             group = rng.choice(groups)
-            names = [file.stem for file in group.glob("*.yaml")] + ["nope", "null", "", "[a]", "5"]
+            names = [file.stem for file in group.glob("*.yaml")]
+            names = [name for name in names if name != "traceback"]  # which asks for one
+            names += ["nope", "null", "", "[a]", "5"]
             typed.append(f"{group.relative_to(HOME / 'conf')}={rng.choice(names)}")
         elif way == "place":
             place = rng.choice(PLACES)

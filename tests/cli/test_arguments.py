@@ -6,7 +6,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli import run_command
-from posefilter.cli.arguments import defer_settings, quoted
+from posefilter.cli.arguments import bracketed, defer_settings, quoted
 from posefilter.cli.job import Job
 
 HOME = Path(__file__).parents[2]
@@ -58,3 +58,32 @@ def test_a_folder_named_after_settings_can_be_typed(typed: str, value: str | Non
         assert [str(part) for part in parsed.sweep_string_iterator()] == ["'a/b'", "'c=1'"]
     else:
         assert parsed.value() == value
+
+
+@pytest.mark.parametrize(
+    ("typed", "passed"),
+    [
+        ("intrinsics=1,2,3,4", "intrinsics=[1,2,3,4]"),
+        ("size=320,240", "size=[320,240]"),
+        ("data.generate.size=320,240", "data.generate.size=[320,240]"),
+        ("model.glimpse.size=3,6", "model.glimpse.size=3,6"),  # a sweep over one number
+        ("size=[320,240],[640,480]", "size=[320,240],[640,480]"),
+    ],
+)
+def test_lists_of_numbers_need_no_brackets(typed: str, passed: str) -> None:
+    assert bracketed([typed]) == [passed]
+
+
+@pytest.mark.parametrize("command", ["evaluate", "predict", "report", "export"])
+def test_every_command_shows_where_a_mistake_came_from(
+    command: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    wrong = {"report": "run=nowhere", "predict": "rgb=a"}.get(command, "checkpoint=nowhere.ckpt")
+    assert run_command(command, HOME, [wrong, "debug=traceback"]) == 2
+    said = capfd.readouterr().err
+    assert "Traceback" in said
+    assert said.splitlines()[-1].startswith(f"{command}: ")
+    assert "debug" not in said.splitlines()[-1]
+    assert run_command(command, HOME, [wrong, "debug=smoke"]) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line == f"{command}: debug=smoke: is of train; {command} has debug=traceback alone"

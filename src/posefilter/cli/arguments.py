@@ -20,10 +20,29 @@ def bracketed(arguments: list[str]) -> list[str]:
     """
     return [
         re.sub(
-            r"^((?:\w+\.)*(?:intrinsics|camera|size))=([^\[\],]+(?:,[^\[\],]+)+)$", r"\1=[\2]", a
+            # a glimpse's size is one number
+            r"^((?:\w+\.)*(?:intrinsics|camera)|(?:(?:\w+\.)*generate\.)?size)"
+            r"=([^\[\],]+(?:,[^\[\],]+)+)$",
+            r"\1=[\2]",
+            a,
         )
         for a in arguments
     ]
+
+
+def without_trace(arguments: list[str], name: str) -> list[str]:
+    """Leave out `debug=traceback`, which `run_command` obeys itself: `debug` is a group of choices
+    of `train` alone.
+
+    Raises UserError for a choice of it with another command.
+    """
+    if name == "train":
+        return arguments
+    left = [a for a in arguments if a != "debug=traceback"]
+    for argument in left:
+        if argument.startswith("debug=") and argument != "debug=null":
+            raise UserError(f"{argument}: is of train; {name} has debug=traceback alone")
+    return left
 
 
 def quoted(arguments: Sequence[str]) -> list[str]:

@@ -28,6 +28,7 @@ from posefilter.cli.arguments import (
     name_places,
     quoted,
     spelled,
+    without_trace,
 )
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
@@ -92,6 +93,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
             return 0
+        arguments = without_trace(arguments, name)
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
