@@ -23,7 +23,7 @@ _NEEDED = {
         *("cost_false_alarm", "cost_miss", "cost_unsure"),
     ),
     "calibrate": ("frames", "seed", "replace"),
-    "track": ("depth_scale", "stride", "fps", "seed", "out", "tracker"),
+    "track": ("stride", "fps", "seed", "out", "tracker"),
     "generate": ("seed",),
     "check_data": ("data", "out"),
     "evaluate": ("trainer", "absent_frames"),

@@ -117,8 +117,9 @@ def _check_video(cfg: DictConfig) -> None:
         raise UserError("give either frames=DIR, or data=ycb_video|bop|fat and data.root=DIR")
     if cfg.frames and cfg.scene is not None:
         raise UserError(f"scene={cfg.scene}: is one of a dataset; frames=DIR is one video")
-    if data and cfg.intrinsics is not None:
-        raise UserError("intrinsics: are of frames=DIR; a dataset brings its own, leave them out")
+    for key in ("intrinsics", "depth_scale"):
+        if data and cfg[key] is not None:
+            raise UserError(f"{key}: is of frames=DIR; a dataset brings its own, leave it out")
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
     if data and data.root is None:

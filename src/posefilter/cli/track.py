@@ -43,6 +43,8 @@ from posefilter.tracking.settings import FrameBudget, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
 
+_DEPTH_SCALE = 10000  # units of depth images in a meter, as YCB-Video's
+
 
 def track(job: Job) -> None:
     """Write poses.csv, poses.jsonl, tracks.csv, metrics.json, and a video of each scene.
@@ -267,7 +269,7 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
     """
     data = cfg.get("data")
     if cfg.frames:
-        K, scale = read_intrinsics(cfg.intrinsics), float(cfg.depth_scale)
+        K, scale = read_intrinsics(cfg.intrinsics), float(cfg.depth_scale or _DEPTH_SCALE)
         return [FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride)], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
