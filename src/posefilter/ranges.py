@@ -174,6 +174,7 @@ RANGES: dict[str, Range] = {
     "tracker.found_above": SHARE,
     "tracker.patience": COUNT,
     "tracker.search_above": SHARE,
+    "tracker.look_every": COUNT,
     "tracker.search_every": COUNT_OR_NONE,
     # trainer, callbacks
     "trainer.max_steps": _whole(1, 10**12, words=(-1,)),

@@ -10,7 +10,6 @@ from posefilter.errors import UserError
 from posefilter.geometry.camera import back_project, project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import origin_of, rotation_of, transform
-from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import HasDepth, Method, Scene
 from posefilter.types import Belief, ObjectModel
@@ -99,6 +98,7 @@ class PointToPlaneIcp:
         center, own = model.center.to(first), self.choose_points(model.points).to(first)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
+        moved = first.new_zeros(len(first), 6, 1, dtype=torch.float64)
         for index in range(self.iterations):
             part = index / max(self.iterations - 1, 1)
             width = self.initial_gate * (self.final_gate / self.initial_gate) ** part
@@ -107,10 +107,10 @@ class PointToPlaneIcp:
             known = total > _FEW
             share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
             weighted = rows.mT * (weights * share[:, None])[:, None]
-            moved = twist_between(first, pose, center).double()[..., None]
             slope = weighted @ offsets[..., None] - precision @ moved
-            step = torch.linalg.solve(weighted @ rows + precision, slope)[..., 0].to(pose)
-            pose = torch.where(known[:, None, None], space.move(pose, step), pose)
+            step = torch.linalg.solve(weighted @ rows + precision, slope) * known[:, None, None]
+            # for turns as small as these, twists add up
+            pose, moved = space.move(pose, step[..., 0].to(pose)), moved + step
         # without enough points in the last step what was paired before was something else
         return belief._replace(best=torch.where(known[:, None, None], pose, first))
 

@@ -86,7 +86,9 @@ class TrackerSettings:
             not, the network sees the whole image in the next frame.
         patience: Frames in a row that count against an object that is lost.
         search_above: While the object is lost, a look whose presence is above is worth a search.
-        search_every: While it is lost, every so many frames it is searched for anyway; 0: never.
+        look_every: While it is lost and other objects are tracked, too, it is looked for in every
+            so many frames; one object alone is in each.
+        search_every: While it is lost, every so many looks it is searched for anyway; 0: never.
 
     Raises:
         UserError: A number is out of range.
@@ -112,11 +114,12 @@ class TrackerSettings:
     found_above: float = 0.5
     patience: int = 2
     search_above: float = 0.1
+    look_every: int = 2
     search_every: int = 3
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, fit_pixels=1, patience=1)
+        check_whole(self, rounds=0, fit_pixels=1, patience=1, look_every=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0)
         least = min(self.move_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
         if not (least >= 0 and self.window_scale >= 1):

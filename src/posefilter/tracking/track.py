@@ -102,6 +102,8 @@ class Track:
         seed: Decides every random draw.
         turn: Frames by which its looks at the whole image, and its searches while it is lost, come
             sooner: objects that are tracked together take turns.
+        beside: Whether other objects are tracked, too: while it is lost it is then looked for in
+            every `look_every`-th frame alone.
 
     Raises:
         UserError: The method cannot be tracked with.
@@ -114,11 +116,13 @@ class Track:
         settings: TrackerSettings,
         seed: int = 0,
         turn: int = 0,
+        beside: bool = False,
     ) -> None:
         check_method(method)
         assert isinstance(method.space, PoseSpace)
         self.method, self.space = method, method.space
         self.size, self.settings, self.seed, self.turn = size, settings, seed, turn
+        self.beside = beside
         self.reset()
 
     def reset(self) -> None:
@@ -144,7 +148,7 @@ class Track:
         if self.state is None:
             return 8.0
         if self.loss_detector.lost:
-            return 2.5 if self._search_is_due else 1.0
+            return 0.2 if self._rests else 2.5 if self._search_is_due else 1.0
         return 1.5 if self._whole_is_due else 1.0
 
     @torch.no_grad()
@@ -154,6 +158,8 @@ class Track:
         predicted = None if self.state is None else self._predict(self.state)
         if predicted is None:
             sight = self._estimate(frame)
+        elif self._rests:
+            sight = FrameEstimate(self._take(frame.see_whole(self.size)), None, 0.0, 0.0, None)
         elif self.loss_detector.lost:
             sight = self._search(frame, predicted)
         else:
@@ -303,9 +309,20 @@ class Track:
     # -- what is looked at, and what it says ------------------------------------------------------
 
     @property
+    def _looks(self) -> tuple[int, bool]:
+        """How often it has been its turn to be looked for, and whether it is now."""
+        every = self.settings.look_every if self.beside else 1
+        number, left = divmod(self.frames + self.turn, every)
+        return number, left == 0
+
+    @property
+    def _rests(self) -> bool:
+        return self.state is not None and self.loss_detector.lost and not self._looks[1]
+
+    @property
     def _search_is_due(self) -> bool:
         every = self.settings.search_every
-        return every > 0 and (self.frames + self.turn) % every == 0
+        return every > 0 and self._looks[0] % every == 0
 
     @property
     def _whole_is_due(self) -> bool:

@@ -71,6 +71,7 @@ class Tracker:
                 self.settings,
                 seed,
                 turn,
+                beside=len(methods) > 1,
             )
             for turn, method in enumerate(methods)
         )
