@@ -26,6 +26,11 @@ def build_data(node: DictConfig, console: str) -> PoseDataModule:
     """Build the data module, and have its scenes rendered where they are missing."""
     if console == JSON:
         node = without_bars(node)
+    if node.get("generate") and "_target_" not in node.generate:
+        node = (
+            node.copy()
+        )  # sizes that debug=smoke has for scenes, with a dataset that renders none
+        node.generate = None
     data = instantiate(node, "data")
     if not isinstance(data, PoseDataModule):
         raise UserError(f"data._target_={node.get('_target_')}: is no data module")
