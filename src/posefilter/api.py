@@ -128,7 +128,7 @@ def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstim
     if data is not None:
         data.prepare_data()
         data.setup("fit")
-        method.set_object(data.object_model(0))
+        method.set_object(data.object_to_learn())
     return method
 
 

@@ -148,6 +148,16 @@ class HasDepth(Protocol):
         ...
 
 
+@runtime_checkable
+class HasColor(HasDepth, Protocol):
+    """A scene that keeps the image's colors too; required to compare them with a texture."""
+
+    @property
+    def measured_color(self) -> Tensor:
+        """Red, green and blue (B, 3, H, W) in [0, 1]."""
+        ...
+
+
 class Schedule(Protocol):
     """Set the noise level of each step."""
 

@@ -258,6 +258,8 @@ RANGES: dict[str, Range] = {
     "refine.components.noise": METERS,
     "refine.components.effective": POSITIVE,
     "refine.components.points": COUNT,
+    "refine.components.learned_weight": WEIGHT,
+    "refine.learned_weight": WEIGHT,
     "refine.iterations": COUNT,
     "refine.initial_gate": METERS,
     "refine.final_gate": METERS,

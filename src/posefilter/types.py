@@ -36,6 +36,10 @@ class ObjectModel(NamedTuple):
     hull: Tensor  # (V, 3) vertices of a convex hull [m], for outlines
     # (P, 3) by part: the vertices of its hull, and points of its surface [m]; see meshes/parts.py
     parts: dict[str, Tensor] | None = None
+    # (Q, 9) surface points [m], outward unit normals, colors in [0, 1]; None: an earlier version's
+    texture: Tensor | None = None
+    # (G, 4, 4) turns that move the shape onto itself, whatever the texture; the identity first
+    shape_symmetries: Tensor | None = None
 
 
 class Particles(NamedTuple):

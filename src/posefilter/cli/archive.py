@@ -130,8 +130,9 @@ def check_tensor(value: Tensor, size: int, said: str) -> None:
 
 def _check_object(model: Any, said: str) -> None:
     shapes = {"points": (-1, 3), "center": (3,), "symmetries": (-1, 4, 4), "hull": (-1, 3)}
-    # checkpoints of before there were parts have none
-    if not isinstance(model, dict) or set(model) - {"parts"} != {
+    # checkpoints of earlier versions have none of these
+    later = {"texture": (-1, 9), "shape_symmetries": (-1, 4, 4)}
+    if not isinstance(model, dict) or set(model) - {"parts", *later} != {
         "name",
         "radius",
         "diameter",
@@ -147,7 +148,8 @@ def _check_object(model: Any, said: str) -> None:
     parts = {} if model.get("parts") is None else model["parts"]
     if not (isinstance(parts, dict) and len(parts) <= _PARTS and all(map(_is_part_name, parts))):
         raise UserError(f"{said}: its object's parts should be points by plain names")
-    named = {key: (model[key], shape) for key, shape in shapes.items()}
+    held = shapes | {key: shape for key, shape in later.items() if model.get(key) is not None}
+    named = {key: (model[key], shape) for key, shape in held.items()}
     named |= {f"part {part}": (points, (-1, 3)) for part, points in parts.items()}
     for key, (value, shape) in named.items():
         fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.is_floating_point()
@@ -155,13 +157,14 @@ def _check_object(model: Any, said: str) -> None:
             want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
         ):
             raise UserError(f"{said}: its object's {key} should be numbers of shape {shape}")
-        most = _SYMMETRIES if key == "symmetries" else _POINTS
+        most = _SYMMETRIES if key.endswith("symmetries") else _POINTS
         if not 0 < len(value) <= most or not bool((value.abs() < _FARTHEST).all()):
             raise UserError(
                 f"{said}: its object's {key} should have 1 to {most} rows of finite lengths [m]"
             )
-    if not _are_rigid(model["symmetries"]):
-        raise UserError(f"{said}: its object's symmetries should be turns, each with a shift")
+    for key in held:
+        if key.endswith("symmetries") and not _are_rigid(model[key]):
+            raise UserError(f"{said}: its object's {key} should be turns, each with a shift")
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")

@@ -91,6 +91,8 @@ def strip(checkpoint: dict[str, Any], points: int, quantize: bool = False) -> di
     model, weights = dict(kept["object_model"]), unpack(kept["state_dict"])
     every = max(1, -(-len(model["points"]) // points))
     model["points"] = model["points"][::every].clone()
+    if quantize and model.get("texture") is not None:
+        model["texture"] = model["texture"].half()  # to a tenth of a millimeter
     settings = dict(kept["recipe"]["settings"])
     data = settings.get("data") or {}
     # no folders of the trainer's machine

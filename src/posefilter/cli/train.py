@@ -75,7 +75,7 @@ def build(job: Job) -> Run:
     method, trainer = build_method(recipe(job)), build_trainer(job)
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
-    model = data.object_model(0)
+    model = data.object_to_learn()
     method.set_object(model)
     if job.cfg.warm_start:
         starts = read_starts(job.cfg.warm_start, model.name)

@@ -6,9 +6,12 @@ surface where the pose says, and does the proposal network, which has seen the i
 take the same pixels for the same points of the object?
 """
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from posefilter.filters.texture import measure_texture
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import invert, transform
@@ -68,6 +71,32 @@ def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, T
     through = (known & (behind >= tolerance)).float().mean(1)
     few = 1 / points.shape[1]
     return {"surface": agrees, "free_space": (agrees + few) / (agrees + through + 2 * few)}
+
+
+class _Image(NamedTuple):
+    """What a texture is compared with."""
+
+    measured_color: Tensor
+    measured_depth: Tensor
+    intrinsics: Tensor
+
+
+def measure_print(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, Tensor]:
+    """Return whether the image shows the object's print where poses put it.
+
+    Args:
+        best: (B, 4, 4) camera_from_object [m].
+        batch: B images.
+        model: The object.
+
+    Returns:
+        (B,) `texture`: the logarithm of one plus the evidence of the print [nat]. Nothing where the
+        object has no texture.
+    """
+    if model.texture is None:
+        return {}
+    image = _Image(batch.rgb, batch.depth[:, 0], batch.intrinsics)
+    return {"texture": measure_texture(best[:, None], image, model)[:, 0].log1p()}
 
 
 def measure_coordinates(

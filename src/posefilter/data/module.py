@@ -24,6 +24,7 @@ from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
 from posefilter.meshes.store import BUILTIN, MeshStore, object_model
+from posefilter.meshes.texture import add_texture
 from posefilter.ranges import check_ranges
 from posefilter.types import Batch, ObjectModel
 
@@ -206,6 +207,14 @@ class PoseDataModule(LightningDataModule):
             self._model_points, self.root, name, self.reader.native_from_mesh(name)
         )
         return object_model(self.meshes.load(name), points=points, count=self._points)
+
+    def object_to_learn(self) -> ObjectModel:
+        """Return the first class as a method learns it: with the texture of its mesh.
+
+        Raises:
+            UserError: As `object_model`.
+        """
+        return add_texture(self.object_model(0), self.meshes.load(self.objects[0]))
 
     def records(self, split: str) -> list[FrameRecord]:
         """Return the records of a split: a batch's `frame_id` is an index into them."""

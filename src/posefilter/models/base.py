@@ -20,7 +20,7 @@ from posefilter.capabilities import Capabilities, check_parts, collect_provided
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
-from posefilter.confidence.features import measure_belief, measure_depth
+from posefilter.confidence.features import measure_belief, measure_depth, measure_print
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
@@ -221,6 +221,7 @@ class PoseEstimator(Module):
         return {
             **measure_belief(trace.belief, self.model),
             **measure_depth(trace.belief.best, batch, self.model),
+            **measure_print(trace.belief.best, batch, self.model),
         }
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:

@@ -39,6 +39,11 @@ class ImageScene:
         """The z-depth (B, H, W) [m]; 0 unknown."""
         return self.image[:, 3]
 
+    @property
+    def measured_color(self) -> Tensor:
+        """Red, green and blue (B, 3, H, W) in [0, 1]."""
+        return (self.image[:, :3] + 1) / 2
+
 
 @dataclass(frozen=True)
 class ObjectnessScene(ImageScene):

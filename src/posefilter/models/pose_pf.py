@@ -54,6 +54,11 @@ class PoseScene(NamedTuple):
         return self.image.values[..., 3].unflatten(1, self.image.size)
 
     @property
+    def measured_color(self) -> Tensor:
+        """Red, green and blue (B, 3, H, W) in [0, 1]."""
+        return self.image.values[..., :3].mT.unflatten(2, self.image.size)
+
+    @property
     def intrinsics(self) -> Tensor:
         """The camera matrices (B, 3, 3) [px]."""
         return self.image.intrinsics

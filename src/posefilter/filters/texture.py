@@ -1,0 +1,295 @@
+"""The print as a witness of its own: which turn of a shape fits the colors of the image.
+
+A learned likelihood and the depth hardly tell the turns of a can apart, where only print does.
+Here the colors that the mesh has are compared with those that the image shows, without learning.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor
+
+from posefilter.capabilities import Capabilities
+from posefilter.errors import UserError
+from posefilter.geometry.camera import project
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
+from posefilter.geometry.pose import origin_of, rotation_of, transform
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.protocols import HasColor, Method, Scene, ScoresPoses
+from posefilter.types import Belief, ObjectModel
+
+_DARK = 0.03  # added to colors before the logarithm, so that black does not decide
+_GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
+_NEAR = (0.004, 0.03)  # [m, diameters] between a point and what is measured at its pixel
+_BLUR = 0.33  # of the distance between neighboring points
+_SHARPEST = 0.5  # [px]
+_INDEPENDENT = 0.4  # share of the points that see something of their own
+_PIXELS = 2.0  # that a point needs for itself
+_LARGEST = 0.99  # correlation
+_SHIFT = 1.0  # [px]
+_MOST = 12  # turns that are compared with shifts
+_APART = 10.0  # [degrees] between the turns that are tried first
+_MISSING = (
+    "filter/refine: the checkpoint carries no texture of '{name}', as those of earlier versions; "
+    "choose filter/refine=mean_shift_icp, or train again"
+)
+_OWN = 0.2  # [diameters] a particle that is farther from every turn is of another place
+
+
+class _Print(NamedTuple):
+    """An object's textured points."""
+
+    points: Tensor  # (P, 3) [m]
+    normals: Tensor  # (P, 3) unit
+    color: Tensor  # (P, 3) logarithm
+    spacing: float  # [m] between neighbors
+
+
+def measure_texture(
+    poses: Tensor, scene: HasColor, model: ObjectModel, shift: float = _SHIFT
+) -> Tensor:
+    """Return how much better the object's print explains the image than plain shading does.
+
+    With y the logarithm of the image's colors at the surface points that are seen, and x that of
+    the object's, a regression y = shading + gain x is compared with y = shading, where the shading
+    is linear in the normal. The ratio of their maximum likelihoods depends on the partial
+    correlation r of x and y alone: n / 2 times -log(1 - r^2), for n independent points. Exposure,
+    white balance and a light from anywhere change nothing. A plain object has 0 at every pose.
+
+    Args:
+        poses: (B, C, 4, 4) camera_from_object [m].
+        scene: B images with color and depth.
+        model: The object.
+        shift: The best of nine shifts of the image counts, which lie so far apart [px], since fine
+            print does not correlate where a pose is a millimeter off. 0: none.
+
+    Returns:
+        Log-likelihood ratios (B, C) [nat], 0 or more.
+
+    Raises:
+        UserError: The object has no texture.
+    """
+    own = _read_print(model, poses)
+    images = zip(poses, scene.measured_color, scene.measured_depth, scene.intrinsics, strict=True)
+    return torch.stack([_compare(*image, own, model, shift) for image in images])
+
+
+def _read_print(model: ObjectModel, like: Tensor) -> _Print:
+    if model.texture is None:
+        raise UserError(_MISSING.format(name=model.name))
+    texture = model.texture.to(like)
+    # by a sphere's area: a cylinder's or a box's differs by less than matters for a blur
+    spacing = model.radius * (4 * torch.pi / 3 / len(texture)) ** 0.5
+    return _Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + _DARK).log(), spacing)
+
+
+def _compare(
+    poses: Tensor,
+    color: Tensor,
+    depth: Tensor,
+    K: Tensor,
+    own: _Print,
+    model: ObjectModel,
+    shift: float,
+) -> Tensor:
+    """Return the ratios of poses in one image.  (C, 4, 4), (3, H, W), (H, W), (3, 3) -> (C,)."""
+    points = transform(poses, own.points)
+    normals = own.normals @ rotation_of(poses).mT
+    cosine = -(normals * F.normalize(points, dim=-1)).sum(-1)
+    pixels = project(points, K)
+    at = nearest_pixel(pixels).flatten(0, 1)
+    z = gather_pixels(depth[None, None], at[None])[0, :, 0].unflatten(0, cosine.shape)
+    near = (z - points[..., 2]).abs() < _NEAR[0] + _NEAR[1] * model.diameter
+    seen = (z > 0) & near & (cosine > _GRAZING)
+    weights = seen * cosine
+    focal = float(K[0, 0])
+    covered = (weights * (own.spacing * focal / points[..., 2].clamp_min(0.05)).square()).sum(-1)
+    count = _INDEPENDENT * torch.minimum(seen.sum(-1), covered / _PIXELS)
+    basis = torch.cat([torch.ones_like(cosine)[..., None], normals], dim=-1)
+    x = _remove(own.color.expand_as(points), basis, weights)
+    middle = float(origin_of(poses, model.center.to(poses))[:, 2].median().clamp_min(0.05))
+    image = (blur(color, max(_SHARPEST, _BLUR * own.spacing * focal / middle)) + _DARK).log()
+    best = torch.zeros_like(count)
+    for offset in torch.cartesian_prod(*2 * [torch.tensor([-1.0, 0, 1])]) if shift else [0]:
+        moved = (pixels + torch.as_tensor(shift * offset).to(pixels)).flatten(0, 1)
+        y = _remove(sample(image[None], moved[None])[0].unflatten(0, cosine.shape), basis, weights)
+        best = torch.maximum(best, _correlate(x, y, weights))
+    return -0.5 * count * torch.log1p(-best.clamp_max(_LARGEST).square())
+
+
+def _correlate(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted correlation of colors without means.  (C, P, 3), (C, P) -> (C,)."""
+    xy, xx, yy = ((weights[..., None] * one).sum((1, 2)) for one in (x * y, x * x, y * y))
+    return xy / (xx * yy).sqrt().clamp_min(1e-9)
+
+
+def _remove(values: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
+    """Return what a weighted regression on a basis leaves.  (C, P, 3), (C, P, 4), (C, P)."""
+    weighted = basis * weights[..., None]
+    gram = weighted.mT @ basis
+    ridge = 1e-6 * weights.sum(-1)[:, None, None] + 1e-9
+    eye = torch.eye(basis.shape[-1], device=basis.device, dtype=basis.dtype)
+    return values - basis @ torch.linalg.solve(gram + ridge * eye, weighted.mT @ values)
+
+
+def blur(image: Tensor, sigma: float) -> Tensor:
+    """Blur an image by a Gaussian, repeating its edge.  (C, H, W), [px] -> (C, H, W)."""
+    half = min(max(1, round(3 * sigma)), min(image.shape[1:]) - 1)
+    at = torch.arange(-half, half + 1, device=image.device, dtype=image.dtype)
+    kernel = torch.exp(-0.5 * (at / sigma).square())
+    kernel = (kernel / kernel.sum())[None, None, None]
+    padded = F.pad(image[:, None], (half, half, half, half), mode="replicate")
+    return F.conv2d(F.conv2d(padded, kernel), kernel.mT)[:, 0]
+
+
+class TextureTurns:
+    """Turn the estimate, and the particles, as the print says.
+
+    The turns that move the object's shape onto itself are what the depth leaves open. Each has the
+    log-posterior e + w l, with e the evidence of the print (`measure_texture`) and l the learned
+    log-likelihood. The estimate takes the best of them. Particles draw theirs, so that the belief
+    is spread over turns that the print does not tell apart either. An object whose shape has no
+    such turn stays as it is.
+
+    Args:
+        learned_weight: w. The learned likelihood's scale is arbitrary.
+        pixels: Image points of each learned score.
+        sigma: Its noise level [m].
+
+    Raises:
+        UserError: A number is out of range.
+    """
+
+    requires: ClassVar[Capabilities] = ("depth", "pose")
+
+    def __init__(
+        self, learned_weight: float = 1.0, pixels: int = 256, sigma: float = 0.004
+    ) -> None:
+        if learned_weight < 0 or min(pixels, sigma) <= 0:
+            raise UserError(
+                "refine: turns by texture need learned_weight >= 0, pixels and sigma above 0; got "
+                f"{learned_weight}, {pixels} and {sigma}"
+            )
+        self.learned_weight, self.pixels, self.sigma = learned_weight, pixels, sigma
+
+    @torch.no_grad()
+    def __call__(
+        self, belief: Belief, scene: Scene, method: Method, generator: Generator
+    ) -> Belief:
+        """Return the belief with the estimate and its particles turned; the score stays.
+
+        Raises:
+            UserError: The method keeps no color, or its object has no texture.
+        """
+        model: ObjectModel | None = getattr(method, "model", None)
+        if not isinstance(scene, HasColor) or model is None:
+            raise UserError(
+                f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
+                "choose filter/refine=mean_shift_icp, icp or none"
+            )
+        first = belief.best
+        if model.texture is None or model.shape_symmetries is None:
+            raise UserError(_MISSING.format(name=model.name))
+        turns = model.shape_symmetries.to(first)
+        if len(turns) == 1:
+            return belief
+        coarse = turns[spread_out(turns, _APART)]
+        log_posterior = self._score(first, coarse, scene, method, model, generator)
+        chosen = coarse[log_posterior.argmax(1)]
+        best = self._turn_finely(first, chosen, turns, scene, model)
+        poses = _turn_particles(belief, coarse, log_posterior, model, generator)
+        return belief._replace(best=best, poses=poses)
+
+    def _score(
+        self,
+        best: Tensor,
+        turns: Tensor,
+        scene: HasColor,
+        method: Method,
+        model: ObjectModel,
+        generator: Generator,
+    ) -> Tensor:
+        """Return the log-posterior of each turn of the estimates, (B, S)."""
+        poses = best[:, None] @ turns
+        learned = torch.zeros_like(poses[..., 0, 0])
+        if isinstance(method, ScoresPoses) and self.learned_weight:
+            scores = method.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            learned = self.learned_weight * scores
+        if len(turns) <= _MOST:
+            return measure_texture(poses, scene, model) + learned
+        evidence = measure_texture(poses, scene, model, shift=0)
+        top = (evidence + learned).topk(_MOST, dim=1).indices
+        rows = torch.arange(len(best), device=best.device)[:, None]
+        evidence[rows, top] = measure_texture(poses[rows, top], scene, model)
+        return evidence + learned
+
+    def _turn_finely(
+        self, best: Tensor, chosen: Tensor, turns: Tensor, scene: HasColor, model: ObjectModel
+    ) -> Tensor:
+        """Return the estimates turned by the best of all turns near those chosen.
+
+        Args:
+            best: (B, 4, 4).
+            chosen: (B, 4, 4), one of `turns` each.
+            turns: (S, 4, 4).
+            scene: The images.
+            model: The object.
+        """
+        angles = _angles(chosen, turns)  # (B, S)
+        most = int((angles < _APART).sum(1).max())
+        if most == 1:
+            return best @ chosen
+        near = turns[angles.topk(most, dim=1, largest=False).indices]  # the chosen one first
+        poses = best[:, None] @ near
+        evidence = measure_texture(poses, scene, model)
+        return poses[torch.arange(len(best), device=best.device), evidence.argmax(1)]
+
+
+def spread_out(turns: Tensor, apart: float) -> Tensor:
+    """Return indices of turns no two of which are nearer than `apart` degrees; the first is among
+    them.  (S, 4, 4) -> (n,).
+    """
+    angles, kept = _angles(turns, turns), [0]
+    for index in range(1, len(turns)):
+        if bool((angles[index, kept] > apart - 0.1).all()):
+            kept.append(index)
+    return torch.tensor(kept, device=turns.device)
+
+
+def _angles(a: Tensor, b: Tensor) -> Tensor:
+    """Return the angles between turns [degrees].  (A, 4, 4), (B, 4, 4) -> (A, B)."""
+    trace = rotation_of(a).flatten(1) @ rotation_of(b).flatten(1).mT
+    return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
+
+
+def _turn_particles(
+    belief: Belief,
+    turns: Tensor,
+    log_posterior: Tensor,
+    model: ObjectModel,
+    generator: Generator,
+) -> Tensor:
+    """Return the particles, each turned from the turn it is at to one that it draws.
+
+    Args:
+        belief: Its poses (B, N, 4, 4), and the estimates before they were turned.
+        turns: (S, 4, 4).
+        log_posterior: (B, S) of the turns.
+        model: The object.
+        generator: Draws the turns, systematically: their shares are those of the posterior.
+    """
+    poses, best = belief.poses, belief.best
+    x, y, z = model.center.tolist()
+    space = PoseSpace((x, y, z), model.radius)
+    distance = space.distance(poses[:, :, None], (best[:, None] @ turns)[:, None])  # (B, N, S)
+    nearest, at = distance.min(-1)
+    back = torch.linalg.inv(turns)[at]
+    B, N = at.shape
+    shift = torch.rand(B, 1, generator=generator, device=at.device)
+    order = torch.rand(B, N, generator=generator, device=at.device).argsort(1)
+    position = (order + shift) / N
+    sums = log_posterior.double().softmax(1).cumsum(1).to(position)
+    drawn = torch.searchsorted(sums.contiguous(), position).clamp_max(len(turns) - 1)
+    moved = poses @ back @ turns[drawn]
+    return torch.where((nearest < _OWN * model.diameter)[..., None, None], moved, poses)
