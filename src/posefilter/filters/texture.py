@@ -27,7 +27,7 @@ _SHARPEST = 0.5  # [px]
 _INDEPENDENT = 0.4  # share of the points that see something of their own
 _PIXELS = 2.0  # that a point needs for itself
 _LARGEST = 0.99  # correlation
-_SHIFT = 1.0  # [px]
+_SHIFT = 0.002  # [focal lengths], a pixel of the width at which networks see
 _MOST = 12  # turns that are compared with shifts
 _APART = 10.0  # [degrees] between the turns that are tried first
 _MISSING = (
@@ -61,8 +61,8 @@ def measure_texture(
         poses: (B, C, 4, 4) camera_from_object [m].
         scene: B images with color and depth.
         model: The object.
-        shift: The best of nine shifts of the image counts, which lie so far apart [px], since fine
-            print does not correlate where a pose is a millimeter off. 0: none.
+        shift: The best of nine shifts of the image counts, which lie so far apart [focal lengths],
+            since fine print does not correlate where a pose is a millimeter off. 0: none.
 
     Returns:
         Log-likelihood ratios (B, C) [nat], 0 or more.
@@ -112,7 +112,7 @@ def _compare(
     image = (blur(color, max(_SHARPEST, _BLUR * own.spacing * focal / middle)) + _DARK).log()
     best = torch.zeros_like(count)
     for offset in torch.cartesian_prod(*2 * [torch.tensor([-1.0, 0, 1])]) if shift else [0]:
-        moved = (pixels + torch.as_tensor(shift * offset).to(pixels)).flatten(0, 1)
+        moved = (pixels + torch.as_tensor(shift * focal * offset).to(pixels)).flatten(0, 1)
         y = _remove(sample(image[None], moved[None])[0].unflatten(0, cosine.shape), basis, weights)
         best = torch.maximum(best, _correlate(x, y, weights))
     return -0.5 * count * torch.log1p(-best.clamp_max(_LARGEST).square())
