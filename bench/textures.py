@@ -19,7 +19,16 @@ from posefilter.files import write_whole
 from posefilter.meshes.texture import add_texture
 from posefilter.types import ObjectModel
 
+TURNS = "posefilter.filters.texture.TextureTurns"
 REFINE = Path(__file__).parents[1] / "conf/filter/refine/mean_shift_icp_texture.yaml"
+
+
+def insert_turns(components: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a refinement's components, with the turns before the last, which scores anew."""
+    known: Any = OmegaConf.to_container(OmegaConf.load(REFINE))
+    turns = next(one for one in known["components"] if one["_target_"] == TURNS)
+    kept = [one for one in components if one["_target_"] != TURNS]
+    return [*kept[:-1], turns, kept[-1]]
 
 
 def give_texture(file: Path, meshes: str) -> int:
@@ -31,8 +40,8 @@ def give_texture(file: Path, meshes: str) -> int:
     assert model.texture is not None
     assert model.shape_symmetries is not None
     checkpoint["object_model"] = dict(model._replace(texture=model.texture.half())._asdict())
-    refine: Any = OmegaConf.to_container(OmegaConf.load(REFINE))
-    checkpoint["recipe"]["settings"]["filter"]["refine"] = refine
+    refine = checkpoint["recipe"]["settings"]["filter"]["refine"]
+    refine["components"] = insert_turns(refine["components"])
     checkpoint["recipe"]["choices"]["filter/refine"] = REFINE.stem
     checkpoint.pop("calibration", None)
     write_whole(file, pack_whole(checkpoint), sync=True)

@@ -57,6 +57,9 @@ class PoseFilter:
             if step["kind"] == "icp":
                 best = self.align(image, best, **step)
                 continue
+            if step["kind"] == "texture":
+                best, poses = self.turn(scene, image, best, poses, rng, **step)
+                continue
             refine = self.rescore if step["kind"] == "rescore" else self.shift
             best, score = refine(scene, best, poses, weights, rng, **step)
         return best, float(score), poses, weights
@@ -90,11 +93,12 @@ class PoseFilter:
         scores = self.score(scene, poses, sigma, pixels, rng)
         return poses[scores.argmax()], scores.max()
 
-    def shift(self, scene, best, poses, weights, rng, iterations, antithetic_pairs, start, end,
-              sigma, pixels, **_):  # fmt: skip
+    def shift(self, scene, best, poses, weights, rng, iterations, antithetic_pairs, initial_scale,
+              final_scale, sigma, pixels, **_):  # fmt: skip
         """Mean shift: the likelihood-weighted mean of pairs of opposite moves."""
         for index in range(iterations):
-            spread = start * (end / start) ** (index / max(iterations - 1, 1))
+            share = index / max(iterations - 1, 1)
+            spread = initial_scale * (final_scale / initial_scale) ** share
             noise = rng.standard_normal((antithetic_pairs, 6), dtype=np.float32)
             moves = np.concatenate([noise, -noise]) * self.scale(spread)
             near = move(np.broadcast_to(best, (len(moves), 4, 4)), moves, self.center)
@@ -120,6 +124,97 @@ class PoseFilter:
             step = np.linalg.solve((rows.T * weights) @ rows + precision, slope)
             pose, moved = move(pose[None], step[None], self.center)[0], moved + step
         return np.float32(pose) if known else best
+
+    def turn(self, scene, image, best, poses, rng, turns, coarse, surface, spacing, learned_weight,
+             pixels, sigma, **_):  # fmt: skip
+        """Turn the estimate and the particles as the object's print says."""
+        turns = np.float32(np.pad(np.reshape(turns, (-1, 3, 4)), ((0, 0), (0, 1), (0, 0))))
+        turns[:, 3, 3] = 1
+        some, size = turns[coarse], self.settings["diameter"]
+        own = np.split(np.array(surface), 3, axis=1)
+        weigh = lambda x, still: compare(image, x, own, self.center, spacing, size, still)  # noqa: E731
+        learned = learned_weight * self.score(scene, best @ some, sigma, pixels, rng)
+        total = learned + weigh(best @ some, len(some) > 12)
+        if len(some) > 12:
+            top = np.argsort(-total)[:12]
+            total[top] = learned[top] + weigh(best @ some[top], False)
+        chosen = some[total.argmax()]
+        cosine = (np.einsum("sij,ij->s", turns[:, :3, :3], chosen[:3, :3]) - 1) / 2
+        near = best @ turns[np.degrees(np.arccos(cosine.clip(-1, 1))) < 10]
+        found = near[weigh(near, False).argmax()] if len(near) > 1 else best @ chosen
+        apart = distance(poses[:, None], best @ some, self.center, self.radius)
+        at, share = apart.argmin(1), (rng.permutation(len(poses)) + rng.random()) / len(poses)
+        drawn = np.searchsorted(np.cumsum(softmax(total)), share).clip(0, len(some) - 1)
+        moved = poses @ np.linalg.inv(some)[at] @ some[drawn]
+        return found, np.where((apart.min(1) < 0.2 * size)[:, None, None], moved, poses)
+
+
+def compare(image, poses, own, center, spacing, size, still):
+    """How much better the print explains the image than plain shading does: (C,) [nat]."""
+    K, depth = image["intrinsics"], image["depth"]
+    own, normal, color = own
+    R, focal = poses[:, :3, :3].astype(float), float(K[0, 0])
+    points = own @ R.transpose(0, 2, 1) + poses[:, None, :3, 3]
+    normals = normal @ R.transpose(0, 2, 1)
+    cosine = -(normals * points).sum(-1) / np.linalg.norm(points, axis=-1)
+    at = points[..., :2] / points[..., 2:].clip(1e-3) * [K[0, 0], K[1, 1]] + K[:2, 2]
+    u, v = np.moveaxis(np.floor(at + 0.5).clip(-1e6, 1e6).astype(int), -1, 0)
+    high, wide = depth.shape
+    z = depth[v.clip(0, high - 1), u.clip(0, wide - 1)]
+    z = z * ((u >= 0) & (u < wide) & (v >= 0) & (v < high))
+    seen = (z > 0) & (np.abs(z - points[..., 2]) < 0.004 + 0.03 * size) & (cosine > 0.25)
+    weight = seen * cosine
+    covered = (weight * (spacing * focal / points[..., 2].clip(0.05)) ** 2).sum(-1)
+    count = 0.4 * np.minimum(seen.sum(-1), covered / 2)
+    basis = np.concatenate([np.ones_like(cosine)[..., None], normals], -1)
+    middle = np.median((R @ center + poses[:, :3, 3])[:, 2]).clip(0.05)
+    shown = np.log(blur(image["rgb"] / 255, max(0.5, 0.33 * spacing * focal / middle)) + 0.03)
+    x, best = leave(np.broadcast_to(color, points.shape), basis, weight), np.zeros(len(poses))
+    for offset in np.indices((3, 3)).reshape(2, 9).T - 1 if not still else np.zeros((1, 2)):
+        y = leave(look(shown, at + 0.002 * focal * offset), basis, weight)
+        xy, xx, yy = ((weight[..., None] * one).sum((1, 2)) for one in (x * y, x * x, y * y))
+        best = np.maximum(best, xy / np.sqrt(xx * yy).clip(1e-9))
+    return -0.5 * count * np.log1p(-(best.clip(0, 0.99) ** 2))
+
+
+def leave(values, basis, weight):
+    """What a weighted regression on a basis leaves: (C, P, 3), (C, P, 4), (C, P)."""
+    weighted = (basis * weight[..., None]).transpose(0, 2, 1)
+    ridge = (1e-6 * weight.sum(-1) + 1e-9)[:, None, None] * np.eye(4)
+    return values - basis @ np.linalg.solve(weighted @ basis + ridge, weighted @ values)
+
+
+def blur(image, sigma):
+    """A Gaussian blur that repeats the edge: (H, W, 3), [px]."""
+    half = min(max(1, round(3 * sigma)), min(image.shape[:2]) - 1)
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
+    for axis in (0, 1):
+        padded = np.pad(image, [(half, half) if i == axis else (0, 0) for i in range(3)], "edge")
+        parts = (np.take(padded, range(i, i + image.shape[axis]), axis) * w
+                 for i, w in enumerate(kernel / kernel.sum()))  # fmt: skip
+        image = sum(parts)
+    return image
+
+
+def look(image, at):
+    """Sample an image bilinearly, 0 outside: (H, W, 3), (*, 2) [px] -> (*, 3)."""
+    at = at.clip(-1e6, 1e6)
+    left, value = np.floor(at).astype(int), 0
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        u, v = left[..., 0] + i, left[..., 1] + j
+        inside = (u >= 0) & (u < image.shape[1]) & (v >= 0) & (v < image.shape[0])
+        share = (1 - np.abs(at - np.stack([u, v], -1))).prod(-1) * inside
+        value = value + share[..., None] * image[v.clip(0, image.shape[0] - 1),
+                                                 u.clip(0, image.shape[1] - 1)]  # fmt: skip
+    return value
+
+
+def distance(a, b, center, radius):
+    """How far poses are apart: (*, 4, 4) [m] twice; a turn counts as the shift at the radius."""
+    shift = np.linalg.norm((a[..., :3, :3] - b[..., :3, :3]) @ center
+                           + a[..., :3, 3] - b[..., :3, 3], axis=-1)  # fmt: skip
+    trace = np.einsum("...ij,...ij->...", a[..., :3, :3], b[..., :3, :3])
+    return np.hypot(shift, radius * np.arccos(((trace - 1) / 2).clip(-1, 1)))
 
 
 def pair(image, pose, own, center, width):

@@ -6,7 +6,8 @@ import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,15 +19,17 @@ from posefilter.cli import run_command
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.deploy.resizing import Resize
-from posefilter.deploy.settings import describe_filter
+from posefilter.deploy.settings import describe_filter, describe_turns
 from posefilter.deploy.write import make_graphs, to_program, write_filter
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
-from posefilter.geometry.pose import fit_rigid, is_rigid, move_about
+from posefilter.filters.texture import TextureTurns, list_turns
+from posefilter.geometry.pose import fit_rigid, is_rigid, make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Belief
+from printed_objects import load, look
 
 HOME = Path(__file__).parents[2]
 SCENE = (
@@ -149,6 +152,37 @@ def test_the_example_aligns_as_torch_does(
         ours = own.align(image, start[0].numpy(), surface, **vars(icp))
         assert np.abs(theirs - start[0].numpy()).max() > 8e-3
         assert np.abs(ours - theirs).max() < 1e-3  # pixels are rounded in another precision
+
+
+@pytest.mark.parametrize("name", ["soup_can", "carton"])
+def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
+    model, turn = load(name), TextureTurns()
+    turns, coarse = list_turns(model)
+    assert (len(coarse) > 12) == (name == "soup_can")  # both ways through the stages
+    R = random_rotation(1, generator=torch.Generator().manual_seed(2))[0]
+    truth = make_pose(R, torch.tensor([0.0, 0, 4.5 * model.radius]) - R @ model.center)
+    scene = look(name, truth)
+    wrong = truth @ turns[len(turns) // 3]
+    given = Belief(wrong.expand(1, 20, 4, 4), torch.zeros(1, 20), wrong[None], torch.zeros(1))
+    method: Any = SimpleNamespace(model=model)
+    theirs = turn(given, scene, method, torch.Generator()).best[0].numpy()
+    own = poses.PoseFilter.__new__(poses.PoseFilter)
+    own.center, own.radius = model.center.numpy(), float(model.radius)
+    own.settings = {"diameter": model.diameter}
+    own.score = lambda scene, states, *_: np.zeros(len(states))
+    image = {
+        "rgb": 255 * scene.measured_color[0].movedim(0, 2).numpy(),
+        "depth": scene.measured_depth[0].numpy(),
+        "intrinsics": scene.intrinsics[0].numpy(),
+    }
+    (described,) = describe_turns(turn, model)
+    ours, particles = own.turn(
+        None, image, wrong.numpy(), given.poses[0].numpy(), np.random.default_rng(0), **described
+    )
+    assert np.abs(wrong.numpy() - theirs).max() > 0.5
+    assert np.abs(ours - theirs).max() < 1e-3
+    assert np.abs(particles - ours).max(axis=(1, 2)).min() < 0.1  # by turns of ten degrees
+    assert all(is_rigid(torch.from_numpy(one)) for one in particles)
 
 
 def test_an_estimate_is_that_of_torch(

@@ -195,6 +195,17 @@ CHANGES: dict[str, Callable[[dict[str, Any]], None]] = {
     "a name of blanks": update("object_model", name=" "),
     "200,000 symmetries": update("object_model", symmetries=torch.eye(4).repeat(200_000, 1, 1)),
     "symmetries that stretch": update("object_model", symmetries=2 * torch.eye(4)[None]),
+    "2,000 symmetries of the shape": update(
+        "object_model", shape_symmetries=torch.eye(4).repeat(2_000, 1, 1)
+    ),
+    "a shape's symmetry that stretches": update(
+        "object_model", shape_symmetries=2 * torch.eye(4)[None]
+    ),
+    "a texture of eight columns": update("object_model", texture=torch.zeros(5, 8)),
+    "a texture that is not finite": update("object_model", texture=torch.full((5, 9), torch.nan)),
+    "a texture of negative colors": update("object_model", texture=-torch.ones(5, 9)),
+    "30,000 textured points": update("object_model", texture=torch.zeros(30_000, 9)),
+    "no hull": update("object_model", hull=None),
     "no symmetry": update("object_model", symmetries=torch.zeros(0, 4, 4)),
     "points at the end of numbers": update("object_model", points=torch.full((5, 3), 3e38)),
 }  # fmt: skip

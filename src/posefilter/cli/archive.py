@@ -23,7 +23,7 @@ _MOST_FILES = 50_000  # in an archive
 _MOST_NODES, _DEEPEST = 500_000, 64
 _PART = re.compile(r"[\w.\-]{1,100}(/[\w.\-]{1,100}){0,4}")
 _POINTS = 1_000_000  # of an object's surface
-_SYMMETRIES = 10_000
+_MOST = {"symmetries": 10_000, "texture": 20_000, "shape_symmetries": 1_000}  # rows
 _PARTS = 100
 _FARTHEST = 1000.0  # length of an object [m]
 _SPREAD = 4  # times the bytes of a file that its weights may stand for
@@ -148,8 +148,9 @@ def _check_object(model: Any, said: str) -> None:
     parts = {} if model.get("parts") is None else model["parts"]
     if not (isinstance(parts, dict) and len(parts) <= _PARTS and all(map(_is_part_name, parts))):
         raise UserError(f"{said}: its object's parts should be points by plain names")
-    held = shapes | {key: shape for key, shape in later.items() if model.get(key) is not None}
-    named = {key: (model[key], shape) for key, shape in held.items()}
+    held = {key: model[key] for key in shapes}
+    held |= {key: model[key] for key in later if model.get(key) is not None}
+    named = {key: (value, (shapes | later)[key]) for key, value in held.items()}
     named |= {f"part {part}": (points, (-1, 3)) for part, points in parts.items()}
     for key, (value, shape) in named.items():
         fits = isinstance(value, Tensor) and value.dim() == len(shape) and value.is_floating_point()
@@ -157,14 +158,17 @@ def _check_object(model: Any, said: str) -> None:
             want not in (-1, have) for want, have in zip(shape, value.shape, strict=True)
         ):
             raise UserError(f"{said}: its object's {key} should be numbers of shape {shape}")
-        most = _SYMMETRIES if key.endswith("symmetries") else _POINTS
+        most = _MOST.get(key, _POINTS)
         if not 0 < len(value) <= most or not bool((value.abs() < _FARTHEST).all()):
             raise UserError(
                 f"{said}: its object's {key} should have 1 to {most} rows of finite lengths [m]"
             )
     for key in held:
-        if key.endswith("symmetries") and not _are_rigid(model[key]):
+        if key.endswith("symmetries") and not _are_rigid(held[key]):
             raise UserError(f"{said}: its object's {key} should be turns, each with a shift")
+    colors = held["texture"][:, 6:] if "texture" in held else torch.zeros(1)
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise UserError(f"{said}: its object's texture should have colors in [0, 1]")
     for key in ("radius", "diameter"):
         if not (isinstance(model[key], float | int) and 0 < model[key] < 1000):
             raise UserError(f"{said}: its object's {key} should be a length [m]")

@@ -2,14 +2,18 @@
 
 from typing import Any
 
+import torch
+
 from posefilter.errors import UserError
 from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.icp import PointToPlaneIcp
+from posefilter.filters.texture import TextureTurns, list_turns, read_print
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.likelihood import PoseLikelihood
+from posefilter.types import ObjectModel
 
 VERSION = 1  # of the files' format
 
@@ -150,4 +154,26 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
         surface = one.choose_points(method.model.points).tolist()
         own = {name: getattr(one, name) for name in names}
         return [{"kind": "icp", **own, "surface": surface}]
-    raise _refuse(one, "refine", "mean_shift_icp", "mean_shift", "rescore", "none")
+    if isinstance(one, TextureTurns) and isinstance(method, PosePF):
+        return describe_turns(one, method.model)
+    choices = ("mean_shift_icp_texture", "mean_shift_icp", "mean_shift", "rescore", "none")
+    raise _refuse(one, "refine", *choices)
+
+
+def describe_turns(one: TextureTurns, model: ObjectModel) -> list[dict[str, Any]]:
+    """Return what turns by texture need; nothing where the shape leaves no turn open."""
+    turns, coarse = list_turns(model)
+    if len(turns) == 1:
+        return []
+    own = read_print(model)
+    surface = torch.cat([own.points, own.normals, own.color], dim=1)
+    return [
+        {
+            "kind": "texture",
+            **{name: getattr(one, name) for name in ("learned_weight", "pixels", "sigma")},
+            "surface": [[round(x, 5) for x in row] for row in surface.tolist()],
+            "spacing": own.spacing,
+            "turns": [[round(x, 6) for x in turn[:3].flatten().tolist()] for turn in turns],
+            "coarse": coarse.tolist(),
+        }
+    ]

@@ -37,7 +37,7 @@ _MISSING = (
 _OWN = 0.2  # [diameters] a particle that is farther from every turn is of another place
 
 
-class _Print(NamedTuple):
+class Print(NamedTuple):
     """An object's textured points."""
 
     points: Tensor  # (P, 3) [m]
@@ -70,18 +70,23 @@ def measure_texture(
     Raises:
         UserError: The object has no texture.
     """
-    own = _read_print(model, poses)
+    own = read_print(model, poses)
     images = zip(poses, scene.measured_color, scene.measured_depth, scene.intrinsics, strict=True)
     return torch.stack([_compare(*image, own, model, shift) for image in images])
 
 
-def _read_print(model: ObjectModel, like: Tensor) -> _Print:
+def read_print(model: ObjectModel, like: Tensor | None = None) -> Print:
+    """Return an object's textured points, as `like` is.
+
+    Raises:
+        UserError: The object has no texture.
+    """
     if model.texture is None:
         raise UserError(_MISSING.format(name=model.name))
-    texture = model.texture.to(like)
+    texture = model.texture.float() if like is None else model.texture.to(like)
     # by a sphere's area: a cylinder's or a box's differs by less than matters for a blur
     spacing = model.radius * (4 * torch.pi / 3 / len(texture)) ** 0.5
-    return _Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + _DARK).log(), spacing)
+    return Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + _DARK).log(), spacing)
 
 
 def _compare(
@@ -89,7 +94,7 @@ def _compare(
     color: Tensor,
     depth: Tensor,
     K: Tensor,
-    own: _Print,
+    own: Print,
     model: ObjectModel,
     shift: float,
 ) -> Tensor:
@@ -189,12 +194,11 @@ class TextureTurns:
                 "choose filter/refine=mean_shift_icp, icp or none"
             )
         first = belief.best
-        if model.texture is None or model.shape_symmetries is None:
-            raise UserError(_MISSING.format(name=model.name))
-        turns = model.shape_symmetries.to(first)
+        turns, first_tried = list_turns(model)
         if len(turns) == 1:
             return belief
-        coarse = turns[spread_out(turns, _APART)]
+        turns = turns.to(first)
+        coarse = turns[first_tried]
         log_posterior = self._score(first, coarse, scene, method, model, generator)
         chosen = coarse[log_posterior.argmax(1)]
         best = self._turn_finely(first, chosen, turns, scene, model)
@@ -246,15 +250,27 @@ class TextureTurns:
         return poses[torch.arange(len(best), device=best.device), evidence.argmax(1)]
 
 
-def spread_out(turns: Tensor, apart: float) -> Tensor:
-    """Return indices of turns no two of which are nearer than `apart` degrees; the first is among
-    them.  (S, 4, 4) -> (n,).
+def list_turns(model: ObjectModel) -> tuple[Tensor, Tensor]:
+    """Return the turns that an object's shape leaves open, and which of them are tried first.
+
+    Args:
+        model: The object.
+
+    Returns:
+        (S, 4, 4) object_from_object, the identity first; indices of some of them, no two of which
+        are nearer than ten degrees.
+
+    Raises:
+        UserError: The object has no texture.
     """
+    turns = model.shape_symmetries
+    if model.texture is None or turns is None:
+        raise UserError(_MISSING.format(name=model.name))
     angles, kept = _angles(turns, turns), [0]
     for index in range(1, len(turns)):
-        if bool((angles[index, kept] > apart - 0.1).all()):
+        if bool((angles[index, kept] > _APART - 0.1).all()):
             kept.append(index)
-    return torch.tensor(kept, device=turns.device)
+    return turns, torch.tensor(kept, device=turns.device)
 
 
 def _angles(a: Tensor, b: Tensor) -> Tensor:

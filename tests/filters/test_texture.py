@@ -1,0 +1,200 @@
+"""The print decides the turns that a shape leaves open, and says nothing where there is none."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import Generator, Tensor
+
+from posefilter.errors import UserError
+from posefilter.filters.texture import TextureTurns, blur, list_turns, measure_texture
+from posefilter.geometry.pose import make_pose
+from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
+from posefilter.geometry.spaces import PoseSpace
+from posefilter.meshes.store import MeshStore
+from posefilter.meshes.texture import sample_texture
+from posefilter.rendering.surfaces import Lights
+from posefilter.types import Belief, ObjectModel
+from printed_objects import Seen, W, load, look
+
+
+def draw(name: str, count: int) -> list[Tensor]:
+    """Return random poses in which the object fills a good part of the image."""
+    g, model = Generator().manual_seed(5), load(name)
+    rotations = random_rotation(count, generator=g)
+    shift = torch.tensor([0.0, 0, 4.5 * model.radius])
+    return [make_pose(R, shift - R @ model.center) for R in rotations]
+
+
+def believe(pose: Tensor, count: int = 40) -> Belief:
+    poses = pose.expand(1, count, 4, 4).clone()
+    return Belief(poses, torch.full((1, count), -np.log(count)), pose[None], torch.zeros(1))
+
+
+def method(model: ObjectModel) -> SimpleNamespace:
+    return SimpleNamespace(model=model)
+
+
+def turn(belief: Belief, scene: Seen, model: ObjectModel, **settings: float) -> Belief:
+    out = TextureTurns(**settings)(belief, scene, method(model), Generator().manual_seed(0))  # type: ignore[arg-type]
+    assert torch.equal(out.score, belief.score)
+    return out
+
+
+@pytest.mark.parametrize("name", ["soup_can", "carton", "tuna_can"])
+def test_a_print_turns_the_shape_back(name: str) -> None:
+    model = load(name)
+    turns, _ = list_turns(model)
+    assert len(turns) > 1
+    right = 0
+    poses = draw(name, 6)
+    for number, pose in enumerate(poses):
+        wrong = pose @ turns[(number + 1) * len(turns) // 7]
+        best = turn(believe(wrong), look(name, pose), model).best[0]
+        right += bool(angle_between(best[:3, :3], pose[:3, :3]) < np.deg2rad(6))
+    assert right >= 5  # an end of a can may show no print
+
+
+def test_the_right_turn_stays() -> None:
+    model, (pose, *_) = load("carton"), draw("carton", 1)
+    given = believe(pose)
+    out = turn(given, look("carton", pose), model)
+    assert torch.allclose(out.best[0], pose, atol=1e-5)
+    assert torch.allclose(out.poses, given.poses, atol=1e-5)
+
+
+def test_a_plain_object_says_nothing() -> None:
+    model, pose = load("bowl"), draw("bowl", 1)[0]
+    texture = model.texture
+    assert texture is not None
+    plain = model._replace(texture=torch.cat([texture[:, :6], texture[:, 6:] * 0 + 0.5], dim=1))
+    evidence = measure_texture(pose[None, None], look("bowl", pose), plain)
+    assert evidence.abs().max() < 1e-3
+
+
+def test_exposure_white_balance_and_light_hardly_matter() -> None:
+    model, pose = load("carton"), draw("carton", 2)[1]
+    scene = look("carton", pose)
+    first = float(measure_texture(pose[None, None], scene, model))
+    tinted = scene.measured_color * torch.tensor([0.9, 0.6, 0.5])[:, None, None]
+    second = float(measure_texture(pose[None, None], scene._replace(measured_color=tinted), model))
+    other = Lights(0.3, ((-0.6, 0.2, -0.8),), (0.8,))
+    third = float(measure_texture(pose[None, None], look("carton", pose, other), model))
+    assert first > 20
+    assert second == pytest.approx(first, rel=0.25)
+    assert third == pytest.approx(first, rel=0.35)
+
+
+def test_what_is_hidden_is_not_compared() -> None:
+    model, pose = load("carton"), draw("carton", 1)[0]
+    scene = look("carton", pose)
+    nothing = scene._replace(measured_depth=torch.full_like(scene.measured_depth, 0.1))
+    assert float(measure_texture(pose[None, None], nothing, model)) == 0
+    left = scene.measured_depth.clone()
+    left[..., W // 2 :] = 0
+    half = float(measure_texture(pose[None, None], scene._replace(measured_depth=left), model))
+    assert 0 < half < float(measure_texture(pose[None, None], scene, model))
+
+
+def test_particles_take_shares_of_the_turns_and_others_stay() -> None:
+    """Without any print each turn is as likely; a particle that is elsewhere is left alone."""
+    model, pose = load("carton"), draw("carton", 1)[0]
+    assert model.texture is not None
+    gray = torch.cat([model.texture[:, :6], torch.full_like(model.texture[:, 6:], 0.5)], dim=1)
+    model = model._replace(texture=gray)
+    turns, _ = list_turns(model)
+    given = believe(pose, 40)
+    given.poses[0, 0, :3, 3] += 1.0
+    out = turn(given, look("carton", pose), model)
+    assert torch.equal(out.poses[0, 0], given.poses[0, 0])
+    x, y, z = model.center.tolist()
+    space = PoseSpace((x, y, z), model.radius)
+    apart = space.distance(out.poses[0, 1:, None], (pose @ turns)[None])
+    assert apart.amin(1).max() < 1e-3
+    counts = apart.argmin(1).bincount(minlength=len(turns))
+    assert counts.min() >= 39 // len(turns) - 1
+
+
+def test_evidence_falls_with_the_angle() -> None:
+    model, pose = load("soup_can"), draw("soup_can", 4)[2]
+    turns, coarse = list_turns(model)
+    at = pose @ turns[coarse]
+    evidence = measure_texture(at[None], look("soup_can", pose), model)[0]
+    off = angle_between(at[:, :3, :3], pose[:3, :3])
+    assert evidence.argmax() == off.argmin()
+
+
+def test_turns_that_are_tried_first_lie_ten_degrees_apart() -> None:
+    turns, coarse = list_turns(load("soup_can"))
+    assert coarse[0] == 0
+    assert torch.allclose(turns[0], torch.eye(4))
+    R = turns[coarse][:, :3, :3]
+    angles = angle_between(R[:, None], R[None]) + 4 * torch.eye(len(R))
+    assert torch.rad2deg(angles.min()) > 9.8
+    assert 36 <= len(coarse) <= 80 < len(turns)
+
+
+def test_an_object_whose_shape_leaves_nothing_open_stays() -> None:
+    model, pose = load("mug"), draw("mug", 1)[0]
+    assert len(list_turns(model)[0]) == 1
+    given = believe(pose)
+    assert turn(given, look("mug", pose), model) is given
+
+
+def test_without_a_texture_it_is_refused_in_one_line() -> None:
+    model, pose = load("carton"), draw("carton", 1)[0]
+    with pytest.raises(UserError, match="carries no texture of 'carton'"):
+        turn(believe(pose), look("carton", pose), model._replace(texture=None))
+    with pytest.raises(UserError, match="keeps no color"):
+        turn(believe(pose), object(), model)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("settings", [{"learned_weight": -1}, {"pixels": 0}, {"sigma": 0}])
+def test_numbers_out_of_range(settings: dict[str, float]) -> None:
+    with pytest.raises(UserError, match="turns by texture need"):
+        TextureTurns(**settings)  # type: ignore[arg-type]
+
+
+def test_texture_is_that_of_the_mesh() -> None:
+    mesh = MeshStore("builtin").load("carton")
+    points, normals, color = np.split(sample_texture(mesh, 500), 3, axis=1)
+    low, high = mesh.bounds
+    assert (points > low - 1e-6).all()
+    assert (points < high + 1e-6).all()
+    assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-5
+    outward = (normals * (points - (low + high) / 2)).sum(1)
+    assert (outward > 0).all()
+    assert color.std() > 0.05
+    assert color.min() >= 0
+    assert color.max() <= 1
+
+
+def test_a_blur_keeps_what_is_flat_and_the_mean() -> None:
+    flat = torch.full((3, 20, 30), 0.4)
+    assert torch.allclose(blur(flat, 2.0), flat)
+    dot = torch.zeros(1, 41, 41)
+    dot[0, 20, 20] = 1
+    soft = blur(dot, 2.0)
+    assert float(soft.sum()) == pytest.approx(1, abs=1e-5)
+    assert float(soft.max()) == pytest.approx(1 / (2 * np.pi * 4), rel=0.05)
+
+
+def test_small_images_are_blurred_too() -> None:
+    assert blur(torch.rand(3, 2, 3), 5.0).shape == (3, 2, 3)
+
+
+def test_a_turn_between_those_that_are_tried_first_is_found() -> None:
+    """A turn by 7 degrees about a can's axis is found although no first turn is there."""
+    model, pose = load("soup_can"), draw("soup_can", 3)[1]
+    turns, _ = list_turns(model)
+    axis = turns[1, :3, :3]
+    generator = torch.stack(
+        [axis[2, 1] - axis[1, 2], axis[0, 2] - axis[2, 0], axis[1, 0] - axis[0, 1]]
+    )
+    about = generator / generator.norm() * np.deg2rad(-7)
+    off = torch.eye(4)
+    off[:3, :3] = exp_so3(about[None])[0]
+    off[:3, 3] = model.center - off[:3, :3] @ model.center
+    best = turn(believe(pose @ off), look("soup_can", pose), model).best[0]
+    assert torch.rad2deg(angle_between(best[:3, :3], pose[:3, :3])) < 3
