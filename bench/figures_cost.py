@@ -82,9 +82,8 @@ def main() -> None:
         data.prepare_data()
         data.setup("fit")
         checkpoint = read_checkpoint(known.checkpoint) if known.checkpoint else None
-        method = (
-            method_of(checkpoint) if checkpoint else build_method(recipe(job), data.object_model(0))
-        )
+        own = data.object_to_learn()
+        method = method_of(checkpoint) if checkpoint else build_method(recipe(job), own)
         # caches, fonts and compiled kernels: neither's to pay
         validate(method, data, looking(job, folder), folder)
         plain, drawn = [], []

@@ -53,7 +53,7 @@ def gradient(model: str, ablation: str, steps: int, more: Sequence[str]) -> floa
     data = build_data(job.cfg.data, "json")
     data.setup("fit")
     method = build_method(recipe(job))
-    method.set_object(data.object_model(0))
+    method.set_object(data.object_to_learn())
     batch = next(iter(data.train_dataloader()))
     method.training_step(batch, 0).backward()
     parts = [p.grad.double().norm() for p in method.net.parameters() if p.grad is not None]

@@ -37,7 +37,7 @@ def measure(job: Job, cache: str, workers: int, steps: int) -> tuple[float, floa
     data.setup("fit")
     ready = time.perf_counter() - began
     method, speed = build_method(recipe(job)), Speed()
-    method.set_object(data.object_model(0))
+    method.set_object(data.object_to_learn())
     brief = {"max_steps": steps, "limit_val_batches": 0, "log_every_n_steps": 2 * steps}
     trainer = make_trainer(OmegaConf.merge(job.cfg.trainer, brief), [speed])
     trainer.fit(method, datamodule=data)

@@ -73,7 +73,7 @@ def main() -> int:
     settings.data.augment, settings.data.limit_test = {}, options.images
     data = build_data(settings.data, "json")
     data.setup("test")
-    method.set_object(data.object_model(0))
+    method.set_object(data.object_to_learn())
     generator = torch.Generator().manual_seed(options.seed)
     found: dict[str, list[Tensor]] = {kind: [] for kind in KINDS}
     with torch.no_grad():

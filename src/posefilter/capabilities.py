@@ -15,6 +15,7 @@ from posefilter.errors import UserError
 Capability = Literal[
     "belief_maps",
     "candidates",
+    "color",
     "correspondences",
     "depth",
     "displacement",
@@ -41,6 +42,7 @@ Capabilities = tuple[Capability, ...]
 MEANINGS: Mapping[str, str] = {
     "belief_maps": "a training on maps of keypoints alone",
     "candidates": "scored candidate poses",
+    "color": "a method whose scenes keep the image's colors",
     "correspondences": "a training on dense object coordinates alone",
     "depth": "a method whose scenes keep the measured depth",
     "displacement": "particles with a learned displacement",

@@ -83,7 +83,7 @@ REFUSED = {
     ),
     "model=patch_pf filter/refine=rescore": (
         "filter/refine=rescore",
-        "choose filter/refine=icp or none",
+        "choose filter/refine=icp, icp_texture or none",
     ),
     "model=pose_pf model/proposals=none": (
         "filter/initialize=from_depth",

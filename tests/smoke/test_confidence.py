@@ -28,7 +28,7 @@ def save_untrained(words: list[str], path: Path) -> None:
     """Write the checkpoint of a method that has not been trained."""
     job = compose_job("train", HOME / "conf", words, path.parent)
     data = build_data(job.cfg.data, "json")
-    method = build_method(recipe(job), data.object_model(0), lightning=False)
+    method = build_method(recipe(job), data.object_to_learn(), lightning=False)
     content: dict[str, Any] = {"state_dict": method.state_dict(), "global_step": 0, "epoch": 0}
     method.on_save_checkpoint(content)
     torch.save(content, path)
@@ -207,7 +207,8 @@ def test_methods_in_image_space_are_calibrated_too(
     words += [f"absent={without}", "frames=12", f"out={out}", *QUIET]
     assert run_command("calibrate", HOME, words) == 0
     stored = torch.load(out, weights_only=True)["calibration"]
-    assert set(stored["features"]) == {"score", "concentration", "surface", "free_space"}
+    known = {"score", "concentration", "surface", "free_space", "texture"}
+    assert set(stored["features"]) == known
     rgb = min(tiny_scenes.rglob("*.left.jpg"))
     depth = rgb.with_name(rgb.name.replace(".left.jpg", ".left.depth.png"))
     color = cv2.cvtColor(cv2.imread(str(rgb)), cv2.COLOR_BGR2RGB)

@@ -166,7 +166,7 @@ class TextureTurns:
         UserError: A number is out of range.
     """
 
-    requires: ClassVar[Capabilities] = ("depth", "pose")
+    requires: ClassVar[Capabilities] = ("color", "depth", "pose")
 
     def __init__(
         self, learned_weight: float = 1.0, pixels: int = 256, sigma: float = 0.004
@@ -191,7 +191,7 @@ class TextureTurns:
         if not isinstance(scene, HasColor) or model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
-                "choose filter/refine=mean_shift_icp, icp or none"
+                "choose filter/refine=icp or none"
             )
         first = belief.best
         turns, first_tried = list_turns(model)

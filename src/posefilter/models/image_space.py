@@ -76,6 +76,7 @@ class ImageSpace(PoseEstimator):
     """
 
     provides: ClassVar[Capabilities] = (
+        "color",
         "depth",
         "displacement",
         "image_patches",

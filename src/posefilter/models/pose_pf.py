@@ -90,7 +90,7 @@ class PosePF(PoseParticles):
         **base: Arguments of `PoseEstimator`.
     """
 
-    provides: ClassVar[Capabilities] = ("depth", "pose", "pose_space", "score_poses")
+    provides: ClassVar[Capabilities] = ("color", "depth", "pose", "pose_space", "score_poses")
     # training rolls out no filter
     test_only_settings = ("filter", "train_filter", "pixels", "quasi_monte_carlo")
     # for comparing the scores of estimate and truth: image points, noise level [m]
