@@ -82,8 +82,10 @@ def main() -> None:
         data.prepare_data()
         data.setup("fit")
         checkpoint = read_checkpoint(known.checkpoint) if known.checkpoint else None
-        own = data.object_to_learn()
-        method = method_of(checkpoint) if checkpoint else build_method(recipe(job), own)
+        if checkpoint:
+            method = method_of(checkpoint)
+        else:
+            method = build_method(recipe(job), data.object_to_learn())
         # caches, fonts and compiled kernels: neither's to pay
         validate(method, data, looking(job, folder), folder)
         plain, drawn = [], []

@@ -132,7 +132,10 @@ class PoseFilter:
         turns[:, 3, 3] = 1
         some, size = turns[coarse], self.settings["diameter"]
         own = np.split(np.array(surface), 3, axis=1)
-        weigh = lambda x, still: compare(image, x, own, self.center, spacing, size, still)  # noqa: E731
+
+        def weigh(some_poses, still):
+            return compare(image, some_poses, own, self.center, spacing, size, still)
+
         learned = learned_weight * self.score(scene, best @ some, sigma, pixels, rng)
         total = learned + weigh(best @ some, len(some) > 12)
         if len(some) > 12:

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
+from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
 from posefilter.geometry.pose import origin_of, rotation_of, transform
@@ -266,10 +267,12 @@ def list_turns(model: ObjectModel) -> tuple[Tensor, Tensor]:
     turns = model.shape_symmetries
     if model.texture is None or turns is None:
         raise UserError(_MISSING.format(name=model.name))
-    angles, kept = _angles(turns, turns), [0]
-    for index in range(1, len(turns)):
-        if bool((angles[index, kept] > _APART - 0.1).all()):
-            kept.append(index)
+    apart, kept = _angles(turns, turns) > _APART - 0.1, []
+    free = torch.ones_like(apart[0])  # of those that are kept already
+    while free.any():
+        kept.append(int(free.int().argmax()))  # the first
+        free &= apart[:, kept[-1]]
+        free[kept[-1]] = False
     return turns, torch.tensor(kept, device=turns.device)
 
 
@@ -304,8 +307,6 @@ def _turn_particles(
     B, N = at.shape
     shift = torch.rand(B, 1, generator=generator, device=at.device)
     order = torch.rand(B, N, generator=generator, device=at.device).argsort(1)
-    position = (order + shift) / N
-    sums = log_posterior.double().softmax(1).cumsum(1).to(position)
-    drawn = torch.searchsorted(sums.contiguous(), position).clamp_max(len(turns) - 1)
+    drawn = inverse_cdf(log_posterior.log_softmax(1), (order + shift) / N)
     moved = poses @ back @ turns[drawn]
     return torch.where((nearest < _OWN * model.diameter)[..., None, None], moved, poses)
