@@ -5,7 +5,13 @@ import pytest
 import torch
 
 from posefilter.confidence.calibration import LIMIT, Calibration, Logistic, read_calibration
-from posefilter.confidence.fit import Frames, cross_validate, fit_calibration, fit_logistic
+from posefilter.confidence.fit import (
+    Frames,
+    cross_validate,
+    fit_calibration,
+    fit_choice,
+    fit_logistic,
+)
 from posefilter.confidence.verdicts import Costs, decide, score_verdicts
 from posefilter.errors import UserError
 from posefilter.metrics.confidence import calibration_error
@@ -147,3 +153,32 @@ def test_costs_are_positive() -> None:
     for wrong in (0, -1, float("inf"), float("nan"), True, "1"):
         with pytest.raises(UserError, match="cost_miss="):
             Costs(miss=wrong)  # type: ignore[arg-type]
+
+
+def test_the_choice_ranks_answers_by_what_makes_them_right() -> None:
+    """Objects that are absent count as wrong answers, and all parts share one standardization."""
+    frames = draw(20_000)
+    first = fit_choice(frames, "scenes")
+    values = {name: torch.from_numpy(frames.values[:, k]) for k, name in enumerate(NAMES)}
+    ranks = first.rank(values)
+    right = torch.from_numpy(frames.right)
+    assert float(ranks[right].mean()) > float(ranks[~right].mean()) + 0.3
+    x = frames.values
+    planted = sigmoid(2 * x[:, 1]) * sigmoid(x[:, [0, 2]] @ np.array([2.0, 1.0]) - 0.5)
+    assert float(np.corrcoef(planted, ranks.numpy())[0, 1]) > 0.85
+    last = fit_calibration(draw(300, seed=9), "scenes", first=first)
+    assert (last.center, last.scale, last.choice) == (first.center, first.scale, first.choice)
+    assert torch.equal(last.rank(values), ranks)
+    assert read_calibration(last.to_plain(), "x") == last
+
+
+def test_a_calibration_of_an_earlier_version_compares_no_answers() -> None:
+    plain = fit_calibration(draw(200), "scenes").to_plain()
+    del plain["choice"]
+    old = read_calibration(plain, "x")
+    assert old.choice is None
+    with pytest.raises(UserError, match="compares no answers"):
+        old.rank({name: torch.zeros(1) for name in NAMES})
+    negative = {"weights": [1.0, -1.0, 0.0], "bias": 0.0}
+    with pytest.raises(UserError, match=r"-1\.0.*choice"):
+        read_calibration({**plain, "choice": negative}, "x")

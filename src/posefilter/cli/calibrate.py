@@ -19,7 +19,14 @@ from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.confidence.calibration import Assessment, Calibration
-from posefilter.confidence.fit import FEWEST, Frames, cross_validate, fit_calibration, make_frames
+from posefilter.confidence.fit import (
+    FEWEST,
+    Frames,
+    cross_validate,
+    fit_calibration,
+    fit_choice,
+    make_frames,
+)
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.data.absent import hide_annotation
 from posefilter.data.dataset import FrameDataset
@@ -77,8 +84,7 @@ def calibrate(job: Job) -> None:
             f"{typed('generate', out='DIR', object=name, absent_share=1, frames=60)} meshes=...)"
         )
     shown = cfg.console != JSON
-    frames = collect_frames(method, [data.val_dataset], absent, shown)
-    calibration = learn(frames, data.source)
+    calibration = learn(method, [data.val_dataset], absent, data.source, shown)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, out)
     tell(job, method, calibration, out)
 
@@ -137,11 +143,33 @@ def is_right(method: PoseEstimator, best: torch.Tensor, truth: torch.Tensor) -> 
     return add_up_to_symmetry(best, truth, model.points, model.symmetries) < 0.1 * model.diameter
 
 
-def learn(frames: Frames, source: str) -> Calibration:
-    """Return the calibration of frames, with its quality on held-out parts of them."""
-    held = measure_quality(frames, cross_validate(frames))
+def learn(
+    method: PoseEstimator,
+    present: Sequence[FrameDataset],
+    absent: Sequence[FrameDataset],
+    source: str,
+    shown: bool = False,
+) -> Calibration:
+    """Return the calibration of a method, with its quality on held-out parts of the frames.
+
+    Frames are searched twice: first answers teach what answers are compared by; the answers that
+    are then chosen teach the probabilities.
+
+    Args:
+        method: A method with its weights; its calibration is replaced.
+        present: Frames with the object.
+        absent: Frames without.
+        source: The kind of data that they are of.
+        shown: Draw bars.
+    """
+    method.calibration, first = None, None
+    frames = collect_frames(method, present, absent, shown)
+    if method.filter.looks > 1:
+        method.calibration = first = fit_choice(frames, source)
+        frames = collect_frames(method, present, absent, shown)
+    held = measure_quality(frames, cross_validate(frames, first=first))
     quality = {key: float(held[key]) for key in _SHOWN if math.isfinite(held[key])}
-    return fit_calibration(frames, source, quality)
+    return fit_calibration(frames, source, quality, first)
 
 
 def measure_quality(frames: Frames, found: Assessment) -> dict[str, Any]:

@@ -138,7 +138,7 @@ def method_of(
     """
     recipe = checkpoint["recipe"]
     settings = changed(recipe["settings"], wanted or {})
-    same = settings == recipe["settings"]
+    same = _without_looks(settings) == _without_looks(recipe["settings"])
     recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
@@ -162,3 +162,13 @@ def method_of(
         else:
             method.calibration_note = "the checkpoint was calibrated for another filter"
     return method.eval()
+
+
+def _without_looks(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return settings without how often an image is searched: fewer answers to choose from are
+    judged by the same features.
+    """
+    own = settings.get("filter")
+    if not isinstance(own, dict):
+        return settings
+    return {**settings, "filter": {key: value for key, value in own.items() if key != "looks"}}

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.cli.build import build_data
-from posefilter.cli.calibrate import collect_frames, learn
+from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
 from posefilter.cli.console import JSON, ended, say, typed
@@ -286,7 +286,7 @@ def calibrate(work: Onboarding) -> None:
     method = method_of(checkpoint, lightning=False)
     method.to("cuda" if torch.cuda.is_available() else "cpu")
     shown = work.cfg.console != JSON
-    calibration = learn(collect_frames(method, [data.val_dataset], [without], shown), data.source)
+    calibration = learn(method, [data.val_dataset], [without], data.source, shown)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)
     work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
 

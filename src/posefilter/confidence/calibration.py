@@ -29,6 +29,7 @@ _RENAMED = {  # features, by their names in earlier versions
     "recognized": "mask_recall",
     "glimpsed": "top_objectness",
 }
+_LATER = {"conformal", "choice"}  # keys that earlier versions do not have
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 
 
@@ -60,6 +61,9 @@ class Calibration:
         source: The kind of data that they are of, such as `fat`.
         quality: Of held-out predictions on those frames, by cross-validation.
         conformal: What sets of poses with a guaranteed coverage go by; None: of an earlier version.
+        choice: Whether the first answer of a filter is right, object there or not, counted as if
+            half of them were; several answers to one image are compared by it. None: of an earlier
+            version, whose filter gives one answer.
     """
 
     features: tuple[str, ...]
@@ -71,6 +75,7 @@ class Calibration:
     source: str
     quality: Mapping[str, float]
     conformal: Conformal | None = None
+    choice: Logistic | None = None
 
     def assess(self, values: Mapping[str, Tensor]) -> Assessment:
         """Return the probabilities of estimates.
@@ -81,34 +86,51 @@ class Calibration:
         Raises:
             UserError: The method has no feature of a name that the calibration uses.
         """
-        missing = [name for name in self.features if name not in values]
-        if missing:
-            raise UserError(
-                f"calibration: is of another method, whose features have {missing[0]}; calibrate "
-                "the checkpoint again"
-            )
-        x = torch.stack([values[name].detach().double().cpu() for name in self.features], dim=-1)
-        return self.assess_features(x)
+        return self.assess_features(self._stack(values))
 
     def assess_features(self, x: Tensor) -> Assessment:
         """Return the probabilities of features (B, F), in the order of `features`.
 
         A feature that is not a number speaks against the estimate as far as any can.
         """
-        x = (x - x.new_tensor(self.center)) / x.new_tensor(self.scale)
-        x = x.nan_to_num(-LIMIT).clamp(-LIMIT, LIMIT)
-        presence, success = (
-            torch.sigmoid(x @ x.new_tensor(one.weights) + one.bias)
-            for one in (self.presence, self.success)
-        )
+        x = self._standardize(x)
+        presence, success = (_evaluate(one, x) for one in (self.presence, self.success))
         return Assessment(presence, presence * success)
+
+    def rank(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return what answers to one image are compared by, (B,) in [0, 1]; see `choice`.
+
+        Args:
+            values: Features (B,) by name.
+
+        Raises:
+            UserError: The calibration compares no answers, or is of another method.
+        """
+        if self.choice is None:
+            raise UserError("calibration: compares no answers; calibrate the checkpoint again")
+        return _evaluate(self.choice, self._standardize(self._stack(values)))
+
+    def _stack(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Return features (B, F), in the order of `features`."""
+        missing = [name for name in self.features if name not in values]
+        if missing:
+            raise UserError(
+                f"calibration: is of another method, whose features have {missing[0]}; calibrate "
+                "the checkpoint again"
+            )
+        return torch.stack([values[name].detach().double().cpu() for name in self.features], dim=-1)
+
+    def _standardize(self, x: Tensor) -> Tensor:
+        x = (x - x.new_tensor(self.center)) / x.new_tensor(self.scale)
+        return x.nan_to_num(-LIMIT).clamp(-LIMIT, LIMIT)
 
     def to_plain(self) -> dict[str, Any]:
         """Return it as dictionaries, lists, numbers and strings; `read_calibration` reads them."""
         plain = asdict(self)
-        for name in ("presence", "success"):
-            one: Logistic = getattr(self, name)
-            plain[name] = {"weights": list(one.weights), "bias": one.bias}
+        for name in ("presence", "success", "choice"):
+            one: Logistic | None = getattr(self, name)
+            if one is not None:
+                plain[name] = {"weights": list(one.weights), "bias": one.bias}
         if self.conformal is not None:
             scores = [list(own) for own in self.conformal.scores]
             edges, by = list(self.conformal.edges), self.conformal.by
@@ -116,6 +138,11 @@ class Calibration:
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
+
+
+def _evaluate(one: Logistic, x: Tensor) -> Tensor:
+    """Return the probability by a regression on standardized features.  (B, F) -> (B,)."""
+    return torch.sigmoid(x @ x.new_tensor(one.weights) + one.bias)
 
 
 def read_calibration(content: Any, said: str) -> Calibration:
@@ -137,7 +164,7 @@ def read_calibration(content: Any, said: str) -> Calibration:
 
 def _read(content: Any) -> Calibration:
     names = {field.name for field in fields(Calibration)}
-    if not isinstance(content, dict) or set(content) | {"conformal"} != names:
+    if not isinstance(content, dict) or set(content) | _LATER != names:
         raise ValueError(f"should hold {', '.join(sorted(names))}, nothing else")
     features = content["features"]
     good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
@@ -171,6 +198,7 @@ def _read(content: Any) -> Calibration:
         source,
         dict(zip(quality, numbers, strict=True)),
         _conformal(content.get("conformal")),
+        None if content.get("choice") is None else _logistic(content["choice"], count, "choice"),
     )
 
 

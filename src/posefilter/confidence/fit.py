@@ -54,8 +54,31 @@ def make_frames(
     return Frames(names, *parts)
 
 
+def fit_choice(frames: Frames, source: str) -> Calibration:
+    """Fit what answers to one image are compared by, to first answers.
+
+    Args:
+        frames: n frames, with the object and without, as `fit_calibration` takes them.
+        source: The kind of data that they are of.
+
+    Returns:
+        A calibration of first answers; `fit_calibration` makes that of the answers chosen by it.
+
+    Raises:
+        UserError: There are too few frames with the object, or without.
+    """
+    _check_counts(frames)
+    fitted = _fit(frames, source, {})
+    share = float(np.clip(frames.right.mean(), 0.05, 0.95))
+    balance = np.where(frames.right, 0.5 / share, 0.5 / (1 - share))
+    return replace(fitted, choice=fit_logistic(_standardize(frames, fitted), frames.right, balance))
+
+
 def fit_calibration(
-    frames: Frames, source: str, quality: Mapping[str, float] | None = None
+    frames: Frames,
+    source: str,
+    quality: Mapping[str, float] | None = None,
+    first: Calibration | None = None,
 ) -> Calibration:
     """Fit both regressions.
 
@@ -66,10 +89,23 @@ def fit_calibration(
         frames: n frames.
         source: The kind of data that they are of.
         quality: Of held-out predictions.
+        first: What the answers were chosen by, see `fit_choice`; features are standardized as it
+            does. None: they are first answers, and no others are searched for.
 
     Raises:
         UserError: There are too few frames with the object, or without.
     """
+    _check_counts(frames)
+    fitted = _fit(frames, source, quality or {}, first)
+    if frames.nonconformity is None:
+        return fitted
+    own = frames.there
+    held = cross_validate(frames, first=first).probability.numpy()[own]
+    sets = fit_conformal(frames.nonconformity[own], held, choose_edges(held), by="probability")
+    return replace(fitted, conformal=sets)
+
+
+def _check_counts(frames: Frames) -> None:
     for count, which in (
         (int(frames.there.sum()), "with"),
         (int((~frames.there).sum()), "without"),
@@ -78,37 +114,47 @@ def fit_calibration(
             raise UserError(
                 f"calibrate: {count} frames {which} the object; {FEWEST} are needed at least"
             )
-    fitted = _fit(frames, source, quality or {})
-    if frames.nonconformity is None:
-        return fitted
-    own = frames.there
-    held = cross_validate(frames).probability.numpy()[own]
-    sets = fit_conformal(frames.nonconformity[own], held, choose_edges(held), by="probability")
-    return replace(fitted, conformal=sets)
 
 
-def _fit(frames: Frames, source: str, quality: Mapping[str, float]) -> Calibration:
+def _fit(
+    frames: Frames,
+    source: str,
+    quality: Mapping[str, float],
+    first: Calibration | None = None,
+) -> Calibration:
     there, right = frames.there, frames.right
     counts = {
         "right": int(right.sum()),
         "wrong": int((there & ~right).sum()),
         "absent": int((~there).sum()),
     }
-    center = np.nanmean(frames.values, 0)
-    scale = np.nanstd(frames.values, 0).clip(1e-6)
-    x = np.nan_to_num((frames.values - center) / scale, nan=-LIMIT).clip(-LIMIT, LIMIT)
-    share = there.mean()
-    balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
-    return Calibration(
+    none = Logistic((0.0,) * len(frames.features), 0.0)
+    out = Calibration(
         frames.features,
-        tuple(center.tolist()),
-        tuple(scale.tolist()),
-        fit_logistic(x, there, balance),
-        fit_logistic(x[there], right[there]),
+        tuple(np.nanmean(frames.values, 0).tolist()),
+        tuple(np.nanstd(frames.values, 0).clip(1e-6).tolist()),
+        none,
+        none,
         counts,
         source,
         dict(quality),
     )
+    if first is not None:
+        out = replace(out, center=first.center, scale=first.scale, choice=first.choice)
+    x = _standardize(frames, out)
+    share = there.mean()
+    balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
+    return replace(
+        out,
+        presence=fit_logistic(x, there, balance),
+        success=fit_logistic(x[there], right[there]),
+    )
+
+
+def _standardize(frames: Frames, calibration: Calibration) -> np.ndarray:
+    """Return the features as a calibration standardizes them, (n, F)."""
+    x = (frames.values - np.array(calibration.center)) / np.array(calibration.scale)
+    return np.nan_to_num(x, nan=-LIMIT).clip(-LIMIT, LIMIT)
 
 
 def fit_logistic(
@@ -142,13 +188,16 @@ def fit_logistic(
     return Logistic(tuple(found[:-1].tolist()), float(found[-1]))
 
 
-def cross_validate(frames: Frames, folds: int = 5, seed: int = 0) -> Assessment:
+def cross_validate(
+    frames: Frames, folds: int = 5, seed: int = 0, first: Calibration | None = None
+) -> Assessment:
     """Return the probabilities of frames, each by a calibration that has not seen it.
 
     Args:
         frames: n frames.
         folds: Parts, each with its share of right, wrong and absent frames.
         seed: Of their shuffle.
+        first: As of `fit_calibration`.
     """
     rng = np.random.default_rng(seed)
     kind = frames.there.astype(int) + frames.right
@@ -161,7 +210,7 @@ def cross_validate(frames: Frames, folds: int = 5, seed: int = 0) -> Assessment:
         held = np.flatnonzero(fold == k)
         if not len(held):
             continue
-        part = _fit(frames.select(np.flatnonzero(fold != k)), "held_out", {})
+        part = _fit(frames.select(np.flatnonzero(fold != k)), "held_out", {}, first)
         found = part.assess_features(torch.from_numpy(frames.values[held]))
         presence[held], probability[held] = found
     return Assessment(presence, probability)

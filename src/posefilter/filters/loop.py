@@ -63,9 +63,11 @@ class ParticleFilter(nn.Module):
         estimate: Chooses one pose of the last particles.
         refine: Improves the estimate, or replaces the particles.
         first_particles: Number of particles at the first step; `particles` if None.
+        looks: How often an image is searched at most, while a calibrated answer is doubtful
+            (confidence/second_look.py); 1 to 3.
 
     Raises:
-        UserError: A number is below 1.
+        UserError: A number is below 1, or `looks` above 3.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class ParticleFilter(nn.Module):
         estimate: Estimate,
         refine: Refine,
         first_particles: int | None = None,
+        looks: int = 3,
     ) -> None:
         super().__init__()
         first = particles if first_particles is None else first_particles
@@ -88,7 +91,9 @@ class ParticleFilter(nn.Module):
                 f"filter: particles={particles}, first_particles={first_particles} and "
                 f"steps={steps} must be 1 or more"
             )
-        self.particles, self.steps = particles, steps
+        if not 1 <= looks <= 3:
+            raise UserError(f"filter.looks={looks}: 1, 2 or 3 is due")
+        self.particles, self.steps, self.looks = particles, steps, looks
         self.first_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate

@@ -4,20 +4,20 @@ import copy
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.second_look import Encoded, measure_worth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.filters.loop import ParticleFilter
 from posefilter.instances.pixels import blank, find_visible, keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import HasObjectness, Scene
+from posefilter.protocols import Scene
 from posefilter.types import Batch, Belief, Trace
 
-_CELLS = 6  # of the network, that a small object covers
 _LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
 
 
@@ -67,19 +67,6 @@ class _Job:
     searches: int = 0
     exhausted: bool = False
     seconds: float = field(default=0.0)
-
-
-class _Encoded:
-    """A method whose image is encoded already."""
-
-    def __init__(self, method: PoseEstimator, scene: Scene) -> None:
-        self._method, self._scene = method, scene
-
-    def encode(self, batch: Batch) -> Scene:
-        return self._scene
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._method, name)
 
 
 @torch.no_grad()
@@ -176,8 +163,8 @@ def _search(
     hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
     image, scene = _encode(job, hidden)
     one = None
-    if bool(image.depth.any()) and (job.searches == 1 or _look_left(scene) >= settings.worth):
-        trace = job.filter(image, _Encoded(job.method, scene), job.generator)
+    if bool(image.depth.any()) and (job.searches == 1 or measure_worth(scene) >= settings.worth):
+        trace = job.filter(image, Encoded(job.method, scene), job.generator)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         seen = find_visible(trace.belief.best, job.method.model, depth, K)[0] & ~hidden
         assessment = _assess(job.method, trace.belief, image, scene)
@@ -218,14 +205,6 @@ def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Scene]:
     """Return the image without some pixels, and as the method encodes it."""
     image = blank(job.batch, hidden[None]) if bool(hidden.any()) else job.batch
     return image, job.method.encode(image)
-
-
-def _look_left(scene: Scene) -> float:
-    """Return the mean probability of the surest cells of a scene; 1 where it has none."""
-    if not isinstance(scene, HasObjectness):
-        return 1.0
-    objectness = scene.objectness.flatten()
-    return float(objectness.topk(min(_CELLS, len(objectness))).values.mean())
 
 
 def _assess(method: PoseEstimator, belief: Belief, image: Batch, scene: Scene) -> Assessment | None:

@@ -21,6 +21,7 @@ from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth, measure_print
+from posefilter.confidence.second_look import look_again
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
@@ -331,12 +332,17 @@ class PoseEstimator(Module):
         return self._evaluate(batch, "test", batch_number)
 
     def predict_step(self, batch: Batch, batch_number: int) -> Trace:
-        """Run the filter; mask and pose of the batch are not used."""
-        return self.filter(batch, self, self.generator("predict", batch_number))
+        """Run the filter, again where its answer is doubtful (`look_again`); mask and pose of the
+        batch are not used.
+        """
+        return self._run(batch, self.generator("predict", batch_number))
+
+    def _run(self, batch: Batch, generator: Generator) -> Trace:
+        return look_again(self, self.filter(batch, self, generator), batch, generator)
 
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()
-        trace: Trace = self.filter(batch, self, self.generator(stage, batch_number))
+        trace = self._run(batch, self.generator(stage, batch_number))
         self.seconds_per_image.append((time.perf_counter() - start) / len(batch.rgb))
         self.update_metrics(trace, batch)
         return trace

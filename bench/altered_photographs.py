@@ -1,0 +1,183 @@
+"""Test checkpoints on photographs that were altered: camera rolled, zoomed, object occluded, color
+changed.
+
+    python bench/altered_photographs.py --frames DIR --meshes DIR [--images 24] [--only TEXT ...]
+        [--out ROWS.json] [--table] A.ckpt [B.ckpt ...]
+
+A folder of few photographs shows an object in few poses, in one place and one light. Each change is
+exact for RGB-D images, so that pose and intrinsics stay true: the camera turns about its optical
+axis, its focal length changes, a piece of another sequence's photograph is put in front, colors are
+those of another camera. Frames are evenly spaced over each sequence. What is drawn depends on the
+number of the image alone: all checkpoints of an object see the same images.
+
+`--table` writes the rows into the table of docs/results/photographs.md.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from held_out import PAGE, choose_points
+from marked import format_row, put_table, read_rows
+from numpy.random import Generator
+
+import posefilter
+from posefilter.data.augmentation import Augment, Compose, Draw, PasteOccluder, RollAndZoom
+from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.photometric import ColorResponse
+from posefilter.data.readers.registry import open_meshes, open_reader
+from posefilter.memory import keep_freed_memory
+from posefilter.metrics.errors import add, add_s, add_up_to_symmetry
+from posefilter.metrics.scores import auc
+
+VIEWS = 4  # photographs of a sequence that are altered
+SCRAPS = 6  # photographs of other sequences that occluders are cut from
+HEAD = ("object", "weights", "change", "images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
+HEAD += ("ADD-S < 0.1 d %", "found %", "found and wrong")
+
+_OCCLUDER = PasteOccluder(probability=1.0, size=(0.05, 0.16), keep=0.35)
+CHANGES: dict[str, Augment] = {
+    "none": Compose([]),
+    "roll": RollAndZoom(0.0, 1.0, (1.0, 1.0), 0.8),
+    "far": RollAndZoom(0.0, 0.0, (0.5, 0.8), 0.8),
+    "occluded": Compose([_OCCLUDER, _OCCLUDER]),
+    "color": ColorResponse(hue_deg=16, mixing=0.14, tint=0.14, gamma=0.35),
+    "all": Compose(
+        [
+            _OCCLUDER,
+            RollAndZoom(0.0, 1.0, (0.6, 1.3), 0.8),
+            ColorResponse(hue_deg=12, mixing=0.1, tint=0.1, gamma=0.25),
+        ]
+    ),
+}
+
+
+def choose_views(records: Sequence[FrameRecord], name: str) -> list[int]:
+    """Return evenly spaced records of an object, VIEWS of each of its sequences."""
+    groups: dict[str, list[int]] = {}
+    for i, record in enumerate(records):
+        if record.object == name:
+            groups.setdefault(record.group, []).append(i)
+    return [own[k * len(own) // VIEWS] for own in groups.values() for k in range(VIEWS)]
+
+
+def read_scraps(reader: Reader, records: Sequence[FrameRecord], group: str) -> list[Sample]:
+    """Return samples of other sequences than `group`."""
+    others = [i for i, record in enumerate(records) if record.group != group]
+    return [reader.read(i) for i in others[:: max(len(others) // SCRAPS, 1)]]
+
+
+def alter(
+    views: Sequence[tuple[Sample, Sequence[Sample]]], change: str, images: int
+) -> list[Sample]:
+    """Return altered photographs, in turn of each view; each comes with what to cut from."""
+
+    def draw_from(scraps: Sequence[Sample]) -> Draw:
+        def draw(rng: Generator) -> Sample:
+            return scraps[int(rng.integers(len(scraps)))]
+
+        return draw
+
+    out = []
+    for k in range(images):
+        view, scraps = views[k % len(views)]
+        rng = np.random.default_rng([k, 7])
+        out.append(CHANGES[change](view, draw_from(scraps), rng))
+    return out
+
+
+def test(
+    estimator: posefilter.Estimator, samples: Sequence[Sample], points: torch.Tensor
+) -> dict[str, Any]:
+    """Return the figures of one checkpoint on samples.  points (P, 3) [m]."""
+    results = [estimator.predict(s.rgb, s.depth, s.intrinsics) for s in samples]
+    poses = torch.from_numpy(np.stack([result.pose for result in results]))
+    truth = torch.from_numpy(np.stack([s.camera_from_object for s in samples])).double()
+    plain, symmetric = (f(poses, truth, points) for f in (add, add_s))
+    model = estimator.models[0]
+    least = 0.1 * model.diameter
+    nearest = add_up_to_symmetry(poses, truth, points, model.symmetries.double())
+    found = torch.tensor([result.verdict == "found" for result in results])
+    return {
+        "images": len(samples),
+        "add_auc": auc(plain),
+        "add_s_auc": auc(symmetric),
+        "add_recall": float((plain < least).double().mean()),
+        "add_s_recall": float((symmetric < least).double().mean()),
+        "found": float(found.double().mean()),
+        "found_wrong": int((found & (nearest >= least)).sum()),
+        "add_mm": (1000 * plain).tolist(),
+        "add_s_mm": (1000 * symmetric).tolist(),
+    }
+
+
+def make_line(row: dict[str, Any]) -> str:
+    """Return a row of the table."""
+    areas = [f"{row[key]:.1f}" for key in ("add_auc", "add_s_auc")]
+    shares = [f"{100 * row[key]:.0f}" for key in ("add_recall", "add_s_recall", "found")]
+    first = [row["object"], f"`{row['weights']}`", row["change"], str(row["images"])]
+    return format_row([*first, *areas, *shares, str(row["found_wrong"])])
+
+
+def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
+    """Put rows into the page's table: those of the same first cells are replaced, others stay."""
+    text = page.read_text()
+    lines = [*read_rows(text, "altered"), *map(make_line, rows)]
+    kept = {tuple(line.split(" | ")[:3]): line for line in lines}
+    order = list(CHANGES)
+    keys = sorted(kept, key=lambda key: (*key[:2], order.index(key[2])))
+    page.write_text(put_table(text, "altered", HEAD, (kept[key] for key in keys)))
+
+
+def main() -> int:
+    """Test the checkpoints on every kind of change."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("checkpoints", nargs="+")
+    parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
+    parser.add_argument("--meshes", required=True, help="its meshes")
+    parser.add_argument("--images", type=int, default=24, help="of each kind of change")
+    parser.add_argument("--only", nargs="+", default=list(CHANGES), choices=list(CHANGES))
+    parser.add_argument("--out", type=Path, help="a file that the rows are added to")
+    parser.add_argument("--table", action="store_true", help="write the rows into the page")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    keep_freed_memory()
+    points = choose_points(options.checkpoints)
+    meshes = open_meshes(options.meshes, None, "ycb_video", list(points))
+    reader = open_reader("ycb_video", options.frames, None, meshes)
+    records = reader.records()
+    rows = []
+    for checkpoint in options.checkpoints:
+        estimator = posefilter.load(checkpoint, device="cpu")
+        name = estimator.models[0].name
+        views = [
+            (reader.read(i), read_scraps(reader, records, records[i].group))
+            for i in choose_views(records, name)
+        ]
+        if not views:
+            print(f"{options.frames}: no photograph shows {name}", file=sys.stderr)
+            continue
+        path = Path(checkpoint)
+        weights = path.stem if path.parent.name != "checkpoints" else path.parents[1].name
+        for change in options.only:
+            samples = alter(views, change, len(views) if change == "none" else options.images)
+            tested = test(estimator, samples, points[name])
+            rows.append({"object": name, "weights": weights, "change": change, **tested})
+            print(make_line(rows[-1]), flush=True)
+    if options.out:
+        before = json.loads(options.out.read_text()) if options.out.exists() else []
+        options.out.write_text(json.dumps(before + rows, indent=1) + "\n")
+    if options.table:
+        write_table(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

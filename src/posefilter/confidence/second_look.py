@@ -1,0 +1,147 @@
+"""Search an image again while the answer is doubtful, and keep the one more probably right.
+
+A filter that has converged on a wrong mode does not come back from it: all its particles are there,
+and its likelihood prefers it. Two other searches may find the right one: of the image without what
+the first answer took for the object, and by other random draws. Which answer is right is then not
+asked of the likelihood, which has erred, but of a logistic regression on all that speaks for an
+answer: agreement of the particles, measured depth, print, and the network of object coordinates.
+"""
+
+from typing import Any, Protocol
+
+import torch
+from torch import Generator, Tensor
+
+from posefilter.confidence.calibration import Calibration
+from posefilter.filters.loop import ParticleFilter
+from posefilter.instances.pixels import blank, find_visible
+from posefilter.protocols import HasObjectness
+from posefilter.types import Batch, ObjectModel, Trace
+
+DOUBTFUL = 0.5  # rank below which an answer is doubtful
+_WORTH = 0.1  # mean probability of a network's surest cells, below which there is no more to find
+_CELLS = 6  # of the network, that a small object covers
+_LEAST_DEPTH = 0.01  # share of the pixels whose depth is known
+
+
+class Searcher(Protocol):
+    """A method with its filter and its calibration."""
+
+    calibration: Calibration | None
+    filter: ParticleFilter
+
+    @property
+    def model(self) -> ObjectModel:
+        """The object."""
+        ...
+
+    def encode(self, batch: Batch) -> Any:
+        """Encode images."""
+        ...
+
+    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+        """Return what speaks for each estimate, by name."""
+        ...
+
+
+class Encoded:
+    """A method whose images are encoded already."""
+
+    def __init__(self, method: Any, scene: Any) -> None:
+        self._method, self._scene = method, scene
+
+    def encode(self, batch: Batch) -> Any:
+        """Return the scene."""
+        return self._scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._method, name)
+
+
+def measure_worth(scene: Any) -> float:
+    """Return the mean probability of the surest cells of one image; 1 where it has none."""
+    if not isinstance(scene, HasObjectness):
+        return 1.0
+    objectness = scene.objectness.flatten()
+    return float(objectness.topk(min(_CELLS, len(objectness))).values.mean())
+
+
+@torch.no_grad()
+def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generator) -> Trace:
+    """Return the trace with each doubtful answer replaced by a better one, where one is found.
+
+    Args:
+        method: A method that was calibrated; any other's trace is returned as it is.
+        first: A finished run of its filter.
+        batch: Its B images; mask and pose are not used.
+        generator: Draws the other searches.
+
+    Returns:
+        The trace; of an image whose answer was replaced, of the search that found it. The scene
+        stays that of the whole images.
+    """
+    calibration, looks = method.calibration, method.filter.looks
+    if calibration is None or calibration.choice is None or looks < 2:
+        return first
+    ranks = calibration.rank(method.collect_features(first, batch))
+    trace = first
+    for row in (ranks < DOUBTFUL).nonzero()[:, 0].tolist():
+        own = Batch(*(x[row : row + 1] for x in batch))
+        found = _search(method, calibration, trace, row, float(ranks[row]), own, generator)
+        if found is not None:
+            trace = _put(trace, row, found)
+    return trace
+
+
+def _search(
+    method: Searcher,
+    calibration: Calibration,
+    first: Trace,
+    row: int,
+    rank: float,
+    image: Batch,
+    generator: Generator,
+) -> Trace | None:
+    """Return the best of the other searches of one image, None where the first is better."""
+    model, pose = method.model, first.belief.best[row : row + 1]
+    hidden = find_visible(pose, model, image.depth[0, 0], image.intrinsics[0])
+    best: Trace | None = None
+    whole = method.encode(image)
+    for part in (blank(image, hidden), image)[: method.filter.looks - 1]:
+        if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
+            continue
+        scene = whole if part is image else method.encode(part)
+        if measure_worth(scene) < _WORTH:
+            continue
+        found = method.filter(part, Encoded(method, scene), generator)
+        # what was hidden is there: judged by the whole image, as the first answer
+        found = found._replace(scene=whole)
+        value = float(calibration.rank(method.collect_features(found, image))[0])
+        if value > rank:
+            rank, best = value, found
+        if rank >= DOUBTFUL:
+            break
+    return best
+
+
+def _put(trace: Trace, row: int, found: Trace) -> Trace:
+    """Return a trace with the row of one image replaced by another trace's only one."""
+
+    def put(old: Any, new: Any) -> Any:
+        if isinstance(old, Tensor):
+            if old.dim() == 0:  # of no image
+                return old
+            out = old.clone()
+            out[row] = new[0]
+            return out
+        if isinstance(old, tuple):
+            pairs = [put(*pair) for pair in zip(old, new, strict=True)]
+            return type(old)(*pairs) if hasattr(old, "_fields") else tuple(pairs)
+        return old
+
+    return trace._replace(
+        particles=put(trace.particles, found.particles),
+        outputs=put(trace.outputs, found.outputs),
+        belief=put(trace.belief, found.belief),
+        log_evidence=put(trace.log_evidence, found.log_evidence),
+    )
