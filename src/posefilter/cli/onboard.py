@@ -180,7 +180,9 @@ class Onboarding:
 
     def rest(self, speed: Speed) -> float:
         """Return how long all that follows the training takes [s]."""
-        images = _VALIDATED + self.cfg.test_frames + 2 * min(_CALIBRATED, self.frames // 10)
+        # frames with and without the object, run twice; doubtful ones, once or twice more each
+        searches = 7 * min(_CALIBRATED, self.frames // 10)
+        images = _VALIDATED + self.cfg.test_frames + searches
         return float(speed.image * images + _REST)
 
 

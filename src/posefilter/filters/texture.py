@@ -30,6 +30,7 @@ _PIXELS = 2.0  # that a point needs for itself
 _LARGEST = 0.99  # correlation
 _SHIFT = 0.002  # [focal lengths], a pixel of the width at which networks see
 _MOST = 12  # turns that are compared with shifts
+_BESIDE = 5  # turns beside one that is tried first, and itself
 _APART = 10.0  # [degrees] between the turns that are tried first
 _MISSING = (
     "filter/refine: the checkpoint carries no texture of '{name}', as those of earlier versions; "
@@ -199,35 +200,64 @@ class TextureTurns:
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
-        coarse = turns[first_tried]
-        log_posterior = self._score(first, coarse, scene, method, model, generator)
-        chosen = coarse[log_posterior.argmax(1)]
+        log_posterior, tried = self._score(
+            first, turns, first_tried, scene, method, model, generator
+        )
+        chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
         best = self._turn_finely(first, chosen, turns, scene, model)
-        poses = _turn_particles(belief, coarse, log_posterior, model, generator)
+        poses = _turn_particles(belief, turns[first_tried], log_posterior, model, generator)
         return belief._replace(best=best, poses=poses)
 
     def _score(
         self,
         best: Tensor,
         turns: Tensor,
+        first_tried: Tensor,
         scene: HasColor,
         method: Method,
         model: ObjectModel,
         generator: Generator,
-    ) -> Tensor:
-        """Return the log-posterior of each turn of the estimates, (B, S)."""
-        poses = best[:, None] @ turns
+    ) -> tuple[Tensor, Tensor]:
+        """Score the turns that are tried first, the most promising at the best turn beside them.
+
+        Fine print does not correlate where a turn is some degrees off, and a can's is up to five
+        from the nearest that is tried first.
+
+        Args:
+            best: (B, 4, 4) the estimates.
+            turns: (S, 4, 4).
+            first_tried: (F,) indices of some of them.
+            scene: The images.
+            method: Scores poses, or not.
+            model: The object.
+            generator: Draws the image points.
+
+        Returns:
+            The log-posterior of each, (B, F), and the index of the turn that stands for it, (B, F).
+        """
+        poses = best[:, None] @ turns[first_tried]
         learned = torch.zeros_like(poses[..., 0, 0])
         if isinstance(method, ScoresPoses) and self.learned_weight:
             scores = method.score_poses(scene, poses, self.sigma, generator, self.pixels)
             learned = self.learned_weight * scores
-        if len(turns) <= _MOST:
-            return measure_texture(poses, scene, model) + learned
+        chosen = first_tried.expand(learned.shape).clone()
+        if len(first_tried) <= _MOST:
+            return measure_texture(poses, scene, model) + learned, chosen
         evidence = measure_texture(poses, scene, model, shift=0)
         top = (evidence + learned).topk(_MOST, dim=1).indices
         rows = torch.arange(len(best), device=best.device)[:, None]
-        evidence[rows, top] = measure_texture(poses[rows, top], scene, model)
-        return evidence + learned
+        angles = _angles(turns[first_tried], turns)
+        beside = angles.topk(_BESIDE, dim=1, largest=False).indices  # itself first
+        near = beside[top]  # (B, M, _BESIDE)
+        around = best[:, None, None] @ turns[near]
+        fine = measure_texture(around.flatten(1, 2), scene, model, shift=0).unflatten(
+            1, (_MOST, -1)
+        )
+        chosen[rows, top] = near.gather(2, fine.argmax(2, keepdim=True))[..., 0]
+        evidence[rows, top] = measure_texture(
+            best[:, None] @ turns[chosen[rows, top]], scene, model
+        )
+        return evidence + learned, chosen
 
     def _turn_finely(
         self, best: Tensor, chosen: Tensor, turns: Tensor, scene: HasColor, model: ObjectModel
