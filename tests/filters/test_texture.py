@@ -198,3 +198,20 @@ def test_a_turn_between_those_that_are_tried_first_is_found() -> None:
     off[:3, 3] = model.center - off[:3, :3] @ model.center
     best = turn(believe(pose @ off), look("soup_can", pose), model).best[0]
     assert torch.rad2deg(angle_between(best[:3, :3], pose[:3, :3])) < 3
+
+
+@pytest.mark.parametrize("degrees", [-5.0, -2.5, 5.0])
+def test_turns_are_compared_where_their_print_fits_best(
+    degrees: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the last step, the chosen turn is within a step of the truth, not within half of ten
+    degrees.
+    """
+    model, pose = load("soup_can"), draw("soup_can", 3)[1]
+    turns, first = list_turns(model)
+    angles = torch.rad2deg(angle_between(turns[:, :3, :3], torch.eye(3).expand(len(turns), 3, 3)))
+    beside = int((angles - abs(degrees)).abs().argmin())
+    assert beside not in first.tolist()
+    monkeypatch.setattr(TextureTurns, "_turn_finely", lambda self, best, chosen, *_: best @ chosen)
+    best = turn(believe(pose @ turns[beside]), look("soup_can", pose), model).best[0]
+    assert torch.rad2deg(angle_between(best[:3, :3], pose[:3, :3])) < 2.6
