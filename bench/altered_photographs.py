@@ -1,16 +1,15 @@
 """Test checkpoints on photographs that were altered: camera rolled, zoomed, object occluded, color
 changed.
 
-    python bench/altered_photographs.py --frames DIR --meshes DIR [--images 24] [--only TEXT ...]
-        [--out ROWS.json] [--table] A.ckpt [B.ckpt ...]
+    python bench/altered_photographs.py --frames DIR --meshes DIR [--images 24] [--out ROWS.json]
+        A.ckpt [B.ckpt ...] [--only CHANGE ...]
+    python bench/altered_photographs.py --table ROWS.json    # only writes rows into photographs.md
 
 A folder of few photographs shows an object in few poses, in one place and one light. Each change is
 exact for RGB-D images, so that pose and intrinsics stay true: the camera turns about its optical
 axis, its focal length changes, a piece of another sequence's photograph is put in front, colors are
 those of another camera. Frames are evenly spaced over each sequence. What is drawn depends on the
 number of the image alone: all checkpoints of an object see the same images.
-
-`--table` writes the rows into the table of docs/results/photographs.md.
 """
 
 import argparse
@@ -39,6 +38,7 @@ VIEWS = 4  # photographs of a sequence that are altered
 SCRAPS = 6  # photographs of other sequences that occluders are cut from
 HEAD = ("object", "weights", "change", "images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
 HEAD += ("ADD-S < 0.1 d %", "found %", "found and wrong")
+_AREAS = ("add_auc", "add_s_auc")
 
 _OCCLUDER = PasteOccluder(probability=1.0, size=(0.05, 0.16), keep=0.35)
 CHANGES: dict[str, Augment] = {
@@ -118,20 +118,31 @@ def test(
 
 def make_line(row: dict[str, Any]) -> str:
     """Return a row of the table."""
-    areas = [f"{row[key]:.1f}" for key in ("add_auc", "add_s_auc")]
+    areas = [f"{row[key]:.1f}" for key in _AREAS]
     shares = [f"{100 * row[key]:.0f}" for key in ("add_recall", "add_s_recall", "found")]
     first = [row["object"], f"`{row['weights']}`", row["change"], str(row["images"])]
     return format_row([*first, *areas, *shares, str(row["found_wrong"])])
 
 
+def make_wide_line(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a row of the page's table: one file's figures for every change."""
+    cells = [rows[0]["object"], rows[0]["weights"]]
+    for change in CHANGES:
+        own = [row for row in rows if row["change"] == change]
+        cells.append(" / ".join(f"{own[-1][key]:.1f}" for key in _AREAS) if own else "–")
+    found = sum(row["found_wrong"] for row in rows), sum(row["images"] for row in rows)
+    return format_row([*cells, f"{found[0]} of {found[1]}"])
+
+
 def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
-    """Put rows into the page's table: those of the same first cells are replaced, others stay."""
-    text = page.read_text()
-    lines = [*read_rows(text, "altered"), *map(make_line, rows)]
-    kept = {tuple(line.split(" | ")[:3]): line for line in lines}
-    order = list(CHANGES)
-    keys = sorted(kept, key=lambda key: (*key[:2], order.index(key[2])))
-    page.write_text(put_table(text, "altered", HEAD, (kept[key] for key in keys)))
+    """Put rows into the page's table: those of the same object and weights are replaced."""
+    text, files = page.read_text(), dict[tuple[str, str], list[dict[str, Any]]]()
+    for row in rows:
+        files.setdefault((row["object"], row["weights"]), []).append(row)
+    lines = [*read_rows(text, "altered"), *map(make_wide_line, files.values())]
+    kept = {tuple(line.split(" | ")[:2]): line for line in lines}
+    head = ("object", "weights", *CHANGES, "found and wrong")
+    page.write_text(put_table(text, "altered", head, (kept[key] for key in sorted(kept))))
 
 
 def main() -> int:
@@ -139,14 +150,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("checkpoints", nargs="+")
-    parser.add_argument("--frames", required=True, help="a folder of YCB-Video")
-    parser.add_argument("--meshes", required=True, help="its meshes")
+    parser.add_argument("checkpoints", nargs="*")
+    parser.add_argument("--frames", help="a folder of YCB-Video")
+    parser.add_argument("--meshes", help="its meshes")
     parser.add_argument("--images", type=int, default=24, help="of each kind of change")
     parser.add_argument("--only", nargs="+", default=list(CHANGES), choices=list(CHANGES))
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
-    parser.add_argument("--table", action="store_true", help="write the rows into the page")
+    parser.add_argument("--table", type=Path, help="a file of rows to write into the page")
     options = parser.parse_args()
+    if options.table:
+        write_table(json.loads(options.table.read_text()))
+        return 0
+    if not (options.frames and options.meshes and options.checkpoints):
+        parser.error("--frames, --meshes and a checkpoint are needed")
     torch.set_num_threads(1)
     keep_freed_memory()
     points = choose_points(options.checkpoints)
@@ -174,8 +190,6 @@ def main() -> int:
     if options.out:
         before = json.loads(options.out.read_text()) if options.out.exists() else []
         options.out.write_text(json.dumps(before + rows, indent=1) + "\n")
-    if options.table:
-        write_table(rows)
     return 0
 
 

@@ -208,6 +208,9 @@ def plan() -> list[Run]:
         ("foam", foam, 1600),
     ]
     judged += [shipped(f"{name}_u", *rest)._replace(scenes=THIRD) for name, *rest in third]
+    # after turns by texture
+    fourth = [("sugar", sugar, 3000), ("mug", mug, 2000), ("soup", soup, 1500)]
+    judged += [shipped(f"{name}_v", *rest)._replace(scenes=THIRD) for name, *rest in fourth]
     return [*map(_without_surface, earlier), *judged]
 
 

@@ -1,0 +1,88 @@
+"""The bench of altered photographs: changes are exact, the same for all files, and rows stay."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from posefilter.data.frames import Sample
+
+
+@pytest.fixture
+def altered(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("bench/altered_photographs.py")
+
+
+def make_sample(value: int) -> Sample:
+    """Return a square of 60 pixels at 1 m before a wall at 2 m."""
+    rgb = np.full((120, 160, 3), value, dtype=np.uint8)
+    depth, mask = np.full((120, 160), 2.0, dtype=np.float32), np.zeros((120, 160), dtype=bool)
+    mask[30:90, 50:110] = True
+    depth[mask] = 1.0
+    K = np.array([[160, 0, 79.5], [0, 160, 59.5], [0, 0, 1]], dtype=np.float32)
+    pose = np.eye(4, dtype=np.float32)
+    pose[2, 3] = 1.0
+    return Sample(rgb, depth, mask, K, pose, 0, 0, 1.0)
+
+
+def test_views_are_spread_over_each_sequence(altered: ModuleType) -> None:
+    names = ["a"] * 8 + ["b"] * 4
+    records = [SimpleNamespace(object=name, group="0001") for name in names]
+    records += [SimpleNamespace(object="a", group="0002")] * 4
+    assert altered.choose_views(records, "a") == [0, 2, 4, 6, 12, 13, 14, 15]
+    assert altered.choose_views(records, "c") == []
+
+
+@pytest.mark.parametrize("change", ["none", "roll", "far", "occluded", "color", "all"])
+def test_a_change_keeps_the_pose_true(altered: ModuleType, change: str) -> None:
+    """The object's center stays where the pose and the intrinsics put it."""
+    views = [(make_sample(90), [make_sample(200)])]
+    samples = altered.alter(views, change, 6)
+    again = altered.alter(views, change, 6)
+    for one, same in zip(samples, again, strict=True):
+        assert np.array_equal(one.rgb, same.rgb)
+        assert np.array_equal(one.depth, same.depth)
+        if change in ("roll", "far", "none"):
+            u, v = np.argwhere(one.mask).mean(0)[::-1]
+            center = one.intrinsics @ one.camera_from_object[:3, 3]
+            assert np.allclose((u, v), center[:2] / center[2], atol=1.0)
+            assert np.median(one.depth[one.mask]) == pytest.approx(1.0)
+    first = next((one for one in samples if one.mask.sum() < views[0][0].mask.sum()), samples[0])
+    changed = {
+        "rgb": not np.array_equal(first.rgb, views[0][0].rgb),
+        "depth": not np.array_equal(first.depth, views[0][0].depth),
+    }
+    assert changed["depth"] == (change not in ("none", "color"))
+    if change == "color":
+        assert changed["rgb"]
+    if change == "occluded":
+        assert 0 < first.mask.sum() < views[0][0].mask.sum()
+        hidden = views[0][0].mask & ~first.mask
+        assert (first.depth[hidden] < 1.0).all()
+
+
+def test_a_file_has_one_row_and_others_stay(altered: ModuleType, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("x\n<!-- table: altered -->\n<!-- end -->\ny\n")
+
+    def row(name: str, change: str, area: float) -> dict[str, object]:
+        return {
+            "object": name,
+            "weights": "w",
+            "change": change,
+            "images": 4,
+            "add_auc": area,
+            "add_s_auc": area + 1,
+            "found_wrong": 1,
+        }
+
+    altered.write_table([row("b", "none", 50.0), row("b", "all", 40.0)], page)
+    altered.write_table([row("a", "none", 60.0)], page)
+    altered.write_table([row("b", "none", 70.0)], page)
+    lines = [line for line in page.read_text().splitlines() if line.startswith(("| a", "| b"))]
+    assert lines[0].startswith("| a | w | 60.0 / 61.0 | – |")
+    assert lines[1].startswith("| b | w | 70.0 / 71.0 | – |")
+    assert lines[1].endswith("| 1 of 4 |")
+    assert len(lines) == 2
