@@ -172,3 +172,8 @@ def test_where_the_network_sees_nothing_there_is_nothing_to_find() -> None:
     assert measure_worth(SimpleNamespace(objectness=sure)) == pytest.approx(0.9)
     assert measure_worth(SimpleNamespace(objectness=blind)) == 0
     assert measure_worth(torch.zeros(1)) == 1
+
+
+def test_an_answer_that_is_hardly_better_does_not_replace_the_first() -> None:
+    _, last = run(Toy(), draw([[(5, 5, 1.0, 0.2), (40, 30, 0.8, 0.23)]]))
+    assert places(last) == [(5, 5)]

@@ -7,6 +7,7 @@ asked of the likelihood, which has erred, but of a logistic regression on all th
 answer: agreement of the particles, measured depth, print, and the network of object coordinates.
 """
 
+import math
 from typing import Any, Protocol
 
 import torch
@@ -19,6 +20,8 @@ from posefilter.protocols import HasObjectness
 from posefilter.types import Batch, ObjectModel, Trace
 
 DOUBTFUL = 0.5  # rank below which an answer is doubtful
+MARGIN = 1.0  # [nat] of the log-odds by which another answer must be better: the first has more
+# often been right, and without a margin a tie would be decided by noise
 _WORTH = 0.1  # mean probability of a network's surest cells, below which there is no more to find
 _CELLS = 6  # of the network, that a small object covers
 _LEAST_DEPTH = 0.01  # share of the pixels whose depth is known
@@ -106,6 +109,8 @@ def _search(
     model, pose = method.model, first.belief.best[row : row + 1]
     hidden = find_visible(pose, model, image.depth[0, 0], image.intrinsics[0])
     best: Trace | None = None
+    odds = rank / max(1 - rank, 1e-9) * math.exp(MARGIN)
+    least = odds / (1 + odds)  # rank that another answer must exceed
     whole = method.encode(image)
     for part in (blank(image, hidden), image)[: method.filter.looks - 1]:
         if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
@@ -117,9 +122,9 @@ def _search(
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(scene=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])
-        if value > rank:
-            rank, best = value, found
-        if rank >= DOUBTFUL:
+        if value > least:
+            least, best = value, found
+        if value >= max(DOUBTFUL, least):
             break
     return best
 
