@@ -6,10 +6,11 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Generator, Tensor
 
+from posefilter.confidence.visible_pixels import blank, find_visible, lie_in_hull
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
-from posefilter.instances.pixels import blank, find_visible, keep_pixels, lie_in_hull, resize_mask
+from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore, object_model
 from posefilter.rendering.embree import render_depth

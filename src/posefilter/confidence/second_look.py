@@ -14,8 +14,8 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Calibration
+from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
-from posefilter.instances.pixels import blank, find_visible
 from posefilter.protocols import HasObjectness
 from posefilter.types import Batch, ObjectModel, Trace
 

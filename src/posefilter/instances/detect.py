@@ -12,8 +12,9 @@ from torch import Generator, Tensor
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.second_look import Encoded, measure_worth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
+from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
-from posefilter.instances.pixels import blank, find_visible, keep_pixels, resize_mask
+from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
 from posefilter.protocols import Scene
 from posefilter.types import Batch, Belief, Trace
