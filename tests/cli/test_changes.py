@@ -45,3 +45,9 @@ def test_one_of_a_list_is_changed_and_the_others_stay(tmp_path: Path) -> None:
 def test_what_is_not_there_is_named(typed: str, told: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=told):
         change(typed, tmp_path)
+
+
+def test_a_setting_that_earlier_recipes_leave_out_is_taken(tmp_path: Path) -> None:
+    assert change("filter.looks=1", tmp_path)["filter"]["looks"] == 1
+    with pytest.raises(UserError, match="filter.look: the checkpoint's"):
+        change("filter.look=1", tmp_path)

@@ -438,3 +438,14 @@ def test_what_is_no_seed_is_refused_in_one_line(small: posefilter.Estimator, see
         small.predict(*read_scene(), seed=seed)  # type: ignore[arg-type]
     with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):
         posefilter.Tracker(small, seed=seed)  # type: ignore[arg-type]
+
+
+def test_fewer_looks_keep_the_calibration() -> None:
+    rgb, depth, K = read_scene()
+    once = posefilter.load("003_cracker_box", overrides=["filter.looks=1"], device="cpu")
+    result = once.predict(rgb, depth, K)
+    assert once.methods[0].filter.looks == 1
+    assert result.probability is not None
+    assert 0 <= result.probability <= result.presence
+    with pytest.raises(posefilter.UserError, match=r"filter\.looks=4: 1, 2 or 3"):
+        posefilter.load("003_cracker_box", overrides=["filter.looks=4"], device="cpu")

@@ -9,6 +9,7 @@ from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
 SECTIONS = ("filter", "model")
+_LATER = ("filter.looks",)  # settings that recipes of earlier versions leave out
 LOOSE = ("evaluate", "predict", "track", "convert_bag", "export", "calibrate")
 
 
@@ -53,6 +54,9 @@ def _merge(old: dict[str, Any], new: dict[str, Any], where: str) -> dict[str, An
     for key, value in new.items():
         place = f"{where}.{key}" if where else key
         if key not in merged:
+            if place in _LATER:
+                merged[key] = value
+                continue
             section = where or "method"
             raise UserError(
                 f"{place}: the checkpoint's {section} has no such setting{hint(key, merged)}"
