@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from held_out import PAGE, choose_points
+from held_out import PAGE, choose_points, name_weights
 from marked import format_row, put_table, read_rows
 from numpy.random import Generator
 
@@ -180,8 +180,7 @@ def main() -> int:
         if not views:
             print(f"{options.frames}: no photograph shows {name}", file=sys.stderr)
             continue
-        path = Path(checkpoint)
-        weights = path.stem if path.parent.name != "checkpoints" else path.parents[1].name
+        weights = name_weights(checkpoint)
         for change in options.only:
             samples = alter(views, change, len(views) if change == "none" else options.images)
             tested = test(estimator, samples, points[name])

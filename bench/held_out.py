@@ -110,6 +110,12 @@ def choose_points(checkpoints: Sequence[str]) -> dict[str, torch.Tensor]:
     return out
 
 
+def name_weights(checkpoint: str) -> str:
+    """Return what tables call a checkpoint: its run, or the file by itself."""
+    path = Path(checkpoint)
+    return path.stem if path.parent.name != "checkpoints" else path.parents[1].name
+
+
 def test(
     checkpoint: str, frames: Sequence[tuple[str, Sample]], points: torch.Tensor
 ) -> dict[str, Any]:
@@ -122,11 +128,9 @@ def test(
     scenes = [scene for scene, _ in frames]
     plain, symmetric = (f(poses, truth, points) for f in (add, add_s))
     recall = [float((e < 0.1 * model.diameter).double().mean()) for e in (plain, symmetric)]
-    path = Path(checkpoint)
-    name = path.stem if path.parent.name != "checkpoints" else path.parents[1].name
     return {
         "object": model.name,
-        "weights": name,
+        "weights": name_weights(checkpoint),
         "images": len(frames),
         "scenes": len(set(scenes)),
         "add_auc": auc(plain),
