@@ -138,10 +138,15 @@ class PoseFilter:
 
         learned = learned_weight * self.score(scene, best @ some, sigma, pixels, rng)
         total = learned + weigh(best @ some, len(some) > 12)
-        if len(some) > 12:
+        tried = np.array(coarse)
+        if len(some) > 12:  # the best are compared at the best turn beside each
             top = np.argsort(-total)[:12]
-            total[top] = learned[top] + weigh(best @ some[top], False)
-        chosen = some[total.argmax()]
+            trace = np.einsum("sij,tij->st", some[top, :3, :3], turns[:, :3, :3])
+            beside = np.argsort(-trace, axis=1)[:, :5]
+            fine = weigh((best @ turns[beside]).reshape(-1, 4, 4), True).reshape(12, 5)
+            tried[top] = beside[np.arange(12), fine.argmax(1)]
+            total[top] = learned[top] + weigh(best @ turns[tried[top]], False)
+        chosen = turns[tried[total.argmax()]]
         cosine = (np.einsum("sij,ij->s", turns[:, :3, :3], chosen[:3, :3]) - 1) / 2
         near = best @ turns[np.degrees(np.arccos(cosine.clip(-1, 1))) < 10]
         found = near[weigh(near, False).argmax()] if len(near) > 1 else best @ chosen
