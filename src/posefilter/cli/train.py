@@ -165,15 +165,21 @@ def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
     return method.compute_metrics()
 
 
-def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[str, Any]:
-    """Write metrics.json, print the table, and say what may be typed next; return the metrics."""
+def finish(
+    run: Run, training: dict[str, Any], results: dict[str, Any], checkpoint: Path | None = None
+) -> dict[str, Any]:
+    """Write metrics.json, print the table, and say what may be typed next; return the metrics.
+
+    checkpoint: What was tested; None for the run's best.
+    """
     job, file = run.job, run.job.folder / "metrics.json"
-    metrics = record(results, job, run.data.describe(), run.best) | {"training": training}
+    tested = checkpoint or run.best
+    metrics = record(results, job, run.data.describe(), tested) | {"training": training}
     if is_follower():
         return metrics
     write_json(file, metrics)
     report = typed("report", run=job.folder)
-    evaluate = typed("evaluate", checkpoint=run.best, **places(job), **plugins(job))
+    evaluate = typed("evaluate", checkpoint=tested, **places(job), **plugins(job))
     inside = Path("outputs").resolve() in job.folder.resolve().parents
     everything = "tensorboard --logdir outputs" if is_installed() else "make board"
     board = everything if inside else f"tensorboard --logdir {shlex.quote(str(job.folder))}"
@@ -182,7 +188,7 @@ def finish(run: Run, training: dict[str, Any], results: dict[str, Any]) -> dict[
         f"{job.choices['model']}, loss {job.choices['loss']}",
         job.cfg.console,
         "trained",
-        {"run": job.folder, "checkpoint": run.best, "metrics": file},
+        {"run": job.folder, "checkpoint": tested, "metrics": file},
         [] if job.swept else [report, evaluate, board],
     )
     return metrics
