@@ -111,7 +111,9 @@ def _search(
     best: Trace | None = None
     odds = rank / max(1 - rank, 1e-9) * math.exp(MARGIN)
     least = odds / (1 + odds)  # rank that another answer must exceed
-    whole = method.encode(image)
+    # of a single image, its first search has encoded it
+    known = first.scene is not None and len(first.belief.best) == 1
+    whole = first.scene if known else method.encode(image)
     for part in (blank(image, hidden), image)[: method.filter.looks - 1]:
         if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
             continue
