@@ -46,7 +46,7 @@ from posefilter.report.onboarding_page import make_onboarding_page
 RECORD = "onboarding.json"
 _SPEED = ("steps", "seconds_per_step", "seconds_per_image")  # known once the training begins
 FOUND = {**dict.fromkeys(_SPEED, NUMBER), "concerns": [TEXT], "facts": {}, "training": {}}
-_FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 40, 200, 2000
+_FRAMES_A_MINUTE, _FEWEST_FRAMES, _MOST_FRAMES = 100, 200, 4000
 _FEWEST_STEPS, _MOST_STEPS = 100, 8000
 # Rendered, at most, as those in which enough of the object is seen are fewer.
 _VAL_FRAMES, _TEST_FRAMES = 90, 120
