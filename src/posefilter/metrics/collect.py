@@ -14,7 +14,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s
 from posefilter.metrics.scores import summarize
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 
 def concat_state(state: Any) -> Tensor:
@@ -164,7 +164,7 @@ class BeliefQuality(Rows):
         self.models = list(models)
         self.points = [subsample(model.points, points) for model in models]
 
-    def update(self, belief: Belief, truth: Tensor, object_id: Tensor | None = None) -> None:
+    def update(self, belief: BeliefBatch, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate beliefs.
 
         Args:
