@@ -95,8 +95,8 @@ def test_the_collected_block() -> None:
     assert found["mass_01d"] == pytest.approx(1, abs=1e-3)
     assert found["mass_2cm"] == pytest.approx(1, abs=1e-3)
     assert found["rank"] < 0.1  # the truth is in the very middle of each
-    assert found["coverage_50"] == found["coverage_90"] == 100
+    assert found["distance_coverage_50"] == found["distance_coverage_90"] == 100
     metric.reset()
     metric.update(belief, truth.roll(1, 0))
     assert metric.compute()["mass_2cm"] == 0
-    assert metric.compute()["coverage_90"] == 0
+    assert metric.compute()["distance_coverage_90"] == 0

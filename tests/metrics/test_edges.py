@@ -318,11 +318,11 @@ def test_coverage_counts_ranks_up_to_its_level() -> None:
     metric.update(belief, torch.eye(4)[None])
     inside = metric.compute()
     assert inside["rank"] <= 0.5
-    assert (inside["coverage_50"], inside["coverage_90"]) == (100, 100)
+    assert (inside["distance_coverage_50"], inside["distance_coverage_90"]) == (100, 100)
     outside = torch.eye(4)[None].clone()
     outside[0, 0, 3] = 3.0
     metric.update(belief, outside)
-    assert (metric.compute()["coverage_50"], metric.compute()["coverage_90"]) == (
+    assert (metric.compute()["distance_coverage_50"], metric.compute()["distance_coverage_90"]) == (
         50,
         50,
     )
