@@ -99,7 +99,7 @@ def test(
     poses = torch.from_numpy(np.stack([result.pose for result in results]))
     truth = torch.from_numpy(np.stack([s.camera_from_object for s in samples])).double()
     plain, symmetric = (f(poses, truth, points) for f in (add, add_s))
-    model = estimator.models[0]
+    model = estimator.object_models[0]
     least = 0.1 * model.diameter
     nearest = add_up_to_symmetry(poses, truth, points, model.symmetries.double())
     found = torch.tensor([result.verdict == "found" for result in results])
@@ -172,7 +172,7 @@ def main() -> int:
     rows = []
     for checkpoint in options.checkpoints:
         estimator = posefilter.load(checkpoint, device="cpu")
-        name = estimator.models[0].name
+        name = estimator.object_models[0].name
         views = [
             (reader.read(i), read_scraps(reader, records, records[i].group))
             for i in choose_views(records, name)

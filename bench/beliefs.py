@@ -28,7 +28,7 @@ from posefilter.data.loaders import make_loader
 from posefilter.filters.importance import ImportanceSampling
 from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Belief
+from posefilter.types import Batch, BeliefBatch
 
 HOME = Path(__file__).parents[1]
 SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
@@ -38,8 +38,8 @@ HEAD = ("variant", "frames", *(f"{level} %" for level in SHOWN), "log density", 
 
 
 def list_variants(
-    belief: Belief, scene: Any, method: PoseEstimator, batch_number: int, options: Any
-) -> dict[str, Belief]:
+    belief: BeliefBatch, scene: Any, method: PoseEstimator, batch_number: int, options: Any
+) -> dict[str, BeliefBatch]:
     """Return the beliefs to compare, by name."""
     out = {}
     for power in POWERS:

@@ -92,7 +92,7 @@ def list_images(reader: Reader, every: int) -> list[list[int]]:
 def is_right(result: Result, sample: Sample) -> bool:
     """Return whether a pose is within 0.1 diameters (ADD, up to symmetry)."""
     truth = torch.from_numpy(sample.camera_from_object).double()[None]
-    model = result.model
+    model = result.object_model
     pose, symmetries = torch.from_numpy(result.pose)[None], model.symmetries.double()
     return bool(add_up_to_symmetry(pose, truth, model.points, symmetries) < 0.1 * model.diameter)
 

@@ -57,7 +57,7 @@ def make_method(name: str) -> PoseEstimator:
     typed = [f"model={name}", "variant=working", "filter/estimate=argmax", "filter/refine=none"]
     job = compose_job("train", HOME / "conf", typed, Path())
     torch.manual_seed(0)
-    model = posefilter.load("003_cracker_box", device="cpu").models[0]
+    model = posefilter.load("003_cracker_box", device="cpu").object_models[0]
     return build_method(recipe(job), model, lightning=False).eval()
 
 

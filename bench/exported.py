@@ -42,7 +42,7 @@ def main() -> None:
 
     torch.set_num_threads(1)
     estimator = posefilter.load(typed.checkpoint, device="cpu")
-    (model,) = estimator.models
+    (model,) = estimator.object_models
     meshes = open_meshes(typed.meshes, 1.0, "ycb_video", [model.name])
     reader = open_reader("ycb_video", typed.frames, None, meshes, "raise")
     exported = PoseFilter(typed.folder)

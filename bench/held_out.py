@@ -104,7 +104,7 @@ def choose_points(checkpoints: Sequence[str]) -> dict[str, torch.Tensor]:
     """Return each object's surface points, of the file that carries the most, (P, 3) [m]."""
     out: dict[str, torch.Tensor] = {}
     for checkpoint in checkpoints:
-        model = posefilter.load(checkpoint, device="cpu").models[0]
+        model = posefilter.load(checkpoint, device="cpu").object_models[0]
         if len(model.points) > len(out.get(model.name, ())):
             out[model.name] = model.points.double()
     return out
@@ -121,7 +121,7 @@ def test(
 ) -> dict[str, Any]:
     """Return the row of one checkpoint.  points (P, 3) [m]."""
     estimator = posefilter.load(checkpoint, device="cpu")
-    model = estimator.models[0]
+    model = estimator.object_models[0]
     results = [estimator.predict(s.rgb, s.depth, s.intrinsics) for _, s in frames]
     poses = torch.from_numpy(np.stack([result.pose for result in results]))
     truth = torch.from_numpy(np.stack([s.camera_from_object for _, s in frames])).double()

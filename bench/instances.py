@@ -56,7 +56,7 @@ def measure_errors(results: list[Any], truths: list[np.ndarray]) -> np.ndarray:
     """Return the ADD of each result against each truth, in diameters, (R, T)."""
     out = np.full((len(results), len(truths)), np.inf)
     for r, result in enumerate(results):
-        model, pose = result.model, torch.from_numpy(result.pose)
+        model, pose = result.object_model, torch.from_numpy(result.pose)
         for t, truth in enumerate(truths):
             error = add_up_to_symmetry(
                 pose[None], torch.from_numpy(truth)[None], model.points, model.symmetries

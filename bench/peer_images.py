@@ -212,7 +212,7 @@ def measure(
             if time.monotonic() > until:
                 return rows
             if case.object not in models:
-                models[case.object] = posefilter.load(case.object, device="cpu").models[0]
+                models[case.object] = posefilter.load(case.object, device="cpu").object_models[0]
             pose, seconds, cpu = way.estimate(case)
             row = {"title": title, "method": way.method, "given": told, "key": case.key}
             row |= {"object": case.object, "scene": case.scene, "seconds": seconds, "cpu": cpu}

@@ -118,7 +118,7 @@ def compare(
     estimator = posefilter.load(name, device="cpu")
     estimator.predict(frames[0].rgb, frames[0].depth, frames[0].intrinsics)  # warm
     results, seconds = run_tracked(estimator, frames)
-    points = estimator.models[0].points.double()
+    points = estimator.object_models[0].points.double()
     truth = torch.from_numpy(np.stack([frame.truth[name] for frame in frames]))
     out = {WAYS[0]: (np.stack([one.pose for one in results]), np.array(seconds))}
     model, sequence = folder / f"{name}.cao", folder / f"{name}.bin"

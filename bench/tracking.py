@@ -86,7 +86,7 @@ def judge(
     results: Sequence[Any], frames: Sequence[VideoFrame], seconds: Sequence[float]
 ) -> Outcome:
     """Return the figures of results, a frame each; what is lost counts as missed."""
-    model = results[0].model
+    model = results[0].object_model
     poses = torch.from_numpy(np.stack([one.pose for one in results]))
     truth = torch.from_numpy(np.stack([frame.truth[model.name] for frame in frames]))
     missed = torch.tensor([not getattr(one, "found", True) for one in results])
@@ -131,7 +131,7 @@ def measure_loss(
     mixed = [other[n] if n in AWAY else frame for n, frame in enumerate(frames)]
     results, _ = run_tracked(estimator, mixed)
     said = [results[n].found for n in AWAY]
-    model = estimator.models[0]
+    model = estimator.object_models[0]
     back = "not again"
     for n in range(AWAY.stop, len(frames)):
         truth = torch.from_numpy(frames[n].truth[name])[None]
@@ -178,7 +178,7 @@ def measure_sequence(
 
     Tracks are of the default settings, and of a walk that is fixed; each the mean over `SEEDS`.
     """
-    name, model = estimator.objects[0], estimator.models[0]
+    name, model = estimator.objects[0], estimator.object_models[0]
     shown = [n for n, frame in enumerate(frames) if name in frame.truth]
     covered = [n for n in range(shown[0], shown[-1]) if n not in shown]
     own = [frames[n] for n in shown]
@@ -222,7 +222,7 @@ def _with(
 
 def _error(result: Any, frame: VideoFrame) -> float:
     truth = torch.from_numpy(frame.truth[result.object])[None]
-    return float(add_s(torch.from_numpy(result.pose)[None], truth, result.model.points))
+    return float(add_s(torch.from_numpy(result.pose)[None], truth, result.object_model.points))
 
 
 def measure_together(

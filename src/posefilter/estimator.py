@@ -69,9 +69,14 @@ class Estimator:
         return tuple(method.model.name for method in self.methods)
 
     @property
-    def models(self) -> tuple[ObjectModel, ...]:
+    def object_models(self) -> tuple[ObjectModel, ...]:
         """What is known of each object: its center, size, surface points and hull."""
         return tuple(method.model for method in self.methods)
+
+    @property
+    def models(self) -> tuple[ObjectModel, ...]:
+        """The earlier name of `object_models`."""
+        return self.object_models
 
     def predict(
         self,
@@ -164,16 +169,16 @@ class Estimator:
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
             method.seed = seed
-            start, found, surface = time.perf_counter(), None, None
+            start, found, inliers = time.perf_counter(), None, None
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
                 if method.calibration is not None:
                     features = method.collect_features(trace, batch)
-                    found, surface = method.calibration.assess(features), features["surface"]
+                    found, inliers = method.calibration.assess(features), features["surface"]
                 apparent = method.measure_apparent_size(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, surface, apparent, blank))
+            runs.append(Run(method, batch, trace, seconds, found, inliers, apparent, blank))
         return runs
 
 

@@ -2,7 +2,7 @@
 chooses which.
 
 DataModule -> Batch -> method.encode -> [measure -> reweight -> resample -> propagate] x
-steps -> estimate -> refine -> Belief
+steps -> estimate -> refine -> BeliefBatch
 
 The order on this page is the order in which filters/loop.py calls them.
 """
@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from posefilter.types import (
     Batch,
-    Belief,
+    BeliefBatch,
     ObjectModel,
     ParticleOutput,
     Particles,
@@ -226,7 +226,7 @@ class Estimate(Protocol):
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief of the last particles."""
         ...
 
@@ -241,8 +241,8 @@ class Refine(Protocol):
     """
 
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with another estimate, or with other particles."""
         ...
 

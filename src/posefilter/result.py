@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from posefilter.belief import Belief, Mode, PoseSet
-from posefilter.belief.summaries import check_share
+from posefilter.belief.summaries import check_probability
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
 from posefilter.confidence.conformal import Conformal
@@ -17,8 +17,7 @@ from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.plausibility import find_warnings
-from posefilter.types import Batch, ObjectModel, Trace
-from posefilter.types import Belief as BeliefTensors
+from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 if TYPE_CHECKING:
     from posefilter.figures.overlay import Shape
@@ -50,12 +49,13 @@ class Result:
         blank: Why the image cannot be judged, in words: it is of one color, or its depth is the
             same everywhere.  The verdict is then "unsure".  Empty where it can be.
         seconds: The filter's time for this image, its share of a batch.
-        model: The object's center, size, surface points and hull.
+        object_model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
         calibration_note: In words, why there is no probability; empty where there is one.
         conformal: What `conformal_set` goes by; None where the calibration has none.
-        surface: The share of the object's surface points at which the depth shows a surface, by
-            which earlier calibrations choose the group of a conformal set.
+        depth_inlier_fraction: The fraction of the object's surface points, those that face away
+            included, whose depth at the pose agrees with the measured one.  Earlier calibrations
+            choose the group of a conformal set by it, under the name `surface`.
         instance: Which of its class it is, from 0, the most probable first.
         mask: The pixels (H, W) bool of the image that are its own, where instances were asked for;
             else None.
@@ -69,11 +69,11 @@ class Result:
     belief: Belief
     warnings: tuple[str, ...]
     seconds: float
-    model: ObjectModel
+    object_model: ObjectModel
     costs: Costs = field(default_factory=Costs, kw_only=True)
     calibration_note: str = field(default="", kw_only=True)
     conformal: Conformal | None = field(default=None, kw_only=True)
-    surface: float = field(default=math.nan, kw_only=True)
+    depth_inlier_fraction: float = field(default=math.nan, kw_only=True)
     apparent_size: float = field(default=math.nan, kw_only=True)
     wrong_size: bool = field(default=False, kw_only=True)
     blank: str = field(default="", kw_only=True)
@@ -101,6 +101,16 @@ class Result:
             return None
         verdict = decide(self.presence, self.probability, costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
+
+    @property
+    def model(self) -> ObjectModel:
+        """The earlier name of `object_model`."""
+        return self.object_model
+
+    @property
+    def surface(self) -> float:
+        """The earlier name of `depth_inlier_fraction`."""
+        return self.depth_inlier_fraction
 
     @property
     def covariance(self) -> np.ndarray:
@@ -132,8 +142,9 @@ class Result:
                 else "their guarantee is of one search of the whole image, not of instances"
             )
             raise UserError(f"{self.object}: has no conformal sets ({why})")
-        check_share(level)
-        value = self.surface if self.conformal.by == "surface" else self.probability
+        check_probability("level", level)
+        by_depth = self.conformal.by == "surface"
+        value = self.depth_inlier_fraction if by_depth else self.probability
         assert value is not None  # where there are sets there is a probability
         limit = self.conformal.find_limit(level, value)
         threshold = -self.belief.differential_entropy - limit
@@ -156,7 +167,7 @@ class Result:
         """
         from posefilter.figures.overlay import draw_overlay  # slow to import, needed for pictures
 
-        shape = self.model.hull if shape is None else shape
+        shape = self.object_model.hull if shape is None else shape
         pose = None if self.verdict == "absent" else self.pose
         unsure = self.verdict == "unsure"
         return draw_overlay(rgb, intrinsics, pose, shape, caption=self.describe(), dashed=unsure)
@@ -188,13 +199,13 @@ class Result:
         """
         from posefilter.figures.belief import draw_belief  # slow to import, needed for pictures
 
-        tensors = BeliefTensors(
+        tensors = BeliefBatch(
             torch.from_numpy(self.belief.samples),
             torch.from_numpy(self.belief.weights).log(),
             torch.from_numpy(self.pose),
             torch.tensor(self.score),
         )
-        return draw_belief(rgb, intrinsics, tensors, self.model)
+        return draw_belief(rgb, intrinsics, tensors, self.object_model)
 
     def draw_band(
         self,
@@ -220,8 +231,8 @@ class Result:
         """
         from posefilter.figures.band import draw_band  # slow to import, needed for pictures
 
-        check_share(level)
-        shape = self.model.hull if shape is None else shape
+        check_probability("level", level)
+        shape = self.object_model.hull if shape is None else shape
         poses, weights = self.belief.samples, self.belief.weights
         return draw_band(rgb, intrinsics, poses, weights, shape, level, caption=self.describe())
 
@@ -234,7 +245,8 @@ class Run(NamedTuple):
     trace: Trace
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
-    surface: torch.Tensor | None = None  # (B,) the feature; None where there is no probability
+    # (B,) the feature `surface`; None where there is no probability
+    depth_inlier_fraction: torch.Tensor | None = None
     size: ApparentSize | None = None  # None where the method cannot tell
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
 
@@ -253,7 +265,7 @@ def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[lis
 def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
     """Return what a run amounts to for one image of its batch."""
     model, belief, found = run.method.model, run.trace.belief, run.found
-    calibration = run.method.calibration
+    calibration, inliers = run.method.calibration, run.depth_inlier_fraction
     weights = belief.log_weights[image].double().cpu().exp().numpy()
     center = model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
@@ -284,11 +296,11 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         ),
         warnings=(blank, *warnings) if blank else warnings,
         seconds=run.seconds,
-        model=model,
+        object_model=model,
         costs=costs or Costs(),
         calibration_note="" if found is not None else explain_missing(run.method),
         conformal=None if found is None or calibration is None else calibration.conformal,
-        surface=math.nan if run.surface is None else float(run.surface[image]),
+        depth_inlier_fraction=math.nan if inliers is None else float(inliers[image]),
         apparent_size=size,
         wrong_size=wrong_size,
         blank=blank,

@@ -68,7 +68,7 @@ class Fragments(NamedTuple):
     """
 
     # (B, N, K) log-probability of each fragment, given that the point is on the object
-    log_share: Tensor
+    log_prob: Tensor
     # (B, N, K, 3) the object point in each fragment, from the object's center, in radii
     position: Tensor
     centers: Tensor  # (B, K, 3) the fragments' centers, likewise
@@ -96,8 +96,11 @@ class Step(NamedTuple):
     sigma: Tensor
 
 
-class Belief(NamedTuple):
-    """The filter's result: weighted poses and a point estimate."""
+class BeliefBatch(NamedTuple):
+    """A filter's result for B images: weighted poses and a point estimate of each.
+
+    What users get of one image is `posefilter.Belief`, in numpy.
+    """
 
     poses: Tensor  # (B, N, 4, 4) camera_from_object
     log_weights: Tensor  # (B, N), normalized
@@ -113,7 +116,7 @@ class Trace(NamedTuple):
     particles: tuple[Particles, ...]
     outputs: tuple[ParticleOutput, ...]
     steps: tuple[Step, ...]
-    belief: Belief
+    belief: BeliefBatch
     # (B, T) log of the summed weights at each step; None if no filter made the trace
     log_evidence: Tensor | None = None
     # the encoded images, as the method's `encode` returned them; None if it is not kept

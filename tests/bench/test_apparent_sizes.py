@@ -40,7 +40,7 @@ class Believing:
         pose[2, 3] = factor - 1
         return SimpleNamespace(
             pose=pose,
-            model=MODEL,
+            object_model=MODEL,
             presence=0.95,
             probability=0.9,
             costs=None,

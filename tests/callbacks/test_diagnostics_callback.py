@@ -21,7 +21,7 @@ from posefilter.callbacks.diagnostics import (
 from posefilter.figures.canvas import AXES
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.metrics.diagnostics import FilterDiagnostics
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 
 def trace(steps: int = 3) -> Trace:
@@ -37,7 +37,7 @@ def trace(steps: int = 3) -> Trace:
         ParticleOutput(even, torch.full((2, 20, 2), 30.0), pose, torch.zeros(2, 20, 0))
         for _ in range(steps)
     )
-    belief = Belief(pose, even, pose[:, 0], even[:, 0])
+    belief = BeliefBatch(pose, even, pose[:, 0], even[:, 0])
     return Trace(
         history, outputs, tuple(Step(t, steps, torch.tensor(0.0)) for t in range(steps)), belief
     )

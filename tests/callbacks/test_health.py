@@ -11,7 +11,7 @@ from posefilter.figures.curves import choose_bounds, choose_ticks, draw_health
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
 from posefilter.metrics.registry import find_metric
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 
 def trace_of(
@@ -29,7 +29,7 @@ def trace_of(
         )
         steps.append(Step(t, len(states), sigma))
     poses = torch.eye(4).expand(len(weights[0]), 1, 4, 4)
-    belief = Belief(
+    belief = BeliefBatch(
         poses, torch.zeros(len(weights[0]), 1), poses[:, 0], torch.zeros(len(weights[0]))
     )
     return Trace(tuple(history), tuple(outputs), tuple(steps), belief)

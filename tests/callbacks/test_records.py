@@ -20,7 +20,7 @@ from posefilter.metrics.bop_results import (
     to_native,
     write_poses_csv,
 )
-from posefilter.types import Batch, Belief, Trace
+from posefilter.types import Batch, BeliefBatch, Trace
 
 
 def poses(count: int, seed: int = 0) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_rows_are_native_and_leave_out_what_is_not_finite() -> None:
 def test_outcomes_and_beliefs(tmp_path: Path) -> None:
     history = torch.from_numpy(poses(8)).reshape(2, 4, 4, 4)
     weights = torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.25] * 4])
-    belief = Belief(history, weights.log(), history[:, 1], torch.tensor([1.5, -2.0]))
+    belief = BeliefBatch(history, weights.log(), history[:, 1], torch.tensor([1.5, -2.0]))
     empty = torch.zeros(2)
     batch = Batch(empty, empty, empty, empty, empty, empty, torch.tensor([1, 0]), empty)
     outcomes = collect_outcomes(Trace((), (), (), belief), batch, 0.25)

@@ -129,7 +129,7 @@ def test_every_chart_finds_what_methods_log() -> None:
         "train/coordinate_error_mm",
         "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00",
         "filter/spread_px/step_00",
-        "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/coverage_50",
+        "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/distance_coverage_50",
         "val/belief/mass_2cm",
         "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_share",
         "speed/drawing_share",

@@ -8,7 +8,7 @@ import torch
 
 from posefilter.callbacks.trajectories import extract_glimpses, follow_particles, trace_lineage
 from posefilter.nets.glimpse import IntegerCut
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 
 def test_a_trajectory_is_a_line_of_ancestors() -> None:
@@ -35,7 +35,7 @@ def test_the_heaviest_are_followed_and_what_they_saw_is_what_is_there() -> None:
     output = ParticleOutput(
         weights, torch.zeros(1, 3, 2), torch.eye(4).expand(1, 3, 4, 4), torch.zeros(1, 3, 0)
     )
-    belief = Belief(output.pose, weights, output.pose[:, 0], torch.zeros(1))
+    belief = BeliefBatch(output.pose, weights, output.pose[:, 0], torch.zeros(1))
     trace = Trace(
         (particles, particles),
         (output,) * 2,

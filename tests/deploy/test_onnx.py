@@ -28,7 +28,7 @@ from posefilter.geometry.pose import fit_rigid, is_rigid, make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 from printed_objects import load, look
 
 HOME = Path(__file__).parents[2]
@@ -79,7 +79,7 @@ def make_pixel_method(*overrides: str) -> PoseEstimator:
     """Return an untrained patch_pf of the cracker box, in test mode."""
     job = compose_job("train", HOME / "conf", ["model=patch_pf", *overrides], Path())
     torch.manual_seed(0)
-    model = posefilter.load("003_cracker_box", device="cpu").models[0]
+    model = posefilter.load("003_cracker_box", device="cpu").object_models[0]
     return build_method(recipe(job), model, lightning=False).eval()
 
 
@@ -147,7 +147,7 @@ def test_the_example_aligns_as_torch_does(
     for number in range(3):
         noise = torch.randn(6, generator=torch.Generator().manual_seed(number))
         start = method.space.move(found, 0.004 * noise)[None]
-        given = Belief(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
+        given = BeliefBatch(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
         theirs = icp(given, method.encode(batch), method, torch.Generator()).best[0].numpy()
         ours = own.align(image, start[0].numpy(), surface, **vars(icp))
         assert np.abs(theirs - start[0].numpy()).max() > 8e-3
@@ -163,7 +163,7 @@ def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
     truth = make_pose(R, torch.tensor([0.0, 0, 4.5 * model.radius]) - R @ model.center)
     scene = look(name, truth)
     wrong = truth @ turns[len(turns) // 3]
-    given = Belief(wrong.expand(1, 20, 4, 4), torch.zeros(1, 20), wrong[None], torch.zeros(1))
+    given = BeliefBatch(wrong.expand(1, 20, 4, 4), torch.zeros(1, 20), wrong[None], torch.zeros(1))
     method: Any = SimpleNamespace(model=model)
     theirs = turn(given, scene, method, torch.Generator()).best[0].numpy()
     own = poses.PoseFilter.__new__(poses.PoseFilter)
@@ -190,7 +190,7 @@ def test_an_estimate_is_that_of_torch(
 ) -> None:
     rgb, depth, K = read_scene()
     pose, _, particles, weights = poses.PoseFilter(exported).estimate(rgb, depth, K)
-    points = estimator.models[0].points.numpy()
+    points = estimator.object_models[0].points.numpy()
     theirs = estimator.predict(rgb, depth, K).pose
     apart = np.linalg.norm(
         points @ (pose[:3, :3] - theirs[:3, :3]).T + pose[:3, 3] - theirs[:3, 3], axis=1
@@ -324,7 +324,7 @@ def test_a_traced_program_runs_in_torch_alone(estimator: posefilter.Estimator) -
 )
 def test_what_cannot_be_exported_is_named(overrides: list[str], named: str) -> None:
     job = compose_job("train", HOME / "conf", overrides, Path())
-    model = posefilter.load("003_cracker_box", device="cpu").models[0]
+    model = posefilter.load("003_cracker_box", device="cpu").object_models[0]
     with pytest.raises(UserError, match=named):
         describe_filter(build_method(recipe(job), model, lightning=False))
 

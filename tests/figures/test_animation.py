@@ -22,7 +22,7 @@ from posefilter.figures.silhouettes import (
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 H, W = 60, 80
 K = np.array([[80.0, 0, 39.5], [0, 80.0, 29.5], [0, 0, 1]])
@@ -61,7 +61,9 @@ def trace_of(states: list[torch.Tensor], ancestors: list[list[int]]) -> Trace:
             )
         )
     steps = tuple(Step(t, len(states), torch.tensor(0.04 / (t + 1))) for t in range(len(states)))
-    belief = Belief(torch.eye(4)[None, None], torch.zeros(1, 1), torch.eye(4)[None], torch.zeros(1))
+    belief = BeliefBatch(
+        torch.eye(4)[None, None], torch.zeros(1, 1), torch.eye(4)[None], torch.zeros(1)
+    )
     return Trace(tuple(history), tuple(outputs), steps, belief)
 
 

@@ -28,7 +28,7 @@ from posefilter.figures.mollweide import (
 )
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import angle_between, exp_so3
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 K = np.array([[150.0, 0, 79.5], [0, 150.0, 59.5], [0, 0, 1]])
 RGB = np.full((120, 160, 3), 128, np.uint8)
@@ -61,7 +61,9 @@ def looking(longitude: float, latitude: float) -> torch.Tensor:
     )
 
 
-def two_modes(share: float = 0.3, count: int = 400) -> tuple[Belief, torch.Tensor, torch.Tensor]:
+def two_modes(
+    share: float = 0.3, count: int = 400
+) -> tuple[BeliefBatch, torch.Tensor, torch.Tensor]:
     a, b = looking(0.5, 0.4), looking(-1.4, -0.5)
     g = torch.Generator().manual_seed(0)
     tangent = torch.randn(count, 6, generator=g, dtype=torch.float64) * torch.tensor(
@@ -70,7 +72,7 @@ def two_modes(share: float = 0.3, count: int = 400) -> tuple[Belief, torch.Tenso
     start = torch.where((torch.arange(count) < count // 2)[:, None, None], a, b)
     poses = move_about(start, tangent, model().center.double())
     weights = torch.where(torch.arange(count) < count // 2, 1 - share, share) * 2 / count
-    return Belief(poses[None], weights.log()[None], a[None], torch.zeros(1)), a, b
+    return BeliefBatch(poses[None], weights.log()[None], a[None], torch.zeros(1)), a, b
 
 
 @pytest.mark.parametrize(
@@ -283,6 +285,6 @@ def test_nothing_is_written_under_a_mark() -> None:
 
 def test_a_batch_of_several_is_refused() -> None:
     belief, _, _ = two_modes()
-    several = Belief(*(torch.cat([x, x]) for x in belief))
+    several = BeliefBatch(*(torch.cat([x, x]) for x in belief))
     with pytest.raises(ValueError, match="one image"):
         draw_belief(RGB, K, several, model())

@@ -20,7 +20,7 @@ from posefilter.figures.convergence import (
 )
 from posefilter.geometry.pose import make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between, exp_so3
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 CENTER = torch.tensor([0.01, 0.02, 0.03], dtype=torch.float64)
 
@@ -56,7 +56,7 @@ def test_particles_come_from_where_their_ancestors_were() -> None:
 def frames() -> list[np.ndarray]:
     best = pose().double()
     trace = trace_of([random_poses(4, 8), pose().expand(8, 4, 4)], [list(range(8))] * 2)
-    belief = Belief(best[None, None], torch.zeros(1, 1), best[None], torch.zeros(1))
+    belief = BeliefBatch(best[None, None], torch.zeros(1, 1), best[None], torch.zeros(1))
     trace = trace._replace(belief=belief)
     return list(
         animate_convergence(

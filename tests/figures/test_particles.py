@@ -19,7 +19,7 @@ from posefilter.figures.particles import (
 )
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 RGB = np.full((60, 80, 3), 128, np.uint8)
 K = np.array([[80.0, 0, 39.5], [0, 80.0, 29.5], [0, 0, 1]])
@@ -42,7 +42,7 @@ def trace_of(states: torch.Tensor, weights: torch.Tensor) -> Trace:
         history,
         (output,) * T,
         steps,
-        Belief(poses, weights[-1].log()[None], poses[:, 0], torch.zeros(1)),
+        BeliefBatch(poses, weights[-1].log()[None], poses[:, 0], torch.zeros(1)),
     )
 
 

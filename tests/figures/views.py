@@ -6,7 +6,7 @@ import torch
 
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
-from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 H, W, STEPS, FIRST, N = 6, 8, 3, 50, 40
 SHARES = (0.7, 0.25, 0.045, 0.005)  # of the belief's hypotheses
@@ -79,5 +79,5 @@ def run(pixels: bool) -> Trace:
     best = move_about(
         hypotheses_of_belief()[:1].expand(2, 4, 4), torch.tensor([0.004, 0, 0, 0, 0, 0]), center
     )
-    belief = Belief(poses, weights.log().expand(2, N), best, torch.tensor([0.0, math.pi]))
+    belief = BeliefBatch(poses, weights.log().expand(2, N), best, torch.tensor([0.0, math.pi]))
     return Trace(tuple(history), tuple(outputs), tuple(steps), belief)

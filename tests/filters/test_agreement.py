@@ -8,7 +8,7 @@ import torch
 from posefilter.filters.agreement import Agreement
 from posefilter.geometry.pose import fit_rigid, invert, make_pose, transform
 from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
-from posefilter.types import Belief, Fragments, ObjectModel, ParticleOutput, Particles
+from posefilter.types import BeliefBatch, Fragments, ObjectModel, ParticleOutput, Particles
 
 MODEL = ObjectModel(
     "cube",
@@ -128,9 +128,9 @@ def test_points_that_are_not_known_do_not_count() -> None:
 
 
 def test_as_many_fragments_are_considered_as_there_are() -> None:
-    log_share = torch.tensor([[[0.2, 0.5, 0.3]]]).log()
+    log_prob = torch.tensor([[[0.2, 0.5, 0.3]]]).log()
     position = torch.arange(9.0).view(1, 1, 3, 3)
-    said = Fragments(log_share, position, torch.zeros(1, 3, 3), torch.tensor(0.1))
+    said = Fragments(log_prob, position, torch.zeros(1, 3, 3), torch.tensor(0.1))
     empty = torch.zeros(1, 1, 0)
     output = ParticleOutput(
         torch.zeros(1, 1), torch.zeros(1, 1, 2), torch.eye(4)[None, None], empty, said
@@ -139,7 +139,7 @@ def test_as_many_fragments_are_considered_as_there_are() -> None:
         share, found = Agreement(top_fragments=options).list_object_points(
             output, torch.zeros(1, 1, 3), torch.zeros(3), 1.0
         )
-        torch.testing.assert_close(share[0, 0], log_share[0, 0, rows].exp())
+        torch.testing.assert_close(share[0, 0], log_prob[0, 0, rows].exp())
         assert torch.equal(found[0, 0], position[0, 0, rows])
 
 
@@ -178,7 +178,7 @@ def noisy(count: int = 40, off: float = 0.012) -> tuple[torch.Tensor, ParticleOu
     return point, ParticleOutput(log_p, torch.zeros(1, count, 2), own, empty), particles
 
 
-def agree(count: int = 40, **settings: float) -> Belief:
+def agree(count: int = 40, **settings: float) -> BeliefBatch:
     point, output, particles = noisy(count)
     g = torch.Generator().manual_seed(6)
     return Agreement(**settings)(particles, output, None, Points(point), g)  # type: ignore[arg-type]

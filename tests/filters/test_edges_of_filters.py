@@ -18,7 +18,7 @@ from posefilter.filters.resample_move import ResampleMove, draw_differences
 from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, ParticleOutput
+from posefilter.types import BeliefBatch, ParticleOutput
 
 PIXELS = PixelSpace()
 POSES = PoseSpace((0.0, 0.0, 0.0), 0.1)
@@ -129,13 +129,13 @@ class Hill:
         return self.slope * 100 * poses[..., 0, 3]
 
 
-def belief(count: int) -> Belief:
+def belief(count: int) -> BeliefBatch:
     poses = shifted([0.001 * k for k in range(count)])[None]
     even = torch.full((1, count), -math.log(count)).double()
-    return Belief(poses, even, poses[:, 0], torch.zeros(1).double())
+    return BeliefBatch(poses, even, poses[:, 0], torch.zeros(1).double())
 
 
-def move(method: Hill, seed: int, **settings: float) -> Belief:
+def move(method: Hill, seed: int, **settings: float) -> BeliefBatch:
     moves = ResampleMove(sweeps=3, **settings)  # type: ignore[arg-type]
     return moves(belief(10), None, method, Generator().manual_seed(seed))  # type: ignore[arg-type]
 

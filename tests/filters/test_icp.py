@@ -14,7 +14,7 @@ from posefilter.geometry.pose import make_pose, rotation_of, transform
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.rotation import exp_so3
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 H, W = 120, 160
 K = intrinsics(200.0, 200.0, 79.5, 59.5)
@@ -54,8 +54,8 @@ def method(points: Tensor | None = None) -> SimpleNamespace:
     return SimpleNamespace(model=model)
 
 
-def belief(pose: Tensor) -> Belief:
-    return Belief(pose[:, None], torch.zeros(len(pose), 1), pose, torch.ones(len(pose)))
+def belief(pose: Tensor) -> BeliefBatch:
+    return BeliefBatch(pose[:, None], torch.zeros(len(pose), 1), pose, torch.ones(len(pose)))
 
 
 def look(*poses: Tensor) -> Seen:

@@ -15,7 +15,7 @@ from posefilter.geometry.pose_sampling import draw_poses, measure_kernels, widen
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.rotation import exp_so3, random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 SCALE = torch.tensor([0.004, 0.003, 0.01, 0.03, 0.06, 0.04]).double()
 CENTER = torch.tensor([0.02, -0.01, 0.03]).double()
@@ -37,16 +37,16 @@ class Known:
         return (-0.5 * square).float()
 
 
-def search_result(width: float = 0.7, count: int = 200) -> Belief:
+def search_result(width: float = 0.7, count: int = 200) -> BeliefBatch:
     """Return what a search leaves: too narrow, beside the middle, without the correlation."""
     g = torch.Generator().manual_seed(0)
     twist = (torch.randn(1, count, 6, generator=g).double() + 0.4) * width * SCALE
     poses = move_about(torch.eye(4).double().expand(1, count, 4, 4), twist, CENTER)
     even = torch.full((1, count), -math.log(count))
-    return Belief(poses.float(), even, poses[:, 0].float(), torch.tensor([3.0]))
+    return BeliefBatch(poses.float(), even, poses[:, 0].float(), torch.tensor([3.0]))
 
 
-def moments(belief: Belief) -> tuple[Tensor, Tensor]:
+def moments(belief: BeliefBatch) -> tuple[Tensor, Tensor]:
     weights = belief.log_weights[0].double().exp()
     poses, origin = belief.poses[0].double(), torch.eye(4).double()
     mean = (weights[:, None] * twist_between(origin, poses, CENTER)).sum(0)
@@ -146,6 +146,6 @@ def test_kernels_are_of_their_own_mode_though_it_has_few_poses() -> None:
     noise = torch.randn(3, 40, 6, generator=g).double() * SCALE
     poses = move_about(torch.eye(4).double().expand(3, 40, 4, 4), noise, CENTER)
     poses[:, 20:] = poses[:, 20:] @ half
-    before = Belief(poses, torch.full((3, 40), -math.log(40)), poses[:, 0], torch.zeros(3))
+    before = BeliefBatch(poses, torch.full((3, 40), -math.log(40)), poses[:, 0], torch.zeros(3))
     after = ImportanceSampling(400, 1, widening=1.0)(before, None, Two(), g)  # type: ignore[arg-type]
     assert float((-after.log_weights.mul(2).logsumexp(1)).exp().mean()) > 35

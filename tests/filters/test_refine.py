@@ -11,7 +11,7 @@ from posefilter.filters.refine import Compose, Gradient, MeanShift, NoRefine, Re
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 SPACE = PoseSpace((0.05, 0.0, -0.02), 0.1)
 CENTER = torch.tensor(SPACE.center)
@@ -44,17 +44,17 @@ def truth() -> Tensor:
     return make_pose(random_rotation(3, generator=g), torch.randn(3, 3, generator=g))
 
 
-def belief_around(sigma: float, count: int = 30) -> Belief:
+def belief_around(sigma: float, count: int = 30) -> BeliefBatch:
     g = Generator().manual_seed(1)
     scale = SPACE.noise_scale(torch.tensor(sigma))
     poses = SPACE.move(
         truth()[:, None].expand(3, count, 4, 4), scale * torch.randn(3, count, 6, generator=g)
     )
     log_w = torch.randn(3, count, generator=g).log_softmax(1)
-    return Belief(poses, log_w, poses[:, 0], torch.full((3,), -math.inf))
+    return BeliefBatch(poses, log_w, poses[:, 0], torch.full((3,), -math.inf))
 
 
-def off(belief: Belief) -> Tensor:
+def off(belief: BeliefBatch) -> Tensor:
     return SPACE.distance(belief.best, truth())
 
 
@@ -111,7 +111,7 @@ def test_images_climb_apart_and_alike() -> None:
     again = Gradient(steps=20)(belief, truth(), method, Generator().manual_seed(0))
     assert torch.equal(whole.best, again.best)
     single = Gradient(steps=20)(
-        Belief(*(x[1:2] for x in belief)), truth()[1:2], method, Generator().manual_seed(0)
+        BeliefBatch(*(x[1:2] for x in belief)), truth()[1:2], method, Generator().manual_seed(0)
     )
     torch.testing.assert_close(single.best, whole.best[1:2], atol=1e-5, rtol=0)
 

@@ -16,7 +16,7 @@ from posefilter.filters.resample_move import ResampleMove
 from posefilter.geometry.pose import make_pose, rotation_of
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PixelSpace, PoseSpace
-from posefilter.types import Belief, Step
+from posefilter.types import BeliefBatch, Step
 
 SPACE = PoseSpace((0.01, 0.0, -0.02), 0.1)
 COUNT = 12
@@ -54,7 +54,7 @@ def moved_by(kernel: Any) -> Callable[[Generator], Tensor]:
 
 def refined_by(refine: Any, part: str) -> Callable[[Generator], Tensor]:
     even = torch.randn(2, COUNT, generator=Generator().manual_seed(1)).double().log_softmax(1)
-    belief = Belief(poses(), even, poses()[:, 0], torch.zeros(2).double())
+    belief = BeliefBatch(poses(), even, poses()[:, 0], torch.zeros(2).double())
     return lambda g: getattr(refine(belief, None, Slope(), g), part)
 
 

@@ -15,7 +15,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.texture import sample_texture
 from posefilter.rendering.surfaces import Lights
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 from printed_objects import Seen, W, load, look
 
 
@@ -27,16 +27,16 @@ def draw(name: str, count: int) -> list[Tensor]:
     return [make_pose(R, shift - R @ model.center) for R in rotations]
 
 
-def believe(pose: Tensor, count: int = 40) -> Belief:
+def believe(pose: Tensor, count: int = 40) -> BeliefBatch:
     poses = pose.expand(1, count, 4, 4).clone()
-    return Belief(poses, torch.full((1, count), -np.log(count)), pose[None], torch.zeros(1))
+    return BeliefBatch(poses, torch.full((1, count), -np.log(count)), pose[None], torch.zeros(1))
 
 
 def method(model: ObjectModel) -> SimpleNamespace:
     return SimpleNamespace(model=model)
 
 
-def turn(belief: Belief, scene: Seen, model: ObjectModel, **settings: float) -> Belief:
+def turn(belief: BeliefBatch, scene: Seen, model: ObjectModel, **settings: float) -> BeliefBatch:
     out = TextureTurns(**settings)(belief, scene, method(model), Generator().manual_seed(0))  # type: ignore[arg-type]
     assert torch.equal(out.score, belief.score)
     return out

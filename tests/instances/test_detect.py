@@ -16,7 +16,7 @@ from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
 from posefilter.instances.detect import Detection, SearchSettings, detect
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Belief, ObjectModel, Trace
+from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
 H, W, SIDE = 48, 64, 6  # [px]
 K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]])
@@ -59,7 +59,7 @@ class SimpleFilter:
         pixel = torch.tensor([[index % W, index // W]]).float() + (SIDE - 1) / 2
         center = back_project(pixel, torch.tensor([1.0]), K)[0] + torch.tensor([0, 0, 0.03])
         pose = make_pose(torch.eye(3), center)[None]
-        belief = Belief(pose[:, None], torch.zeros(1, 1), pose, seen.max()[None])
+        belief = BeliefBatch(pose[:, None], torch.zeros(1, 1), pose, seen.max()[None])
         return SimpleNamespace(belief=belief)
 
 

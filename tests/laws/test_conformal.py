@@ -13,7 +13,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.metrics.credibility import Credibility, score_truth
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 CENTER = torch.zeros(3)
 
@@ -56,7 +56,7 @@ def model(symmetries: torch.Tensor | None = None) -> ObjectModel:
     return ObjectModel("thing", points, CENTER, 0.1, 0.2, group, points)
 
 
-def draw_beliefs(believed: float, count: int = 40) -> tuple[Belief, torch.Tensor]:
+def draw_beliefs(believed: float, count: int = 40) -> tuple[BeliefBatch, torch.Tensor]:
     """Return beliefs with a deviation of `believed` times that of their truths."""
     g = torch.Generator().manual_seed(0)
     scale = torch.tensor([0.01] * 3 + [0.1] * 3)
@@ -65,7 +65,7 @@ def draw_beliefs(believed: float, count: int = 40) -> tuple[Belief, torch.Tensor
     poses = move_about(middle[:, None].expand(-1, 100, -1, -1), noise, CENTER)
     truth = move_about(middle, torch.randn(count, 6, generator=g) * scale, CENTER)
     even = torch.full((count, 100), -math.log(100))
-    return Belief(poses, even, middle, torch.zeros(count)), truth
+    return BeliefBatch(poses, even, middle, torch.zeros(count)), truth
 
 
 def test_ranks_are_uniform_where_beliefs_are_right_and_high_where_they_are_vain() -> None:

@@ -13,7 +13,7 @@ from posefilter.geometry.pose import make_pose, move_about, origin_of, rotation_
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 SHIFT, TURN = 0.004, 0.05
 CENTER = torch.tensor([0.02, -0.01, 0.03]).double()
@@ -39,7 +39,7 @@ class TwoModes:
         return (masses.log() - 0.5 * angle.square()).logsumexp(-1) - 0.5 * far
 
 
-def draw(share: float, width: float = 1.0, runs: int = RUNS) -> Belief:
+def draw(share: float, width: float = 1.0, runs: int = RUNS) -> BeliefBatch:
     """Return `runs` beliefs: each particle in the first mode with probability `share`."""
     g = torch.Generator().manual_seed(0)
     first = torch.rand(runs, COUNT, generator=g) < share
@@ -48,15 +48,15 @@ def draw(share: float, width: float = 1.0, runs: int = RUNS) -> Belief:
     noise = torch.randn(runs, COUNT, 6, generator=g).double()
     poses = move_about(mode, width * noise * torch.tensor([SHIFT] * 3 + [TURN] * 3), CENTER)
     even = torch.full((runs, COUNT), -math.log(COUNT)).double()
-    return Belief(poses, even, poses[:, 0], torch.zeros(runs))
+    return BeliefBatch(poses, even, poses[:, 0], torch.zeros(runs))
 
 
-def first_share(belief: Belief) -> Tensor:
+def first_share(belief: BeliefBatch) -> Tensor:
     """Return the share of each run's particles at the first mode.  -> (RUNS,)."""
     return (angle_between(rotation_of(belief.poses), torch.eye(3).double()) < 1).double().mean(1)
 
 
-def spread(belief: Belief) -> Tensor:
+def spread(belief: BeliefBatch) -> Tensor:
     """Return the standard deviation of shifts and turns from the nearer mode.  -> (6,)."""
     near = angle_between(rotation_of(belief.poses), torch.eye(3).double()) < 1
     turn = torch.where(near[..., None, None], torch.eye(3).double(), HALF)
@@ -64,7 +64,7 @@ def spread(belief: Belief) -> Tensor:
     return twist_between(mode, belief.poses, CENTER).square().mean((0, 1)).sqrt()
 
 
-def move(belief: Belief, mass: float, **options: float) -> Belief:
+def move(belief: BeliefBatch, mass: float, **options: float) -> BeliefBatch:
     g = torch.Generator().manual_seed(1)
     return ResampleMove(**options)(belief, None, TwoModes(mass), g)  # type: ignore[arg-type]
 
@@ -129,7 +129,7 @@ def test_the_estimate_is_kept_and_the_seed_decides() -> None:
 
 
 def test_a_single_particle_turns_alone() -> None:
-    one = Belief(*(x[:, :1] if x.dim() > 1 and x.shape[1] == COUNT else x for x in draw(1.0)))
+    one = BeliefBatch(*(x[:, :1] if x.dim() > 1 and x.shape[1] == COUNT else x for x in draw(1.0)))
     one = one._replace(log_weights=torch.zeros(RUNS, 1).double())
     after = move(one, 0.5, sweeps=5)
     assert after.poses.shape == (RUNS, 1, 4, 4)

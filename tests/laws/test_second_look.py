@@ -16,7 +16,7 @@ from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.confidence.second_look import look_again, measure_worth
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
-from posefilter.types import Batch, Belief, ObjectModel, Particles, Trace
+from posefilter.types import Batch, BeliefBatch, ObjectModel, Particles, Trace
 
 H, W, SIDE = 48, 64, 6  # [px]
 K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]])
@@ -69,7 +69,7 @@ class ToyFilter:
         place[:, 0, :2, 3] = pixel
         zeros = torch.zeros(len(index), 1)
         particles = Particles(place, zeros[..., None], zeros, zeros.long())
-        belief = Belief(place, zeros, found, red.flatten(1).amax(1))
+        belief = BeliefBatch(place, zeros, found, red.flatten(1).amax(1))
         return Trace((particles,), (), (), belief, zeros, None)
 
 

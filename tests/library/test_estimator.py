@@ -69,6 +69,10 @@ def test_an_answer_is_that_of_the_command(estimator: posefilter.Estimator, tmp_p
     assert told["probability"] == result.probability
     assert told["verdict"] == result.verdict
     assert result.verdict in (None, "found")
+    assert result.object_model is estimator.object_models[0]
+    assert 0 < result.depth_inlier_fraction < 0.6  # half of its surface faces away
+    assert (result.model, result.surface) == (result.object_model, result.depth_inlier_fraction)
+    assert estimator.models == estimator.object_models  # by their earlier names
     own = result.belief
     assert told["belief"]["weight_entropy"] == pytest.approx(own.weight_entropy)
     assert told["belief"]["differential_entropy"] == pytest.approx(own.differential_entropy)
@@ -257,7 +261,7 @@ def test_pictures(small: posefilter.Estimator) -> None:
     band = result.draw_band(rgb, K, level=0.5)
     assert band.shape[1] == drawn.shape[1]
     assert len(np.unique(band.reshape(-1, 3), axis=0)) > 100
-    with pytest.raises(posefilter.UserError, match="a share is between 0 and 1"):
+    with pytest.raises(posefilter.UserError, match="the level is between 0 and 1"):
         result.draw_band(rgb, K, level=1.5)
     assert posefilter.figures.draw_overlay is not None
 
@@ -271,10 +275,10 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
         result.draw_belief,
         result.draw_band,
         lambda image, camera: posefilter.figures.draw_overlay(
-            image, camera, torch.from_numpy(result.pose), result.model.hull
+            image, camera, torch.from_numpy(result.pose), result.object_model.hull
         ),
         lambda image, camera: posefilter.figures.draw_belief(
-            image, camera, result.belief, result.model
+            image, camera, result.belief, result.object_model
         ),
     ):
         plain = draw(rgb, K)
@@ -287,7 +291,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
         with pytest.raises(posefilter.UserError, match="a camera matrix"):
             draw(rgb, K[:2])
     with pytest.raises(posefilter.UserError, match=r"pose: .* \(4, 4\)"):
-        posefilter.figures.draw_overlay(rgb, K, result.pose[:3], result.model.hull)
+        posefilter.figures.draw_overlay(rgb, K, result.pose[:3], result.object_model.hull)
 
 
 @pytest.mark.parametrize(
@@ -427,7 +431,7 @@ def test_what_is_typed_first_is_answered_or_refused_in_one_line(
     assert np.array_equal(result.pose, small.predict(rgb, depth, K, seed=3).pose)
     assert repr(small) == f"Estimator({NAME}; cpu)"
     assert repr(result.belief).startswith(f"Belief({NAME}: 40 particles within ")
-    drawn = posefilter.figures.draw_poses(rgb, K, result.pose, result.model.hull)
+    drawn = posefilter.figures.draw_poses(rgb, K, result.pose, result.object_model.hull)
     posefilter.figures.save_image(drawn, str(tmp_path / "new" / "drawn.png"))
     assert np.array_equal(cv2.imread(str(tmp_path / "new" / "drawn.png"))[..., ::-1], drawn)
 

@@ -8,7 +8,7 @@ import torch
 from posefilter.geometry.camera import intrinsics
 from posefilter.types import (
     Batch,
-    Belief,
+    BeliefBatch,
     Fragments,
     ObjectModel,
     ParticleOutput,
@@ -80,7 +80,7 @@ def make_trace() -> Callable[..., Trace]:
                     fragments,
                 )
             )
-        belief = Belief(outputs[-1].pose, weights, outputs[-1].pose[:, 0], weights[:, 0])
+        belief = BeliefBatch(outputs[-1].pose, weights, outputs[-1].pose[:, 0], weights[:, 0])
         return Trace(
             tuple(history),
             tuple(outputs),

@@ -13,7 +13,7 @@ from posefilter.losses.likelihood import BalancedBce, Bce, Focal
 from posefilter.losses.pose_loss import Add, AddS, Confidence, SurfacePointLoss
 from posefilter.losses.regression import Regression
 from posefilter.losses.rgbd_chamfer import RgbdChamfer
-from posefilter.types import Batch, Belief, Fragments, ParticleOutput, Particles, Trace
+from posefilter.types import Batch, BeliefBatch, Fragments, ParticleOutput, Particles, Trace
 
 LOSSES = [
     Bce(OnObject()), Bce(OnObject(), "last"), BalancedBce(OnObject()), Focal(OnObject()),
@@ -28,7 +28,7 @@ def join(one: Any, other: Any) -> Any:
     """Return two traces as one of two images."""
     if isinstance(one, torch.Tensor) and one.dim():
         return torch.cat([one, other])
-    if isinstance(one, Particles | ParticleOutput | Belief | Fragments | Trace | Batch):
+    if isinstance(one, Particles | ParticleOutput | BeliefBatch | Fragments | Trace | Batch):
         return type(one)(*(join(a, b) for a, b in zip(one, other, strict=True)))
     if type(one) is tuple:
         return tuple(join(a, b) for a, b in zip(one, other, strict=True))

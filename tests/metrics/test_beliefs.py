@@ -13,7 +13,7 @@ from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, rank_of_truth, spread
 from posefilter.metrics.collect import BeliefQuality
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 SPACE = PoseSpace((0.0, 0.0, 0.05), 0.1)
 CENTER = torch.tensor(SPACE.center)
@@ -85,18 +85,18 @@ def test_the_collected_block() -> None:
     g = Generator().manual_seed(0)
     truth = truths(6, g)
     poses = around(truth, 0.002, 80, g)
-    belief = Belief(poses, torch.full((6, 80), -math.log(80)), truth, torch.zeros(6))
+    belief = BeliefBatch(poses, torch.full((6, 80), -math.log(80)), truth, torch.zeros(6))
     metric = BeliefQuality([MODEL])
-    metric.update(Belief(*(x[:2] for x in belief)), truth[:2])
-    metric.update(Belief(*(x[2:] for x in belief)), truth[2:])
+    metric.update(BeliefBatch(*(x[:2] for x in belief)), truth[:2])
+    metric.update(BeliefBatch(*(x[2:] for x in belief)), truth[2:])
     found = metric.compute()
     assert found["entropy"] == pytest.approx(math.log(80), rel=1e-4)
     assert found["effective_particles"] == pytest.approx(80, rel=1e-4)
     assert found["mass_01d"] == pytest.approx(1, abs=1e-3)
     assert found["mass_2cm"] == pytest.approx(1, abs=1e-3)
     assert found["rank"] < 0.1  # the truth is in the very middle of each
-    assert found["coverage_50"] == found["coverage_90"] == 100
+    assert found["distance_coverage_50"] == found["distance_coverage_90"] == 100
     metric.reset()
     metric.update(belief, truth.roll(1, 0))
     assert metric.compute()["mass_2cm"] == 0
-    assert metric.compute()["coverage_90"] == 0
+    assert metric.compute()["distance_coverage_90"] == 0

@@ -16,7 +16,7 @@ from posefilter.metrics.credibility import (
     score_truth,
     trace_curve,
 )
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 NONE = torch.zeros(0, dtype=torch.float64)
 
@@ -78,7 +78,7 @@ def test_scores_by_the_density_itself() -> None:
     poses = make_pose(torch.eye(3).expand(80, 3, 3), shifts)[None].expand(2, -1, -1, -1)
     truth = make_pose(torch.eye(3), torch.tensor([[0.0, 0.0, 0.8], [0.3, 0.0, 0.8]]))
     log_w = torch.randn(80, generator=g).log_softmax(0).expand(2, -1)
-    belief = Belief(poses, log_w + 3.0, truth, torch.zeros(2))  # weights may be of any sum
+    belief = BeliefBatch(poses, log_w + 3.0, truth, torch.zeros(2))  # weights may be of any sum
     scores = score_truth(belief, truth, square())
     assert float(scores.rank[0]) < 0.3
     assert float(scores.rank[1]) == pytest.approx(1.0)
@@ -92,5 +92,5 @@ def test_scores_by_the_density_itself() -> None:
     assert float(means[0]) == pytest.approx(float(means[1]))
     assert float(scores.nonconformity[0]) < 0 < float(scores.nonconformity[1])
     assert all(x.dtype == torch.float64 and x.shape == (2,) for x in scores)
-    none = score_truth(Belief(*(x[:0] for x in belief)), truth[:0], square())
+    none = score_truth(BeliefBatch(*(x[:0] for x in belief)), truth[:0], square())
     assert [x.shape for x in none] == [(0,)] * 3

@@ -16,7 +16,7 @@ from posefilter.metrics.diagnostics import (
     pairwise_cosine,
     r2_score,
 )
-from posefilter.types import Batch, Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 
 def test_pairwise_cosine_equals_the_double_loop() -> None:
@@ -137,7 +137,7 @@ def make_trace(state: torch.Tensor, log_likelihood: torch.Tensor) -> Trace:
         (particles,),
         (output,),
         (Step(0, 1, torch.tensor(0.0)),),
-        Belief(pose, log_likelihood, pose[:, 0], pose[:, 0, 0]),
+        BeliefBatch(pose, log_likelihood, pose[:, 0], pose[:, 0, 0]),
     )
 
 

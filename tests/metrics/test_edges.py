@@ -39,7 +39,7 @@ from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.metrics.scores import auc, median_mm, overall, recall
 from posefilter.metrics.tracks import measure_jitter
 from posefilter.metrics.vsd import TAUS
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 MODEL = square()
 
@@ -286,10 +286,10 @@ def test_found_and_finite_are_both_due() -> None:
     assert math.isnan(empty["add"]["auc"])
 
 
-def belief_at(shifts: list[float], log_w: torch.Tensor) -> Belief:
+def belief_at(shifts: list[float], log_w: torch.Tensor) -> BeliefBatch:
     t = torch.tensor([[x, 0.0, 0.0] for x in shifts])
     poses = make_pose(torch.eye(3).expand(len(t), 3, 3), t)[None]
-    return Belief(poses, log_w[None], poses[:, 0], log_w[None, 0])
+    return BeliefBatch(poses, log_w[None], poses[:, 0], log_w[None, 0])
 
 
 def test_the_quality_of_a_belief_of_two_objects_by_hand() -> None:
@@ -318,11 +318,14 @@ def test_coverage_counts_ranks_up_to_its_level() -> None:
     metric.update(belief, torch.eye(4)[None])
     inside = metric.compute()
     assert inside["rank"] <= 0.5
-    assert (inside["coverage_50"], inside["coverage_90"]) == (100, 100)
+    assert (inside["distance_coverage_50"], inside["distance_coverage_90"]) == (100, 100)
     outside = torch.eye(4)[None].clone()
     outside[0, 0, 3] = 3.0
     metric.update(belief, outside)
-    assert (metric.compute()["coverage_50"], metric.compute()["coverage_90"]) == (50, 50)
+    assert (metric.compute()["distance_coverage_50"], metric.compute()["distance_coverage_90"]) == (
+        50,
+        50,
+    )
 
 
 def test_a_point_belongs_to_a_part_within_a_tenth_of_the_diameter() -> None:

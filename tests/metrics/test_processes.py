@@ -21,7 +21,7 @@ from posefilter.metrics.credibility import Credibility, TruthScores
 from posefilter.metrics.diagnostics import FilterDiagnostics
 from posefilter.metrics.parts import PartIoU
 from posefilter.metrics.visibility import ErrorsByVisibility
-from posefilter.types import Belief, ParticleOutput, Particles, Step, Trace
+from posefilter.types import BeliefBatch, ParticleOutput, Particles, Step, Trace
 
 MODEL = square()
 HALVES = {"left": MODEL.points[MODEL.points[:, 0] < 0], "right": MODEL.points}
@@ -52,9 +52,9 @@ def trace_of(part: slice) -> Trace:
     return Trace((particles,), (output,), (Step(0, 1, torch.tensor(0.0)),), belief_of(part))
 
 
-def belief_of(part: slice) -> Belief:
+def belief_of(part: slice) -> BeliefBatch:
     log_w = torch.log_softmax(NUMBERS[0, part], 1)
-    return Belief(CLOUD[part], log_w, CLOUD[part, 0], log_w[:, 0])
+    return BeliefBatch(CLOUD[part], log_w, CLOUD[part, 0], log_w[:, 0])
 
 
 TRUTH, GUESS = BATCH.camera_from_object, CLOUD[:, 0]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from posefilter.errors import UserError
-from posefilter.metrics.registry import HIGHER, LOWER, METRICS, find_metric, read_number
+from posefilter.metrics.registry import HIGHER, LOWER, METRICS, find_metric, read_number, rename_key
 
 HOME = Path(__file__).parents[2]
 
@@ -42,6 +42,8 @@ def test_a_number_is_written_in_its_unit() -> None:
         ("diagnostics/off_frame/last", "diagnostics/off_frame"),
         ("val/diagnostics/heading", "diagnostics/heading"),
         ("filter/ess/step_03", "filter/ess"),
+        ("val/belief/coverage_90", "belief/distance_coverage_90"),
+        ("belief/coverage_50", "belief/distance_coverage_50"),
     ],
 )
 def test_every_way_to_write_a_key_leads_to_its_metric(key: str, known: str) -> None:
@@ -74,6 +76,16 @@ def test_numbers_are_read_where_they_are() -> None:
         "add",
     ):
         assert read_number(metrics, key) is None
+
+
+def test_numbers_are_read_by_earlier_names() -> None:
+    old, new = {"coverage_50": 48.0}, {"distance_coverage_50": 47.0}
+    assert read_number({"belief": old}, "belief/distance_coverage_50") == 48.0
+    assert read_number({"belief": old | new}, "belief/distance_coverage_50") == 47.0
+    assert read_number({"belief": old}, "belief/distance_coverage_90") is None
+    assert rename_key("val/belief/coverage_50") == "val/belief/distance_coverage_50"
+    assert rename_key("credibility/coverage_50") == "credibility/coverage_50"
+    assert rename_key("val/belief/distance_coverage_50") == "val/belief/distance_coverage_50"
 
 
 def test_better_is_the_way_that_a_better_filter_goes() -> None:

@@ -27,7 +27,7 @@ from posefilter.models.pose_pf import PosePF
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.nets.paper_likelihood import PaperLikelihood
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.types import Batch, Belief
+from posefilter.types import Batch, BeliefBatch
 
 SIGMA = (0.01, 0.2)
 
@@ -117,7 +117,7 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
     g = torch.Generator().manual_seed(0)
     truth = batch.camera_from_object
     start = perturb(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
-    belief = Belief(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
+    belief = BeliefBatch(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
     with torch.no_grad():
         scene = trained.encode(batch)
         climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])

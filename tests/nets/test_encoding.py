@@ -34,7 +34,7 @@ def maps(encoder: nn.Module, rgb: Tensor, depth: Tensor) -> list[Tensor]:
     """Return each map that an encoder makes, as (B, h, w, F)."""
     said = encoder(rgb, depth, K.to(rgb).expand(len(rgb), 3, 3))
     if isinstance(encoder, ObjectCoordinateNet):
-        return [said.logit[..., None], said.log_share, said.position.flatten(3), said.features]
+        return [said.logit[..., None], said.log_prob, said.position.flatten(3), said.features]
     return [said.levels[0].permute(0, 2, 3, 1), said.objectness[..., None]]
 
 

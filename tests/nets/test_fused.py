@@ -130,7 +130,7 @@ def test_what_is_kept_of_a_network_goes_when_the_network_changes() -> None:
         return fused.score(likelihood, image, poses, torch.tensor(sigma), CENTER, RADIUS, noise)
 
     def anew(sigma: float) -> torch.Tensor:
-        fused.KEPT.clear()
+        fused.CACHE.clear()
         return score(sigma)
 
     with torch.no_grad():
@@ -148,7 +148,7 @@ def test_what_is_kept_of_a_network_goes_when_the_network_changes() -> None:
         assert torch.equal(halved, anew(0.02))
         for level in range(70):
             score(0.01 + 0.001 * level)
-        assert 1 <= fused.KEPT.count(likelihood) <= 32
+        assert 1 <= fused.CACHE.count(likelihood) <= 32
 
 
 def test_weights_are_computed_once_for_a_noise_level(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,5 +175,5 @@ def test_every_parameter_that_weights_depend_on_is_watched() -> None:
             fused.score(*arguments)
             parameter.mul_(1.1)
             kept = fused.score(*arguments)
-            fused.KEPT.clear()
+            fused.CACHE.clear()
             assert torch.equal(kept, fused.score(*arguments))

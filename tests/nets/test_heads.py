@@ -119,7 +119,7 @@ def test_a_pose_of_fragments_is_that_of_the_likeliest() -> None:
     pose, said = code(raw, point)
     assert said is not None
     assert is_rigid(pose)
-    torch.testing.assert_close(said.log_share.logsumexp(-1), torch.zeros(2, 6), atol=1e-5, rtol=0)
+    torch.testing.assert_close(said.log_prob.logsumexp(-1), torch.zeros(2, 6), atol=1e-5, rtol=0)
     back = (transform(invert(pose), point[:, :, None])[:, :, 0] - center) / radius
     chosen = raw[..., 6 : 6 + K].argmax(-1)
     for i, j in ((0, 0), (1, 3)):

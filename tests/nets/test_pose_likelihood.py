@@ -168,7 +168,7 @@ def test_gradients_reach_the_features_but_not_the_predicted_coordinates() -> Non
     assert told.features.grad is not None
     assert told.features.grad.abs().max() > 0
     assert told.position.grad is None
-    assert told.log_share.grad is None
+    assert told.log_prob.grad is None
     assert told.logit.grad is None
 
 

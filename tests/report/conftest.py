@@ -19,8 +19,8 @@ def metrics(auc: float, **others: Any) -> dict[str, Any]:
     belief = {
         "entropy": 2.0,
         "effective_particles": 12.0,
-        "coverage_50": 48.0,
-        "coverage_90": 41.0,
+        "distance_coverage_50": 48.0,
+        "distance_coverage_90": 41.0,
         "mass_2cm": 0.5,
     }
     return {

@@ -1,9 +1,11 @@
 """What is read from a run's folder, and what is said where something is not there."""
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
+from torch.utils.tensorboard import SummaryWriter
 
 from posefilter.errors import UserError
 from posefilter.report.diagnostics import (
@@ -32,6 +34,24 @@ def test_losses_of_earlier_runs_get_todays_names() -> None:
         "train/learning_rate": one,
     }
     assert rename_losses(new) == new
+
+
+def test_numbers_of_earlier_runs_get_todays_names(run: Path) -> None:
+    """In their metrics.json, and in events, which a later version may have gone on with."""
+    file = run / "metrics.json"
+    file.write_text(file.read_text().replace("distance_coverage_", "coverage_"))
+    assert "distance_coverage" not in file.read_text()
+    assert "coverage_90" in json.loads(file.read_text())["belief"]
+    with SummaryWriter(str(run)) as log:
+        log.add_scalar("val/belief/coverage_90", 30.0, 49, walltime=1030.0)
+        log.add_scalar("val/belief/distance_coverage_90", 35.0, 99, walltime=1060.0)
+    record = read_run(run)
+    assert collect_numbers(record)["belief/distance_coverage_90"] == 41.0
+    assert "belief/coverage_90" not in collect_numbers(record)
+    assert record.curves["val/belief/distance_coverage_90"].values == (30.0, 35.0)
+    assert "val/belief/coverage_90" not in record.curves
+    file.unlink()
+    assert collect_numbers(read_run(run))["belief/distance_coverage_90"] == 35.0
 
 
 def test_scalars_and_pictures_are_read(run: Path) -> None:
@@ -67,7 +87,7 @@ def test_diagnostics_are_found(run: Path) -> None:
     assert found["diagnostics/off_frame/last"] == (0.625, True)  # the last step's
     assert found["diagnostics/offset_r2"] == (0.5, False)
     assert found["missed_fraction"] == (0.25, True)
-    assert found["belief/coverage_90"] == (41.0, True)
+    assert found["belief/distance_coverage_90"] == (41.0, True)
     assert found["val_score_drop"] == (20.0, True)
     assert found["particles_on_object"] == (0.75, False)
     assert "diagnostics/auroc" not in found

@@ -6,7 +6,7 @@ from tests.tracking.toy import SPACE, ToyScene, make_toy, walk_pose
 from posefilter.filters.refine import MeanShift
 from posefilter.protocols import Refine
 from posefilter.tracking.fit import QuadraticFit, draw_orthogonal, find_maximum, regress
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 
 def quadratic(x: torch.Tensor, peak: torch.Tensor, curvature: torch.Tensor) -> torch.Tensor:
@@ -46,7 +46,7 @@ def spread_of(refine: Refine, seeds: int = 12) -> float:
         start = SPACE.move(
             truth[None], 0.004 * SPACE.noise_scale(torch.ones(1)) * torch.randn(6, generator=g)
         )
-        belief = Belief(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
+        belief = BeliefBatch(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
         scene = ToyScene(truth, torch.zeros(1))
         errors.append(SPACE.distance(refine(belief, scene, toy, g).best, truth[None]))
     return float(torch.stack(errors).square().mean().sqrt())

@@ -76,7 +76,7 @@ def check_same(
             np.testing.assert_array_equal(two.pose, one.pose)
             np.testing.assert_array_equal(two.belief.samples, one.belief.samples)
             assert two.presence == one.presence
-            assert two.model.name == one.model.name
+            assert two.object_model.name == one.object_model.name
 
 
 @pytest.mark.parametrize("threads", [2, 3, 4])

@@ -16,7 +16,7 @@ from posefilter.belief.summaries import (
     Mode,
     Projection,
     Uncertainty,
-    check_share,
+    check_probability,
     measure_uncertainty,
     project_belief,
 )
@@ -39,7 +39,7 @@ _MOST_SYMMETRIES = 1000
 class Belief:
     """Weighted poses of one object in one image.
 
-    The batch of tensors that a filter itself returns is `posefilter.types.Belief`.
+    The batch of tensors that a filter itself returns is `posefilter.types.BeliefBatch`.
 
     Attributes:
         samples: Poses (N, 4, 4) camera_from_object, float64 [m].
@@ -186,7 +186,7 @@ class Belief:
         Raises:
             UserError: The level is not in [0, 1].
         """
-        check_share(level)
+        check_probability("level", level)
         weights = self._density.log_weights.exp().numpy()
         return self.highest_density_region(level, find_threshold(self._held_out, weights, level))
 
@@ -248,7 +248,7 @@ class Belief:
             level: Share of the weight within the radius.
 
         Raises:
-            UserError: The points have another shape.
+            UserError: The points have another shape, or the level is not in [0, 1].
         """
         at = self.center if points is None else np.asarray(points, dtype=np.float64)
         if at.ndim > 2 or at.shape[-1] != 3:

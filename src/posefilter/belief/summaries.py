@@ -54,17 +54,22 @@ class Marginal:
         return float(self.weights @ self.values)
 
     @property
-    def deviation(self) -> float:
-        """The standard deviation."""
+    def std(self) -> float:
+        """The weighted standard deviation."""
         return math.sqrt(max(0.0, float(self.weights @ np.square(self.values - self.mean))))
 
-    def quantile(self, share: float) -> float:
-        """Return the least value that at least `share` of the weight does not exceed.
+    @property
+    def deviation(self) -> float:
+        """The earlier name of `std`."""
+        return self.std
+
+    def quantile(self, q: float) -> float:
+        """Return the least value that at least a fraction `q` of the weight does not exceed.
 
         Raises:
-            UserError: The share is not in [0, 1].
+            UserError: `q` is not in [0, 1].
         """
-        return find_quantile(self.values, self.weights, share)
+        return find_quantile(self.values, self.weights, q)
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Return the central interval that holds `level` of the weight."""
@@ -126,27 +131,27 @@ class Projection:
     level: float
 
 
-def find_quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """Return the least value that at least `share` of the weight does not exceed.
+def find_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
+    """Return the least value that at least a fraction `q` of the weight does not exceed.
 
     Args:
         values: (N,).
         weights: (N,) that sum to 1.
-        share: In [0, 1].
+        q: In [0, 1].
 
     Raises:
-        UserError: The share is not in [0, 1].
+        UserError: `q` is not in [0, 1].
     """
-    check_share(share)
+    check_probability("quantile q", q)
     order = np.argsort(values, kind="stable")
     mass = np.cumsum(weights[order])
-    return float(values[order][min(int(np.searchsorted(mass, share - 1e-9)), len(values) - 1)])
+    return float(values[order][min(int(np.searchsorted(mass, q - 1e-9)), len(values) - 1)])
 
 
-def check_share(share: float) -> None:
-    """Raise UserError unless a share or level is in [0, 1]."""
-    if not 0 <= share <= 1:
-        raise UserError(f"belief: a share is between 0 and 1, and {share} is not")
+def check_probability(name: str, value: float) -> None:
+    """Raise UserError unless a quantile or level, which the message names, is in [0, 1]."""
+    if not 0 <= value <= 1:
+        raise UserError(f"belief: the {name} is between 0 and 1, and {value} is not")
 
 
 def measure_uncertainty(
@@ -169,6 +174,7 @@ def measure_uncertainty(
         symmetries: (S, 4, 4) object_from_object.
         level: Share of the weight that is meant.
     """
+    check_probability("level", level)
     copies = pose @ symmetries
     rotation, nearest = angle_between(rotation_of(samples)[:, None], rotation_of(copies)).min(1)
     translation = (origin_of(samples, center) - origin_of(copies, center)[nearest]).norm(dim=-1)
@@ -188,6 +194,7 @@ def project_belief(
 
     (N, 4, 4), (N,), (P, 3) [m], (3, 3) [px] -> Projection.
     """
+    check_probability("level", level)
     pixels = project(transform(samples, points), intrinsics)
     share = weights[:, None, None]
     mean = (share * pixels).sum(0)

@@ -26,7 +26,7 @@ from posefilter.meshes.store import MeshStore
 from posefilter.metrics.beliefs import on_object
 from posefilter.metrics.errors import add
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Belief, ParticleOutput, Particles, Trace
+from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Trace
 
 _COLUMNS = 3
 _TILE = tile_width(_COLUMNS)
@@ -119,7 +119,7 @@ def select_image(trace: Trace, i: int) -> Trace:
         # fragments: not for the eye
         tuple(ParticleOutput(*map(take, output[:-1])) for output in trace.outputs),
         tuple(step._replace(sigma=take(step.sigma)) for step in trace.steps),
-        Belief(*map(take, trace.belief)),
+        BeliefBatch(*map(take, trace.belief)),
     )
 
 

@@ -69,9 +69,9 @@ LAYOUT: dict[str, dict[str, Chart]] = {
         "diagnostics at the last iteration": ("Multiline", [r"diagnostics/.*/last$"]),
     },
     "4  Is the belief calibrated?": {
-        "truths within the region that holds 50 % and 90 % of the belief [%]": (
+        "coverage of the 50 % and 90 % mean-distance regions [%]": (
             "Multiline",
-            [r"val/belief/coverage_\d+$"],
+            [r"val/belief/(distance_)?coverage_\d+$"],  # both: a run that was begun before
         ),
         "weight near the truth": ("Multiline", [r"val/belief/mass_.*"]),
         "share of the images in which a particle outscores the truth": (
@@ -98,7 +98,7 @@ METRICS = (
     "val/score", "val/best_score",
     "test/add/auc", "test/add/recall_01d", "test/add/median_mm", "test/add_s/auc", "test/iou",
     "test/particles_on_object",
-    "test/seconds_per_image", "test/belief/mass_2cm", "test/belief/coverage_90",
+    "test/seconds_per_image", "test/belief/mass_2cm", "test/belief/distance_coverage_90",
 )  # fmt: skip
 # TensorBoard shows the settings that differ first, five of them unless asked for more; these always
 # count as such.

@@ -121,7 +121,7 @@ def predict_several(job: Job) -> list[Result]:
         results = estimator.predict(rgb, depth, K, instances=cfg.instances, seed=cfg.seed)
     seen = [one for one in results if one.verdict != "absent"]
     absent = [name for name in estimator.objects if name not in {one.object for one in seen}]
-    drawn = [mark_result(one, load_shape(store, one.model)) for one in seen]
+    drawn = [mark_result(one, load_shape(store, one.object_model)) for one in seen]
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")

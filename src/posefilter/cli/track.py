@@ -65,7 +65,7 @@ def track(job: Job) -> None:
     estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)))
     videos, native = open_videos(cfg, estimator.objects)
     store = open_shapes(cfg, estimator.objects)
-    shapes = {model.name: load_shape(store, model) for model in estimator.models}
+    shapes = {model.name: load_shape(store, model) for model in estimator.object_models}
     folder.mkdir(parents=True, exist_ok=True)
     log = TrackLog(folder, native)
     broken: UserError | KeyboardInterrupt | Stopped | None = None
@@ -96,7 +96,7 @@ def track(job: Job) -> None:
     write_poses_csv(folder / POSES, log.list_poses(rows))
     metrics = {
         model.name: compute_figures(own, model)
-        for model in estimator.models
+        for model in estimator.object_models
         if (own := [row for row in rows if row.result.object == model.name])
     }
     write_json(folder / "metrics.json", metrics)
@@ -233,7 +233,7 @@ def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
         Seen(
             one.object,
             one.pose if one.found else None,
-            one.model.center.cpu().double().numpy(),
+            one.object_model.center.cpu().double().numpy(),
             float("nan") if one.presence is None else float(one.presence),
         )
         for one in results

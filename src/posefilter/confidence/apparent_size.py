@@ -74,7 +74,7 @@ def _seen(coordinates: Coordinates, cells: Cells, image: int) -> _Seen:
     member = torch.sigmoid(coordinates.logit[image]).flatten()
     which = ((member > 0.5) & cells.valid[image].flatten()).nonzero()[:, 0]
     which = which[:: max(1, math.ceil(len(which) / _CELLS))]
-    maps = coordinates.log_share, coordinates.position, cells.point
+    maps = coordinates.log_prob, coordinates.position, cells.point
     share, points, measured = (x[image].flatten(0, 1)[which] for x in maps)
     return _Seen(member[which], share, points, measured)
 

@@ -18,7 +18,7 @@ from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.pose_error import subsample
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.nets.coordinates import Cells, Coordinates
-from posefilter.types import Batch, Belief, ObjectModel
+from posefilter.types import Batch, BeliefBatch, ObjectModel
 
 _POINTS = 200  # of the surface: as many as exported weights carry
 _NOISE = 0.005  # [m] of the depth
@@ -26,7 +26,7 @@ _CELLS = 6  # of the network, that a small object covers
 _NEAREST = 0.01  # [m] points before the camera's plane
 
 
-def measure_belief(belief: Belief, model: ObjectModel) -> dict[str, Tensor]:
+def measure_belief(belief: BeliefBatch, model: ObjectModel) -> dict[str, Tensor]:
     """Return how the particles agree with the estimate.
 
     Args:

@@ -37,8 +37,7 @@ from posefilter.figures.particles import color_by_weight, draw_weight_scale, fad
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.images import to_camera, to_picture, to_pose
-from posefilter.types import Belief as BeliefTensors
-from posefilter.types import ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 _SECOND: Color = (226, 110, 0)
 _REACH = {"ring": 44, "square": 20, "diamond": 32}  # [px] of marks, at twice the size
@@ -55,7 +54,7 @@ class Mark(NamedTuple):
 def draw_belief(
     rgb: Any,
     intrinsics: Any,
-    belief: Belief | BeliefTensors,
+    belief: Belief | BeliefBatch,
     model: ObjectModel,
     truth: Any = None,
     title: str = "",
@@ -107,7 +106,7 @@ def draw_belief(
 
 
 def select_single(
-    belief: Belief | BeliefTensors,
+    belief: Belief | BeliefBatch,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the poses (N, 4, 4), weights (N,) that sum to 1, and estimate (4, 4) of a belief about
     one image.

@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.pose import fit_rigid, invert, transform
 from posefilter.geometry.votes import draw_votes
 from posefilter.protocols import HasSurfacePoints, Method, Scene
-from posefilter.types import Belief, ParticleOutput, Particles
+from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 
 def require_surface_points(method: Method) -> HasSurfacePoints:
@@ -82,7 +82,7 @@ class Agreement:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief at the agreed pose.
 
         Its score is the share of the weight that agrees, times the highest likelihood.
@@ -116,7 +116,7 @@ class Agreement:
         log_weights = torch.log_softmax(
             self.effective_particles * support[:, : self.hypotheses].clamp_min(1e-30).log(), dim=1
         )
-        return Belief(votes, log_weights, best, score)
+        return BeliefBatch(votes, log_weights, best, score)
 
     def list_object_points(
         self, output: ParticleOutput, point: Tensor, center: Tensor, radius: float
@@ -130,10 +130,10 @@ class Agreement:
         if fragments is None:
             object_point = transform(invert(output.pose.detach()), point[:, :, None])
             return torch.ones_like(object_point[..., 0]), (object_point - center) / radius
-        log_share, fragment = fragments.log_share.detach().topk(
-            min(self.top_fragments, fragments.log_share.shape[-1]), dim=-1
+        log_prob, fragment = fragments.log_prob.detach().topk(
+            min(self.top_fragments, fragments.log_prob.shape[-1]), dim=-1
         )
-        return log_share.exp(), fragments.position.detach().gather(
+        return log_prob.exp(), fragments.position.detach().gather(
             2, fragment[..., None].expand(-1, -1, -1, 3)
         )
 

@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene, Space
-from posefilter.types import Belief, ParticleOutput, Particles
+from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 _KERNEL_MASS = (
     "log of the weight of all particles, each by its kernel at the estimate: at most 0; no "
@@ -18,11 +18,11 @@ _KERNEL_MASS = (
 )
 
 
-def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor) -> Belief:
+def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor) -> BeliefBatch:
     """Return the belief of each image's particle of highest score.  scores (B, N)."""
     score, index = scores.max(1)
     rows = torch.arange(len(index), device=index.device)
-    return Belief(output.pose, particles.log_weights, output.pose[rows, index], score)
+    return BeliefBatch(output.pose, particles.log_weights, output.pose[rows, index], score)
 
 
 class Argmax:
@@ -42,7 +42,7 @@ class Argmax:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief."""
         return select_particle(particles, output, output.log_likelihood)
 
@@ -67,7 +67,7 @@ class Mean:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief; differentiable in weights and poses."""
         space = (
             method.space if isinstance(method.space, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
@@ -76,7 +76,7 @@ class Mean:
         weighted = torch.where(
             weights > 0, weights * output.log_likelihood, torch.zeros_like(weights)
         )
-        return Belief(
+        return BeliefBatch(
             output.pose, particles.log_weights, space.mean(output.pose, weights), weighted.sum(1)
         )
 
@@ -126,7 +126,7 @@ class DensestMode:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief."""
         mass = kernel_mass(
             particles.state.detach(), particles.log_weights.detach(), method.space, self.bandwidth
@@ -157,7 +157,7 @@ class DensestPose:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief."""
         mass = kernel_mass(
             output.pose.detach(), particles.log_weights.detach(), self.space, self.bandwidth

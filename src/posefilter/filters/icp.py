@@ -12,7 +12,7 @@ from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import HasDepth, Method, Scene
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 _FEW = 10.0  # surface points, by their weights: fewer say nothing
 _GRAZING = 0.3  # cosine of the angle between a measured surface and the way to the camera
@@ -79,8 +79,8 @@ class PointToPlaneIcp:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with the estimate moved; the score stays.
 
         Raises:

@@ -13,7 +13,7 @@ from posefilter.geometry.pose_density import fit_density, log_density
 from posefilter.geometry.pose_sampling import draw_poses, widen
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 
 class ImportanceSampling:
@@ -63,8 +63,8 @@ class ImportanceSampling:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with new particles; without gradient."""
         poses, log_weights = belief.poses, belief.log_weights
         for number in range(self.rounds):

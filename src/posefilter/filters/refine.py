@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.protocols import Method, Refine, Scene, ScoresPoses
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 _RESCORED = (
     "log-likelihood of the refined estimate, up to a constant of the image and of its image "
@@ -21,8 +21,8 @@ class NoRefine:
     """Leave the estimate unchanged."""
 
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief unchanged."""
         return belief
 
@@ -40,8 +40,8 @@ class Compose:
         return next(filter(None, reversed(said)), "")
 
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief after the last refinement."""
         for component in self.components:
             belief = component(belief, scene, method, generator)
@@ -58,14 +58,14 @@ def require_scorer(method: Method) -> ScoresPoses:
     return method
 
 
-def top_poses(belief: Belief, count: int) -> Tensor:
+def top_poses(belief: BeliefBatch, count: int) -> Tensor:
     """Return the estimate and the `count` particles of highest weight.  -> (B, 1 + count, 4, 4)."""
     top = belief.log_weights.topk(min(count, belief.log_weights.shape[1]), dim=1).indices
     rows = torch.arange(len(top), device=top.device)[:, None]
     return torch.cat([belief.best[:, None], belief.poses[rows, top]], dim=1)
 
 
-def select_best(belief: Belief, poses: Tensor, scores: Tensor) -> Belief:
+def select_best(belief: BeliefBatch, poses: Tensor, scores: Tensor) -> BeliefBatch:
     """Return the belief with the pose of highest score as its estimate.  (B, C, 4, 4), (B, C)."""
     score, index = scores.max(1)
     return belief._replace(
@@ -89,8 +89,8 @@ class Rescore:
         self.top_k, self.pixels, self.sigma = top_k, pixels, sigma
 
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with the pose of highest score as its estimate."""
         scorer, poses = require_scorer(method), top_poses(belief, self.top_k)
         with torch.no_grad():
@@ -140,8 +140,8 @@ class MeanShift:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with the estimate shifted; without gradient."""
         scorer, best = require_scorer(method), belief.best
         for index in range(self.iterations):
@@ -193,8 +193,8 @@ class Gradient:
         self.final_pixels, self.final_sigma = final_pixels, final_sigma
 
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with a refined estimate; without gradient.
 
         Raises:

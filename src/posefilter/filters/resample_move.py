@@ -28,7 +28,7 @@ from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 _NEAREST = 0.005  # least share of the pairs that a difference is drawn from
 _MOST_PARTNERS = 300  # particles of the other half whose differences are used
@@ -87,8 +87,8 @@ class ResampleMove:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with particles of equal weight; without gradient."""
         space, device = method.space, belief.poses.device
         assert isinstance(space, PoseSpace)  # of what `requires` says

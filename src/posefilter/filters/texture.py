@@ -18,7 +18,7 @@ from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import HasColor, Method, Scene, ScoresPoses
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 _DARK = 0.03  # added to colors before the logarithm, so that black does not decide
 _GRAZING = 0.25  # cosine of the angle between a surface and the way to the camera
@@ -182,8 +182,8 @@ class TextureTurns:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with the estimate and its particles turned; the score stays.
 
         Raises:
@@ -313,7 +313,7 @@ def _angles(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _turn_particles(
-    belief: Belief,
+    belief: BeliefBatch,
     turns: Tensor,
     log_posterior: Tensor,
     model: ObjectModel,

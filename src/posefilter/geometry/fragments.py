@@ -72,12 +72,12 @@ def init_fragments(
 
 
 def fragment_errors(
-    log_share: Tensor, position: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
+    log_prob: Tensor, position: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the cross-entropy of the true fragments, and the L1 error of the positions in them.
 
     Args:
-        log_share: (B, *, K) log-probabilities of the fragments.
+        log_prob: (B, *, K) log-probabilities of the fragments.
         position: (B, *, K, 3) predicted position in each fragment.
         centers: (B, K, 3) the fragments' centers.
         reach: The fragments' mean radius, the unit of the L1 error.
@@ -87,5 +87,5 @@ def fragment_errors(
         Cross-entropies (B, *) [nat] and errors (B, *).
     """
     fragment = nearest_fragment(truth, centers)
-    nll = -log_share.gather(-1, fragment[..., None])[..., 0]
+    nll = -log_prob.gather(-1, fragment[..., None])[..., 0]
     return nll, (gather_fragment(position, fragment) - truth).abs().sum(-1) / reach

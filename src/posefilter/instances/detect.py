@@ -17,7 +17,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
 from posefilter.protocols import Scene
-from posefilter.types import Batch, Belief, Trace
+from posefilter.types import Batch, BeliefBatch, Trace
 
 _LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
 
@@ -45,7 +45,7 @@ class Detection(NamedTuple):
     """One object that is found in an image."""
 
     number: int  # of its method
-    belief: Belief  # of one image
+    belief: BeliefBatch  # of one image
     assessment: Assessment | None  # None where the method is not calibrated
     mask: Tensor  # (H, W) bool, the pixels that are its own, of the first method's image
 
@@ -208,7 +208,9 @@ def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Scene]:
     return image, job.method.encode(image)
 
 
-def _assess(method: PoseEstimator, belief: Belief, image: Batch, scene: Scene) -> Assessment | None:
+def _assess(
+    method: PoseEstimator, belief: BeliefBatch, image: Batch, scene: Scene
+) -> Assessment | None:
     return method.assess(Trace((), (), (), belief, scene=scene), image)
 
 

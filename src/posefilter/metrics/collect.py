@@ -14,7 +14,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import entropy, mass_within, on_object, rank_of_truth, spread
 from posefilter.metrics.errors import NearestPoint, add, add_s
 from posefilter.metrics.scores import summarize
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 
 def concat_state(state: Any) -> Tensor:
@@ -140,8 +140,9 @@ class BeliefQuality(Rows):
 
     entropy: of the weights [nat]. effective_particles: 1 / sum w^2. spread_m, spread_rad: about the
     mean pose. mass_01d, mass_2cm: weight of the poses with ADD below 0.1 diameters and 2 cm. rank:
-    mean rank of the truth (0.5 if calibrated). coverage_50, coverage_90: percentage of images whose
-    rank is at most 0.5 and 0.9 (50 and 90 if calibrated, less if overconfident).
+    mean rank of the truth by its mean distance to the particles (0.5 if calibrated).
+    distance_coverage_50, distance_coverage_90: percentage of images whose rank is at most 0.5 and
+    0.9 (50 and 90 if calibrated, less if overconfident); of highest-density sets see `Credibility`.
 
     Args:
         models: The objects.
@@ -164,7 +165,7 @@ class BeliefQuality(Rows):
         self.models = list(models)
         self.points = [subsample(model.points, points) for model in models]
 
-    def update(self, belief: Belief, truth: Tensor, object_id: Tensor | None = None) -> None:
+    def update(self, belief: BeliefBatch, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate beliefs.
 
         Args:
@@ -196,5 +197,6 @@ class BeliefQuality(Rows):
         rows = dim_zero_cat(self.rows)
         out = dict(zip(self.names, rows.mean(0).tolist(), strict=True))
         for percent in (50, 90):
-            out[f"coverage_{percent}"] = float(100 * (rows[:, -1] <= percent / 100).double().mean())
+            inside = (rows[:, -1] <= percent / 100).double().mean()
+            out[f"distance_coverage_{percent}"] = float(100 * inside)
         return out

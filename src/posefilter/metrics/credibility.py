@@ -8,7 +8,7 @@ from torch import Tensor
 
 from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
 from posefilter.metrics.collect import Rows, concat_state
-from posefilter.types import Belief, ObjectModel
+from posefilter.types import BeliefBatch, ObjectModel
 
 LEVELS = tuple(round(0.05 * k, 2) for k in range(1, 20))  # of the coverage curve
 SHOWN = (50, 80, 90, 95)  # [%] levels with a number of their own
@@ -23,7 +23,7 @@ class TruthScores(NamedTuple):
     nonconformity: Tensor  # (B,) mean log density of the belief, less that at the truth [nat]
 
 
-def score_truth(belief: Belief, truth: Tensor, model: ObjectModel) -> TruthScores:
+def score_truth(belief: BeliefBatch, truth: Tensor, model: ObjectModel) -> TruthScores:
     """Return the density of beliefs at the truth, and the share of each that is denser.
 
     The credible set of a level p holds the truth where the rank is below p.  If truths were drawn

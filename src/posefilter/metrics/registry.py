@@ -95,12 +95,13 @@ def _describe_credible() -> tuple[MetricInfo, ...]:
     return tuple(
         MetricInfo(
             f"credibility/coverage_{level}",
-            f"truths within the {level} % credible set",
+            f"coverage of the {level} % credible set",
             "%",
             ".0f",
             limits=PERCENT,
-            short=f"{level} % set",
-            meaning=f"{level} where calibrated; fewer: overconfident; a set of highest density",
+            short=f"{level} % credible set",
+            meaning=f"truths in the highest-density set: {level} where calibrated; fewer: "
+            "overconfident",
         )
         for level in (50, 80, 90, 95)
     )
@@ -199,28 +200,31 @@ _METRICS = (
     ),
     MetricInfo(
         "belief/rank",
-        "credibility rank of the truth",
+        "rank of the truth by mean distance",
         form=".2f",
-        meaning="0.5 where calibrated; near 1: the truth lies outside",
+        meaning="share of the belief that is nearer to the particles than the truth; 0.5 where "
+        "calibrated; near 1: the truth lies outside",
     ),
     MetricInfo(
-        "belief/coverage_50",
-        "truths within the 50 % region",
+        "belief/distance_coverage_50",
+        "coverage of the 50 % mean-distance region",
         "%",
         ".0f",
         limits=PERCENT,
-        short="50 % region",
-        meaning="50 where calibrated; fewer: overconfident",
+        short="50 % distance region",
+        meaning="truths whose mean distance to the particles is within the belief's 50 % quantile: "
+        "50 where calibrated; fewer: overconfident",
     ),
     MetricInfo(
-        "belief/coverage_90",
-        "truths within the 90 % region",
+        "belief/distance_coverage_90",
+        "coverage of the 90 % mean-distance region",
         "%",
         ".0f",
         HIGHER,
         limits=PERCENT,
-        short="90 % region",
-        meaning="90 where calibrated; fewer: overconfident",
+        short="90 % distance region",
+        meaning="truths whose mean distance to the particles is within the belief's 90 % quantile: "
+        "90 where calibrated; fewer: overconfident",
     ),
     MetricInfo(
         "credibility/log_density",
@@ -355,19 +359,19 @@ _METRICS = (
         direction=LOWER,
         meaning="frames without the object in which one is found",
     ),
-    MetricInfo("apparent_size/images", "images that tell the object's size", form=".0f"),
+    MetricInfo("apparent_size/images", "images with a measured scale ratio", form=".0f"),
     MetricInfo(
         "apparent_size/ratio",
-        "apparent size",
+        "scale ratio of depth to mesh",
         form=".2f",
-        meaning="median, relative to the mesh: 1 where depth and intrinsics are right",
+        meaning="median apparent size of the object: 1 where depth and intrinsics are right",
     ),
     MetricInfo(
         "apparent_size/contradicting",
-        "images of a wrong size",
+        "images with a scale mismatch",
         form=".0f",
         direction=LOWER,
-        meaning="where depth or intrinsics cannot be right",
+        meaning="between depth and mesh: there depth or intrinsics cannot be right",
     ),
     # where particles that are pixels are; lists over the iterations
     MetricInfo("diagnostics/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
@@ -487,6 +491,17 @@ _METRICS = (
     MetricInfo("not_finite", "training scalars that are no numbers", form=".0f", direction=LOWER),
 )
 METRICS = {info.key: info for info in _METRICS}
+_RENAMED = {  # keys of files that earlier versions wrote
+    "belief/coverage_50": "belief/distance_coverage_50",
+    "belief/coverage_90": "belief/distance_coverage_90",
+}
+
+
+def rename_key(key: str) -> str:
+    """Return a number's key, or the tag of a logged scalar, as it is called today."""
+    split = re.match(r"(?:val|test)/", key)
+    start = split.end() if split else 0
+    return key[:start] + _RENAMED.get(key[start:], key[start:])
 
 
 def find_metric(key: str) -> MetricInfo:
@@ -495,12 +510,13 @@ def find_metric(key: str) -> MetricInfo:
     Args:
         key: Its key.  That of a logged scalar (`val/add/auc`), of a range of visibility
             (`by_visibility/0.3-0.5/add/auc`), of a part (`parts/by_part/head/box_iou`) and of one
-            end of a list (`diagnostics/off_frame/last`) lead to the same number.
+            end of a list (`diagnostics/off_frame/last`) lead to the same number, earlier names to
+            today's.
 
     Raises:
         UserError: Where there is no such number.
     """
-    bare = re.sub(r"^(?:(?:val|test)/)?(?:by_visibility/[\d.]+-[\d.]+/)?", "", key)
+    bare = re.sub(r"^(?:(?:val|test)/)?(?:by_visibility/[\d.]+-[\d.]+/)?", "", rename_key(key))
     bare = re.sub(r"^parts/by_part/[^/]+/", "parts/", bare)
     for name in (bare, re.sub(r"/(?:first|last)$", "", bare), re.sub(r"/step_\d+$", "", bare)):
         if name in METRICS:
@@ -518,6 +534,11 @@ def read_number(metrics: Mapping[str, Any], key: str) -> float | None:
     Returns:
         The number, None where the file has none or it is not finite.
     """
+    keys = (key, *(old for old, new in _RENAMED.items() if new == key))
+    return next((x for one in keys if (x := _read(metrics, one)) is not None), None)
+
+
+def _read(metrics: Mapping[str, Any], key: str) -> float | None:
     value: Any = metrics
     for name in key.split("/"):
         if isinstance(value, list) and name in ("first", "last"):

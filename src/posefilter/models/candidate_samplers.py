@@ -18,7 +18,7 @@ from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Propagate, Scene
-from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
 @runtime_checkable
@@ -97,7 +97,7 @@ def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) 
     log_weights = torch.log_softmax(output.log_likelihood, dim=1)
     top = log_weights.argmax(1)
     best = output.pose[torch.arange(len(top), device=top.device), top]
-    belief = Belief(output.pose, log_weights, best, output.log_likelihood.amax(1))
+    belief = BeliefBatch(output.pose, log_weights, best, output.log_likelihood.amax(1))
     return Trace((particles,), (output,), (Step(0, 1, sigma),), belief)
 
 

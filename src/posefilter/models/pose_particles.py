@@ -9,7 +9,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.types import Batch, Belief, ObjectModel, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 _LEAST = 1e-6  # score whose logarithm is finite
 
@@ -79,7 +79,7 @@ class Hypotheses(PoseParticles):
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the loss of the network's output, one value for each image."""
         scene = self.encode(batch)
-        none = Belief(*(batch.depth.new_zeros(0) for _ in Belief._fields))
+        none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
         return {"loss": self.loss(Trace((), (), (), none, scene=scene), batch, self.model)}
 
 

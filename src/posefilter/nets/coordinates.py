@@ -28,7 +28,7 @@ class Coordinates(NamedTuple):
     """Output of the coordinate network for h x w cells, K fragments each."""
 
     logit: Tensor  # (B, h, w) logit of membership of the object
-    log_share: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
+    log_prob: Tensor  # (B, h, w, K) log-probability of each fragment, given that it is the object
     # (B, h, w, K, 3) the object point in each fragment, from the object's center, in radii
     position: Tensor
     centers: Tensor  # (B, K, 3) the fragments' centers, likewise
@@ -39,7 +39,7 @@ class Coordinates(NamedTuple):
         """Return the most probable object point of each cell, from the center, in radii, (B, h, w,
         3).
         """
-        return gather_fragment(self.position, self.log_share.argmax(-1))
+        return gather_fragment(self.position, self.log_prob.argmax(-1))
 
     def first(self, count: int) -> "Coordinates":
         """Return the first `count` images."""
@@ -124,7 +124,7 @@ def coordinate_loss(
         (1, 2)
     )
     nll, error = fragment_errors(
-        coordinates.log_share, coordinates.position, coordinates.centers, reach, truth
+        coordinates.log_prob, coordinates.position, coordinates.centers, reach, truth
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
     return 5 * bce + mean(nll + 0.3 * error), mean(distance)
@@ -191,7 +191,7 @@ def flatten_context(coordinates: Coordinates, height: int, width: int) -> Contex
         ..., :rows, :columns
     ]
     share, position = (
-        coordinates.log_share.detach().exp().flatten(1),
+        coordinates.log_prob.detach().exp().flatten(1),
         coordinates.position.detach().flatten(1, 3),
     )
     shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])

@@ -10,7 +10,7 @@ the time.
 import torch
 from torch import Tensor, nn
 
-from posefilter.nets.kept import Kept
+from posefilter.nets.cache import ModuleCache
 from posefilter.nets.linear import has_onednn
 
 _LAST = torch.channels_last
@@ -97,7 +97,7 @@ class ConvNorm(nn.Sequential):
 
         # training updates the statistics without a new version, but it counts its batches
         parts = (conv.weight, norm.weight, norm.bias, mean, variance, count)
-        return KEPT.get(self, parts, dtype, fold)
+        return CACHE.get(self, parts, dtype, fold)
 
 
-KEPT: Kept[tuple[Tensor, Tensor]] = Kept()
+CACHE: ModuleCache[tuple[Tensor, Tensor]] = ModuleCache()

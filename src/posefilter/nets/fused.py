@@ -17,8 +17,8 @@ from posefilter.errors import UserError
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import argmin
 from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.nets.cache import ModuleCache
 from posefilter.nets.coordinates import STRIDE, Context
-from posefilter.nets.kept import Kept
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.linear import has_onednn
 
@@ -97,7 +97,7 @@ def score(
     octaves = likelihood.octaves
     inputs, cells, inside = _inputs(octaves, image, tables, poses, center, radius, noise, spread)
     # a video asks at the same few noise levels in every frame
-    weights = KEPT.get(
+    weights = CACHE.get(
         likelihood,
         _list_parameters(likelihood),
         (float(sigma), dtype),
@@ -316,4 +316,4 @@ def _linear_relu(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
 
 
 _FUSES = has_onednn()
-KEPT: Kept[_Weights] = Kept()
+CACHE: ModuleCache[_Weights] = ModuleCache()

@@ -197,11 +197,11 @@ class PoseLikelihood(nn.Module):
         """
         if points.context is None:
             raise missing_context()
-        log_share, predicted, logit, features = points.context.split(
+        log_prob, predicted, logit, features = points.context.split(
             [1, 3, 1, points.context.shape[-1] - 5], dim=-1
         )
         error = predicted - points.position / radius
-        known = [log_share / 5, torch.sigmoid(logit), logit / 8]
+        known = [log_prob / 5, torch.sigmoid(logit), logit / 8]
         return torch.cat([*known, contract(error), torch.asinh(10 * error), features], dim=-1)
 
     def score_at_level(self, points: Points, level: Tensor, radius: float) -> Tensor:

@@ -63,7 +63,7 @@ def draw_poses(
     Returns:
         Poses (B, count, 4, 4), camera_from_object [m].
     """
-    share, position = coordinates.log_share.exp().flatten(1, 2), coordinates.position.flatten(1, 2)
+    share, position = coordinates.log_prob.exp().flatten(1, 2), coordinates.position.flatten(1, 2)
     weight = (torch.sigmoid(coordinates.logit).flatten(1) + 1e-4) * cells.valid.flatten(1)
     return draw_votes(
         cells.point.flatten(1, 2), weight, share, position, center, radius, count, generator, votes

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from posefilter.metrics.registry import MetricInfo, find_metric, read_number
+from posefilter.metrics.registry import MetricInfo, find_metric, read_number, rename_key
 from posefilter.report.events import Curve
 from posefilter.report.gather import Run
 
@@ -41,7 +41,7 @@ DIAGNOSTICS = (
         0.02,
         "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
-    Diagnostic("belief/coverage_90", 75.0, "The belief is overconfident."),
+    Diagnostic("belief/distance_coverage_90", 75.0, "The belief is overconfident."),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
     Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),
@@ -103,13 +103,13 @@ def read_last_validation(curves: Mapping[str, Curve]) -> tuple[int | None, dict[
 
 
 def flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    """Return nested numbers under joined names; what is no number is left out."""
+    """Return nested numbers under joined names, those of today; what is no number is left out."""
     out: dict[str, float] = {}
     for name, value in content.items():
         if isinstance(value, Mapping):
             out |= flatten(value, f"{prefix}{name}/")
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            out[prefix + name] = float(value)
+            out[rename_key(prefix + name)] = float(value)
     return out
 
 

@@ -9,6 +9,7 @@ from tensorboard.backend.event_processing.event_accumulator import IMAGES, SCALA
 
 from posefilter.errors import UserError
 from posefilter.limits import MOST_BYTES
+from posefilter.metrics.registry import rename_key
 from posefilter.report.images import StoredImage
 
 
@@ -37,10 +38,12 @@ def read_events(folder: Path) -> tuple[dict[str, Curve], list[StoredImage]]:
     log = EventAccumulator(str(folder), size_guidance={SCALARS: 0, IMAGES: 1})
     log.Reload()
     tags = log.Tags()
-    curves = {}
+    logged: dict[str, list[tuple[int, float, float]]] = {}
     for tag in tags["scalars"]:
-        curves[tag] = drop_repeats([(e.step, e.value, e.wall_time) for e in log.Scalars(tag)])
-    curves = rename_losses(curves)
+        # a run that a later version resumed has both names
+        own = logged.setdefault(rename_key(tag), [])
+        own += [(e.step, e.value, e.wall_time) for e in log.Scalars(tag)]
+    curves = rename_losses({tag: drop_repeats(own) for tag, own in logged.items()})
     pictures = []
     for tag in tags["images"]:
         latest = log.Images(tag)[-1]

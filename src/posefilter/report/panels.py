@@ -17,7 +17,10 @@ VALIDATION = {
 }
 BELIEF = {
     "Belief near the truth": ("val/belief/mass_01d", "val/belief/mass_2cm"),
-    "Coverage of the truth": ("val/belief/coverage_50", "val/belief/coverage_90"),
+    "Coverage of the mean-distance regions": (
+        "val/belief/distance_coverage_50",
+        "val/belief/distance_coverage_90",
+    ),
     "Truth outscored": ("val/belief/truth_outscored", "val/belief/truth_outscored_by_wrong"),
     "Effective sample size": ("val/belief/effective_particles",),
     "Spread of the centers": ("val/belief/spread_m",),

@@ -62,7 +62,7 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
 
 
 def _make_detection(result: Result, header: Any) -> Any:
-    belief, model = result.belief, result.model
+    belief, model = result.belief, result.object_model
     covariance = to_ros_covariance(belief.covariance, belief.mean, belief.center)
     middle = result.pose.copy()
     points = model.points.detach().cpu().double().numpy()

@@ -6,7 +6,7 @@ from torch import Generator, Tensor
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene
-from posefilter.types import Belief, ParticleOutput, Particles
+from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 
 class ModeMean:
@@ -30,7 +30,7 @@ class ModeMean:
         scene: Scene,
         method: Method,
         generator: Generator,
-    ) -> Belief:
+    ) -> BeliefBatch:
         """Return the belief."""
         space, poses = method.space, output.pose
         assert isinstance(space, PoseSpace)
@@ -39,7 +39,7 @@ class ModeMean:
         near = space.distance(poses, top[:, None]) < self.reach
         weights = torch.where(near, particles.log_weights, -torch.inf).softmax(1)
         score = (weights * output.log_likelihood).sum(1)
-        return Belief(poses, particles.log_weights, space.mean(poses, weights), score)
+        return BeliefBatch(poses, particles.log_weights, space.mean(poses, weights), score)
 
 
 def smooth(predicted: Tensor, measured: Tensor, space: PoseSpace, noise: float) -> Tensor:

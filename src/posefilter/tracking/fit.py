@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 
 from posefilter.filters.refine import require_scorer
 from posefilter.protocols import Method, Scene
-from posefilter.types import Belief
+from posefilter.types import BeliefBatch
 
 _LONGEST = 1.5  # standard deviations of the perturbations, by which a round moves at most
 
@@ -50,8 +50,8 @@ class QuadraticFit:
 
     @torch.no_grad()
     def __call__(
-        self, belief: Belief, scene: Scene, method: Method, generator: Generator
-    ) -> Belief:
+        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+    ) -> BeliefBatch:
         """Return the belief with the estimate moved."""
         scorer, best, space = require_scorer(method), belief.best, method.space
         for _ in range(self.rounds):

@@ -49,7 +49,7 @@ def make_row(
     errors = (math.nan, math.nan)
     if truth is not None:
         pair = (torch.from_numpy(result.pose)[None], torch.from_numpy(truth).double()[None])
-        points = result.model.points.cpu()
+        points = result.object_model.points.cpu()
         errors = (float(add(*pair, points.double())), float(add_s(*pair, points)))
     return TrackRow(video, frame, *ids, result, truth, *errors)
 

@@ -33,7 +33,7 @@ from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
 from posefilter.tracking.scoring import Glance, check_method
 from posefilter.tracking.settings import FrameBudget, TrackerSettings
 from posefilter.tracking.window import Window, place_window
-from posefilter.types import Batch, Belief, Particles, Trace
+from posefilter.types import Batch, BeliefBatch, Particles, Trace
 
 _WIDE = 0.04  # [m] the highest level at which a tracked frame is measured
 _MODE = 0.02  # [m] about the best particle, over which the estimate is a mean
@@ -84,7 +84,7 @@ class FrameEstimate(NamedTuple):
     """What one frame shows."""
 
     batch: Batch  # the image, or the window of it that was looked at
-    belief: Belief | None  # None where nothing has depth, or the frame cannot be judged
+    belief: BeliefBatch | None  # None where nothing has depth, or the frame cannot be judged
     objectness: float  # the mean objectness of the pixels that the estimate covers
     presence: float  # what the track is judged by
     found: Assessment | None  # the calibrated probabilities
@@ -281,7 +281,9 @@ class Track:
             return fit
         return Compose([fit, PointToPlaneIcp(prior=self.settings.icp_prior)])
 
-    def _correct(self, predicted: State | None, belief: Belief | None, status: str) -> State | None:
+    def _correct(
+        self, predicted: State | None, belief: BeliefBatch | None, status: str
+    ) -> State | None:
         """Return the state after a frame; `belief` is None where what it shows is not trusted.
 
         It is None until a frame shows something: the next one is then the first.
@@ -365,18 +367,20 @@ class Track:
             ahead = torch.eye(4, device=self.method.device)
             ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.model.center.to(ahead)
             state = begin(
-                Belief(ahead[None, None], ahead.new_zeros(1, 1), ahead[None], ahead.new_zeros(1))
+                BeliefBatch(
+                    ahead[None, None], ahead.new_zeros(1, 1), ahead[None], ahead.new_zeros(1)
+                )
             )
         score = state.best.new_full((1,), -torch.inf)
         score = score if sight.belief is None else sight.belief.score
-        belief = Belief(state.belief.state, state.belief.log_weights, state.best, score)
+        belief = BeliefBatch(state.belief.state, state.belief.log_weights, state.best, score)
         trace = Trace((), (), (), belief)
         return Run(
             self.method, sight.batch, trace, 0.0, sight.found, size=sight.size, blank=[blank]
         )
 
 
-def begin(belief: Belief) -> State:
+def begin(belief: BeliefBatch) -> State:
     """Return the state of a belief whose motion is not known."""
     particles = make_particles(belief.poses, 0)._replace(log_weights=belief.log_weights)
     still = belief.best.new_zeros(1, 6)

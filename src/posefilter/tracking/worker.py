@@ -38,20 +38,20 @@ class Answer(NamedTuple):
     """What became of one track."""
 
     memory: Memory
-    result: dict[str, Any]  # the attributes of a `TrackResult`, without its model
+    result: dict[str, Any]  # the attributes of a `TrackResult`, without its `object_model`
 
 
 def update(track: Track, memory: Memory, frame: Frame) -> Answer:
     """Update a track that was elsewhere in the last frame."""
     track.memory = memory
     content = vars(track.update(frame))
-    return Answer(track.memory, {key: x for key, x in content.items() if key != "model"})
+    return Answer(track.memory, {key: x for key, x in content.items() if key != "object_model"})
 
 
 def restore(track: Track, answer: Answer) -> TrackResult:
     """Take over what another process made of a track."""
     track.memory = answer.memory
-    return TrackResult(**answer.result, model=track.method.model)
+    return TrackResult(**answer.result, object_model=track.method.model)
 
 
 def main() -> None:

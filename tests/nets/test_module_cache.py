@@ -6,11 +6,11 @@ import gc
 import torch
 from torch import nn
 
-from posefilter.nets.kept import Kept
+from posefilter.nets.cache import ModuleCache
 
 
 def test_a_value_is_made_once_until_a_tensor_changes() -> None:
-    kept: Kept[float] = Kept()
+    cache: ModuleCache[float] = ModuleCache()
     net, made = nn.Linear(2, 2), []
 
     def ask(module: nn.Module = net, key: str = "sum") -> float:
@@ -18,7 +18,7 @@ def test_a_value_is_made_once_until_a_tensor_changes() -> None:
             made.append(key)
             return float(sum(one.detach().sum() for one in module.parameters()))
 
-        return kept.get(module, module.parameters(), key, make)
+        return cache.get(module, module.parameters(), key, make)
 
     assert ask() == ask()
     assert made == ["sum"]
@@ -36,21 +36,21 @@ def test_a_value_is_made_once_until_a_tensor_changes() -> None:
 
 
 def test_values_go_with_their_module_and_when_they_are_too_many() -> None:
-    kept: Kept[int] = Kept(most=4)
+    cache: ModuleCache[int] = ModuleCache(max_entries=4)
     net = nn.Linear(2, 2)
     for key in range(11):
-        assert kept.get(net, net.parameters(), key, lambda key=key: key) == key
-        assert 1 <= kept.count(net) <= 4
+        assert cache.get(net, net.parameters(), key, lambda key=key: key) == key
+        assert 1 <= cache.count(net) <= 4
     del net
     gc.collect()
-    assert not len(kept._entries)
+    assert not len(cache._entries)
 
 
 def test_tensors_that_tell_no_change_are_never_relied_on() -> None:
-    kept: Kept[float] = Kept()
+    cache: ModuleCache[float] = ModuleCache()
     with torch.inference_mode():
         net = nn.Linear(1, 1)
     made = []
     for _ in range(2):
-        kept.get(net, net.parameters(), 0, lambda: made.append(0) or 0.0)
+        cache.get(net, net.parameters(), 0, lambda: made.append(0) or 0.0)
     assert len(made) == 2

@@ -1,4 +1,4 @@
-"""What is computed from a network's parameters alone, kept until one of them changes."""
+"""A cache of what is computed from a network's parameters alone, until one of them changes."""
 
 from collections.abc import Callable, Hashable, Iterable
 from typing import Generic, NamedTuple, TypeVar
@@ -14,18 +14,18 @@ class _Entry(NamedTuple, Generic[T]):
     values: dict[Hashable, T]
 
 
-class Kept(Generic[T]):
+class ModuleCache(Generic[T]):
     """Values computed from modules' tensors; each is computed once until a tensor changes.
 
     They lie beside the modules, so that neither a copy nor a file of a module holds them.
 
     Args:
-        most: Values of a module that are kept; beyond that they are forgotten.
+        max_entries: Values of a module that are kept; beyond that all of its values are dropped.
     """
 
-    def __init__(self, most: int = 32) -> None:
+    def __init__(self, max_entries: int = 32) -> None:
         self._entries: WeakKeyDictionary[nn.Module, _Entry[T]] = WeakKeyDictionary()
-        self._most = most
+        self._max_entries = max_entries
 
     def get(
         self, module: nn.Module, of: Iterable[Tensor], key: Hashable, make: Callable[[], T]
@@ -47,7 +47,7 @@ class Kept(Generic[T]):
         if key in known:
             return known[key]
         value = make()
-        known = known if len(known) < self._most else {}
+        known = known if len(known) < self._max_entries else {}
         # a new dictionary each time, so that threads may read the old one
         self._entries[module] = _Entry(state, {**known, key: value})
         return value
