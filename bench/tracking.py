@@ -1,4 +1,4 @@
-"""Tracks against single images on YCB-Video's photographs, and losses that are planted.
+"""Tracks against single images on YCB-Video's photographs, and track losses that are induced.
 
     python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--losses]
 
@@ -10,7 +10,7 @@ For each of YCB-Video's objects whose weights ship and that is in the scenes: ev
 then the same frames tracked, in one process. Times are the processor's of this process, so that
 other work on the machine changes them little; the ratio of the two is what to go by. Then the
 frames once more, of which six are replaced by those of another scene: how many are said to show the
-object, and after how many frames it is found again. Sequences are folders of generate.py with
+object, and after how many frames it is recovered. Sequences are folders of generate.py with
 moving= and covered_frames=: there the losses are in the frames. With --together so many objects of
 a scene are tracked at once by one thread, by two that torch shares an operation's work out to, and
 by two processes that have an object each: in turn, by the clock, on an idle machine if the figures
@@ -37,7 +37,7 @@ from posefilter.meshes import ycb
 from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 from posefilter.metrics.tracks import measure_jitter
-from posefilter.tracking.motion import RandomWalk
+from posefilter.tracking.motion import ConstantVelocity
 from posefilter.weights import list_shipped
 
 HOME = Path(__file__).parents[1]
@@ -50,17 +50,17 @@ HEAD = (
     "ratio",
 )  # fmt: skip
 LOSSES = (
-    "object", "scene", "away", "said to be there", "of these in the first", "found after",
+    "object", "scene", "away", "said to be there", "of these in the first", "recovered after",
     "presence with it", "without",
 )  # fmt: skip
 
 
 SEQUENCES = (
     "object", "sequence", "step mm", "step degrees", "frames", "covered", "single: ADD AUC",
-    "tracked", "by seed", "a fixed walk", "lost", "covered: said to be there", "found after",
+    "tracked", "by seed", "random walk", "lost", "covered: said to be there", "recovered after",
 )  # fmt: skip
 SEEDS = (0, 1)  # of the filter, on sequences
-FIXED = RandomWalk(widest=1, momentum=0)
+RANDOM_WALK = ConstantVelocity(velocity_gain=0, max_noise_scale=1)
 TOGETHER = (
     "scene", "objects", "of these away", "frames", "threads", "frame ms", "mean", "slowest",
     "frames/s", "CPU ms", "ADD AUC, mean", "least", "frames lost",
@@ -89,7 +89,7 @@ def judge(
     model = results[0].object_model
     poses = torch.from_numpy(np.stack([one.pose for one in results]))
     truth = torch.from_numpy(np.stack([frame.truth[model.name] for frame in frames]))
-    missed = torch.tensor([not getattr(one, "found", True) for one in results])
+    missed = torch.tensor([not getattr(one, "is_tracked", True) for one in results])
     errors = [f(poses, truth, model.points.double()) for f in (add, add_s)]
     areas = [auc(torch.where(missed, math.inf, error)) for error in errors]
     jitter = measure_jitter(poses, truth, model.center.double())
@@ -130,17 +130,17 @@ def measure_loss(
     name = estimator.objects[0]
     mixed = [other[n] if n in AWAY else frame for n, frame in enumerate(frames)]
     results, _ = run_tracked(estimator, mixed)
-    said = [results[n].found for n in AWAY]
+    said = [results[n].is_tracked for n in AWAY]
     model = estimator.object_models[0]
     back = "not again"
     for n in range(AWAY.stop, len(frames)):
         truth = torch.from_numpy(frames[n].truth[name])[None]
         error = float(add_s(torch.from_numpy(results[n].pose)[None], truth, model.points))
-        if results[n].found and error < 0.1 * model.diameter:
+        if results[n].is_tracked and error < 0.1 * model.diameter:
             back = str(n - AWAY.stop + 1)
             break
     early = sum(said[: posefilter.TrackerSettings().patience - 1])
-    there = min(r.presence for n, r in enumerate(results) if r.found and n not in AWAY)
+    there = min(r.presence for n, r in enumerate(results) if r.is_tracked and n not in AWAY)
     away = max(results[n].presence for n in AWAY)
     row = [str(len(AWAY)), str(sum(said)), str(early), back, f"{there:.2f}", f"{away:.2f}"]
     return [name, "", *row]
@@ -176,14 +176,14 @@ def measure_sequence(
 ) -> str:
     """Return the row of a rendered sequence, in whose middle the object is covered.
 
-    Tracks are of the default settings, and of a walk that is fixed; each the mean over `SEEDS`.
+    Tracks are of the default settings, and of a random walk; each the mean over `SEEDS`.
     """
     name, model = estimator.objects[0], estimator.object_models[0]
     shown = [n for n, frame in enumerate(frames) if name in frame.truth]
     covered = [n for n in range(shown[0], shown[-1]) if n not in shown]
     own = [frames[n] for n in shown]
     single = judge(*_with(own, run_single(estimator, own)))
-    fixed = posefilter.TrackerSettings(motion=FIXED)
+    fixed = posefilter.TrackerSettings(motion=RANDOM_WALK)
     tracks, others = (
         [run_tracked(estimator, frames, settings, seed)[0] for seed in SEEDS]
         for settings in (None, fixed)
@@ -199,7 +199,7 @@ def measure_sequence(
             (
                 str(count)
                 for count, n in enumerate((n for n in shown if n > max(covered)), start=1)
-                if one[n].found and _error(one[n], frames[n]) < 0.1 * model.diameter
+                if one[n].is_tracked and _error(one[n], frames[n]) < 0.1 * model.diameter
             ),
             "not again",
         )
@@ -210,7 +210,7 @@ def measure_sequence(
     cells += [f"{single.add:.1f}", f"{np.mean([one.add for one in scores]):.1f}", by_seed]
     cells += [f"{np.mean([one.add for one in before]):.1f}"]
     cells += [", ".join(str(one.lost) for one in scores)]
-    cells += [", ".join(str(sum(one[n].found for n in covered)) for one in tracks)]
+    cells += [", ".join(str(sum(one[n].is_tracked for n in covered)) for one in tracks)]
     return f"| {' | '.join([*cells, ', '.join(back)])} |"
 
 
@@ -327,7 +327,7 @@ def main() -> None:
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
-    parser.add_argument("--losses", action="store_true", help="the planted losses alone")
+    parser.add_argument("--losses", action="store_true", help="the induced track losses alone")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--together", type=int, action="append", help="objects at once")
     parser.add_argument("--scene", help="of --together; all without it")

@@ -143,11 +143,11 @@ RANGES: dict[str, Range] = {
     # tracker
     "motion.translation_mm": Range(0, 10_000, many=True),  # or by axis
     "motion.rotation_deg": Range(0, 180, many=True),
-    "motion.momentum": SHARE,
-    "motion.widest": Range(1, 1000),
+    "motion.velocity_gain": SHARE,
+    "motion.max_noise_scale": Range(1, 1000),
     **{
-        f"tracker.{effort}.{name}": allowed
-        for effort in ("follow", "look", "search")
+        f"tracker.{part}.{name}": allowed
+        for part in ("follow", "probe", "search")
         for name, allowed in {
             "min_particles": _whole(1, 100_000),
             "max_particles": _whole(1, 100_000),
@@ -159,7 +159,7 @@ RANGES: dict[str, Range] = {
         }.items()
     },
     "tracker.move_scale": Range(0, 100),
-    "tracker.rounds": _whole(0, 10_000),
+    "tracker.quadratic_fits": _whole(0, 10_000),
     "tracker.fit_pixels": COUNT,
     "tracker.icp_prior": Range(0, 1000),
     "tracker.jump_penalty": Range(0, 1000),
@@ -174,7 +174,7 @@ RANGES: dict[str, Range] = {
     "tracker.found_above": SHARE,
     "tracker.patience": COUNT,
     "tracker.search_above": SHARE,
-    "tracker.look_every": COUNT,
+    "tracker.probe_every": COUNT,
     "tracker.search_every": COUNT_OR_NONE,
     # trainer, callbacks
     "trainer.max_steps": _whole(1, 10**12, words=(-1,)),

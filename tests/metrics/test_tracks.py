@@ -13,8 +13,8 @@ SPACE = PoseSpace(CENTER, 0.1)
 
 
 def test_gaps_are_found_with_their_ends() -> None:
-    found = [bool(int(x)) for x in "0110001011"]
-    assert find_gaps(found) == [Gap(0, 1, True), Gap(3, 3, True), Gap(7, 1, True)]
+    tracked = [bool(int(x)) for x in "0110001011"]
+    assert find_gaps(tracked) == [Gap(0, 1, True), Gap(3, 3, True), Gap(7, 1, True)]
     assert find_gaps([True, False, False]) == [Gap(1, 2, False)]
     assert find_gaps([True, True]) == find_gaps([]) == []
 

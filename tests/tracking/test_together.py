@@ -88,7 +88,7 @@ def test_objects_side_by_side_are_where_they_are_one_after_the_other(threads: in
     together = follow(tracker)
     check_same(alone, together)
     assert "lost" in {results[1].status for results in together}
-    assert together[-1][1].found
+    assert together[-1][1].is_tracked
     tracker.reset()
     check_same(alone, follow(tracker))
     tracker.close()
@@ -103,7 +103,7 @@ def test_an_error_of_one_object_is_raised_and_the_others_go_on() -> None:
     for _ in range(2):
         with pytest.raises(ValueError, match="no"):
             follow(tracker, [3])
-    assert all(result.found for result in follow(tracker, [4])[0])
+    assert all(result.is_tracked for result in follow(tracker, [4])[0])
 
 
 def test_nothing_is_lost_with_a_process_that_ends() -> None:
@@ -138,10 +138,10 @@ def test_an_interrupted_frame_leaves_no_answer_for_the_next(
                 follow(tracker, [3])
         assert worker._process.poll() is not None
         for number in (3, 4):
-            assert [one.found for one in follow(tracker, [number])[0]] == [True, False]
+            assert [one.is_tracked for one in follow(tracker, [number])[0]] == [True, False]
         tracker.wait()
         for number in (5, 6, 7):
-            assert [one.found for one in follow(tracker, [number])[0]] == [True, False]
+            assert [one.is_tracked for one in follow(tracker, [number])[0]] == [True, False]
 
 
 def test_a_process_that_ends_again_and_again_is_told() -> None:
@@ -195,9 +195,7 @@ def test_objects_take_turns_to_see_the_whole_image() -> None:
 
 
 def test_lost_objects_take_turns_to_be_searched_for() -> None:
-    """Each is looked for in every second frame, and searched for in every third of these, in six
-    steps more.
-    """
+    """Every second frame is probed for each, and every third of these searched in six steps."""
     toys = [make_toy() for _ in range(3)]
     tracker = posefilter.Tracker([estimator for _, estimator in toys])
     for number in range(16):
@@ -205,13 +203,13 @@ def test_lost_objects_take_turns_to_be_searched_for() -> None:
             toy.scored.clear()
         tracker.update_all(RGB, DEPTH, K)
         if number:
-            turns = [number + turn for turn in range(3)]
-            assert [len(toy.scored) > 0 for toy, _ in toys] == [turn % 2 == 0 for turn in turns]
-            assert [len(toy.scored) > 2 for toy, _ in toys] == [turn % 6 == 0 for turn in turns]
+            counts = [number + phase for phase in range(3)]
+            assert [len(toy.scored) > 0 for toy, _ in toys] == [count % 2 == 0 for count in counts]
+            assert [len(toy.scored) > 2 for toy, _ in toys] == [count % 6 == 0 for count in counts]
 
 
 def test_a_search_costs_a_bounded_number_of_points() -> None:
-    """And none where a look shows nothing; where it shows the object, it follows at once."""
+    """And none where a probe shows nothing; where it shows the object, it follows at once."""
     toy, estimator = make_toy()
     tracker = posefilter.Tracker(estimator, TrackerSettings(search_every=0))
     costs = []

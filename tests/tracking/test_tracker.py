@@ -1,4 +1,4 @@
-"""The tracker on a likelihood that is made by hand: it follows, notices a loss, and finds again."""
+"""The tracker on a likelihood that is made by hand: it follows, notices a loss, and recovers."""
 
 import dataclasses
 
@@ -10,9 +10,9 @@ from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 import posefilter
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.errors import UserError
-from posefilter.tracking.loss_detector import LossDetector
-from posefilter.tracking.motion import RandomWalk
-from posefilter.tracking.settings import FrameBudget, TrackerSettings
+from posefilter.tracking.motion import ConstantVelocity
+from posefilter.tracking.settings import FilterSettings, TrackerSettings
+from posefilter.tracking.track_loss import TrackLossDetector
 
 NONE = np.zeros_like(DEPTH)
 BLACK = np.zeros_like(RGB)
@@ -31,7 +31,7 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
         toy.truth = pose
         result = tracker.update(RGB, DEPTH, K)
         assert result.status == ("tracked" if number else "started")
-        assert result.found
+        assert result.is_tracked
         assert off(result, pose) < 0.008
         assert result.objectness > 0.8
         if number:
@@ -42,9 +42,9 @@ def test_a_moving_object_is_followed_with_few_particles() -> None:
 
 @pytest.mark.parametrize("shift", [0.03, 0.06])
 def test_an_object_that_starts_to_move_fast_is_followed(shift: float) -> None:
-    """The walk widens by itself: a fixed one of 5 mm stays behind by more than a frame's motion."""
+    """The noise grows by itself; a random walk of 5 mm stays behind by over a frame's motion."""
     off_by = []
-    for motion in (RandomWalk(), RandomWalk(widest=1, momentum=0)):
+    for motion in (ConstantVelocity(), ConstantVelocity(velocity_gain=0, max_noise_scale=1)):
         toy, estimator = make_toy()
         tracker = posefilter.Tracker(estimator, TrackerSettings(motion=motion, whole_image_every=0))
         start, distances = walk_pose(1)[0], []
@@ -94,7 +94,7 @@ def test_the_network_proposes_poses_where_it_sees_the_whole_image(
         assert off(result, toy.truth) < 0.01
 
 
-def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
+def test_a_loss_is_noticed_and_the_object_recovered_elsewhere() -> None:
     toy, estimator = make_toy()
     tracker = posefilter.Tracker(estimator)
     truth = walk_pose(12, shift=0.0)
@@ -105,12 +105,12 @@ def test_a_loss_is_noticed_and_the_object_found_again_elsewhere() -> None:
         toy.truth = None if away else pose
         result = tracker.update(RGB, DEPTH, K)
         statuses.append(result.status)
-        assert result.found == (result.status != "lost")
-        if result.found and not away:
+        assert result.is_tracked == (result.status != "lost")
+        if result.is_tracked and not away:
             assert off(result, pose) < 0.01
     assert statuses[8:10] == ["tracked", "lost"]  # two frames without it are a loss
     assert set(statuses[9:18]) == {"lost"}  # nothing is tracked that is not there
-    again = statuses.index("found")
+    again = statuses.index("recovered")
     assert 18 <= again < 21
     assert set(statuses[again + 1 :]) == {"tracked"}
 
@@ -129,9 +129,9 @@ def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object()
         toy.truth = None if 6 <= number < 12 else pose
         results.append(tracker.update(RGB, DEPTH, K))
     assert min(one.objectness for one in results[:8]) > 0.8
-    assert [one.found for one in results[6:12]] == [True] + 5 * [False]
+    assert [one.is_tracked for one in results[6:12]] == [True] + 5 * [False]
     assert all(one.presence < 0.1 and one.probability < one.presence for one in results[6:12])
-    assert any(one.found for one in results[12:15])
+    assert any(one.is_tracked for one in results[12:15])
     assert results[-1].presence > 0.9
     assert off(results[-1], pose) < 0.008
 
@@ -153,14 +153,16 @@ def test_in_doubt_the_network_sees_the_whole_image() -> None:
 
 
 @pytest.mark.parametrize("patience", [1, 3])
-def test_a_loss_detector_counts_frames_in_a_row(patience: int) -> None:
-    detector = LossDetector(TrackerSettings(patience=patience, lost_below=0.2, found_above=0.6))
+def test_a_track_loss_detector_counts_frames_in_a_row(patience: int) -> None:
+    detector = TrackLossDetector(
+        TrackerSettings(patience=patience, lost_below=0.2, found_above=0.6)
+    )
     assert [detector.judge(p)[1] for p in (0.1, 0.5, 0.7)] == ["lost", "lost", "started"]
     for _ in range(3):  # what is between the bounds, or good, starts the count anew
         assert [detector.judge(0.1)[1] for _ in range(patience - 1)] == ["tracked"] * (patience - 1)
         assert detector.judge(0.3) == (True, "tracked")
     assert [detector.judge(0.1)[1] for _ in range(patience)][-1] == "lost"
-    assert [detector.judge(p) for p in (0.5, 0.7)] == [(False, "lost"), (True, "found")]
+    assert [detector.judge(p) for p in (0.5, 0.7)] == [(False, "lost"), (True, "recovered")]
 
 
 def test_one_bad_frame_is_no_loss() -> None:
@@ -170,12 +172,12 @@ def test_one_bad_frame_is_no_loss() -> None:
     toy.truth = pose = walk_pose(1)[0]
     for rgb, depth in ((RGB, DEPTH), (RGB, DEPTH), (RGB, NONE), (BLACK, DEPTH), (RGB, DEPTH)):
         result = tracker.update(rgb, depth, K)
-        assert result.found == (rgb is not BLACK)
+        assert result.is_tracked == (rgb is not BLACK)
         assert off(result, pose) < 0.01
         blank = rgb is BLACK or depth is NONE
         assert (result.objectness == 0) == blank
         assert (result.verdict == "unsure") == blank
-    assert result.status == "found"  # two of them are a loss
+    assert result.status == "recovered"  # two of them are a loss
 
 
 def test_the_first_frame_that_shows_something_is_the_first() -> None:
@@ -194,7 +196,7 @@ def test_the_first_frame_that_shows_something_is_the_first() -> None:
     assert np.array_equal(result.pose, first.pose)
 
 
-def test_what_was_never_there_is_never_found() -> None:
+def test_what_was_never_there_is_never_tracked() -> None:
     _, estimator = make_toy()
     tracker = posefilter.Tracker(estimator)
     results = [tracker.update(RGB, DEPTH, K) for _ in range(8)]
@@ -244,12 +246,12 @@ def test_impossible_settings_are_refused(wrong: dict[str, float], told: str) -> 
         TrackerSettings(**wrong)  # type: ignore[arg-type]
 
 
-def test_impossible_efforts_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    budget = TrackerSettings().follow
+def test_impossible_filters_and_methods_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    follow = TrackerSettings().follow
     with pytest.raises(UserError, match="max_particles=5 is below min_particles=10"):
-        dataclasses.replace(budget, min_particles=10, max_particles=5)
+        dataclasses.replace(follow, min_particles=10, max_particles=5)
     with pytest.raises(UserError, match="noise levels fall"):
-        FrameBudget(10, 20, 0, 2, 0.001, 0.004, 64)
+        FilterSettings(10, 20, 0, 2, 0.001, 0.004, 64)
     toy, estimator = make_toy()
     monkeypatch.setattr(type(toy), "provides", ("pose", "pose_space", "score_poses", "objectness"))
     toy.__dict__.pop("capabilities", None)

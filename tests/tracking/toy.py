@@ -83,9 +83,9 @@ class Toy(PoseEstimator):
         return ToyScene(self.truth, near.float().view(1, 1, height // 4, width // 4))
 
     def measure(self, scene: Any, particles: Any, step: Any, generator: Generator) -> Any:
-        from posefilter.tracking.scoring import Glance
+        from posefilter.tracking.scoring import FrameScorer
 
-        return Glance(self, scene, 64).measure(scene, particles, step, generator)
+        return FrameScorer(self, scene, 64).measure(scene, particles, step, generator)
 
     def score_poses(
         self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int

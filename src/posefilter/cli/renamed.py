@@ -75,9 +75,14 @@ KEYS = {
     "tracker.search.least": "tracker.search.min_particles",
     "tracker.search.most": "tracker.search.max_particles",
     "tracker.fit_points": "tracker.fit_pixels",
+    "tracker.rounds": "tracker.quadratic_fits",
+    "tracker.motion.momentum": "tracker.motion.velocity_gain",
+    "tracker.motion.widest": "tracker.motion.max_noise_scale",
+    "tracker.look_every": "tracker.probe_every",
+    "tracker.look": "tracker.probe",
     **{
-        f"tracker.{part}.{old}": f"tracker.{part}.{new}"
-        for part in ("follow", "look", "search")
+        f"tracker.{part}.{old}": f"tracker.{now}.{new}"
+        for part, now in (("follow", "follow"), ("look", "probe"), ("search", "search"))
         for old, new in (
             ("start", "initial_sigma"),
             ("stop", "final_sigma"),
@@ -274,7 +279,10 @@ def _rename_key(key: str) -> str:
     if head in GROUPS:
         group = GROUPS[head]
         return f"{_NODES.get(group, group.replace('/', '.'))}.{rest}"
-    return f"{KEYS[head]}.{rest}" if head in KEYS else key
+    parts = key.split(".")
+    places = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+    place = next((one for one in places if one in KEYS), None)
+    return key if place is None else KEYS[place] + key.removeprefix(place)
 
 
 def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:

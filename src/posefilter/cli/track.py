@@ -32,14 +32,14 @@ from posefilter.figures.recording import check_viewer
 from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
 from posefilter.metrics.bop_results import write_poses_csv
-from posefilter.tracking.motion import RandomWalk
+from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.records import (
     compute_figures,
     describe_row,
     make_row,
     write_rows,
 )
-from posefilter.tracking.settings import FrameBudget, TrackerSettings
+from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track import TrackResult
 from posefilter.tracking.tracker import Tracker
 
@@ -205,7 +205,7 @@ def read_frame(video: Video, index: int, tracker: Tracker) -> VideoFrame | None:
 
 def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) -> None:
     """Say why, where an object is lost in every frame and its guesses are implausible."""
-    if not results or any(one.found for one in results):
+    if not results or any(one.is_tracked for one in results):
         return
     kinds: dict[str, list[str]] = {}  # numbers differ from frame to frame
     for warning in (warning for one in results for warning in one.warnings):
@@ -213,17 +213,17 @@ def _say_all_lost(name: str, results: Sequence[TrackResult], cfg: DictConfig) ->
     if kinds:
         most = max(kinds.values(), key=len)
         reason, frames = most[0], len(most)
-        said = f"warning: {name} is found in no frame; in {frames} of {len(results)} {reason}"
+        said = f"warning: {name} is tracked in no frame; in {frames} of {len(results)} {reason}"
         say(cfg.console, "warning", said, object=name, frames=frames, reason=reason)
 
 
 def draw_frame(
     frame: VideoFrame, results: Sequence[TrackResult], shapes: dict[str, Shape]
 ) -> np.ndarray:
-    """Draw the objects that are found; the legend names those that are lost, too."""
-    found = [one for one in results if one.found]
-    drawn = [Drawn(f"{one.object}: {one.status}", one.pose, shapes[one.object]) for one in found]
-    lost = [one.object for one in results if not one.found]
+    """Draw the objects that are tracked; the legend names those that are lost, too."""
+    tracked = [one for one in results if one.is_tracked]
+    drawn = [Drawn(f"{one.object}: {one.status}", one.pose, shapes[one.object]) for one in tracked]
+    lost = [one.object for one in results if not one.is_tracked]
     return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=_name_lost(lost))
 
 
@@ -232,7 +232,7 @@ def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
     return [
         Seen(
             one.object,
-            one.pose if one.found else None,
+            one.pose if one.is_tracked else None,
             one.object_model.center.cpu().double().numpy(),
             float("nan") if one.presence is None else float(one.presence),
         )
@@ -254,8 +254,8 @@ def make_settings(node: DictConfig) -> TrackerSettings:
         return TrackerSettings(
             **{
                 **plain,
-                "motion": RandomWalk(**plain["motion"]),
-                **{name: FrameBudget(**plain[name]) for name in ("follow", "look", "search")},
+                "motion": ConstantVelocity(**plain["motion"]),
+                **{x: FilterSettings(**plain[x]) for x in ("follow", "probe", "search")},
             }
         )
     except TypeError as error:

@@ -50,8 +50,8 @@ class TrackLog:
         self._header = ""
 
     def list_poses(self, rows: Sequence[TrackRow]) -> list[PoseRow]:
-        """Return the rows of the results file: of frames in which the object was found."""
-        return [to_pose_row(row, self._native) for row in rows if row.result.found]
+        """Return the rows of the results file: of frames in which the object was tracked."""
+        return [to_pose_row(row, self._native) for row in rows if row.result.is_tracked]
 
     def close(self) -> None:
         """Close the two files, which stay."""

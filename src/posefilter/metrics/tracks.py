@@ -11,29 +11,29 @@ from posefilter.geometry.pose_statistics import twist_between
 
 
 class Gap(NamedTuple):
-    """Frames in a row in which an object was not found."""
+    """Frames in a row in which an object was not tracked."""
 
     start: int  # the first of them
-    length: int  # number of frames until it was found again, or the track ended
-    ended: bool  # whether it was found again
+    length: int  # number of frames until it was tracked again, or the track ended
+    ended: bool  # whether it was tracked again
 
 
-def find_gaps(found: Sequence[bool]) -> list[Gap]:
+def find_gaps(tracked: Sequence[bool]) -> list[Gap]:
     """Return the gaps of a track, in their order.
 
     Args:
-        found: Of each frame, whether the object was found in it.
+        tracked: Of each frame, whether the object was tracked in it.
     """
     gaps: list[Gap] = []
     start: int | None = None
-    for number, one in enumerate(found):
+    for number, one in enumerate(tracked):
         if not one and start is None:
             start = number
         elif one and start is not None:
             gaps.append(Gap(start, number - start, True))
             start = None
     if start is not None:
-        gaps.append(Gap(start, len(found) - start, False))
+        gaps.append(Gap(start, len(tracked) - start, False))
     return gaps
 
 

@@ -37,7 +37,7 @@ def to_ros_covariance(covariance: np.ndarray, pose: np.ndarray, center: np.ndarr
 
 def list_shown(results: Sequence[Result]) -> list[Result]:
     """Return the results of objects that are not absent; of tracks, those that are not lost."""
-    return [one for one in results if getattr(one, "found", one.verdict != "absent")]
+    return [one for one in results if getattr(one, "is_tracked", one.verdict != "absent")]
 
 
 def make_quaternion(pose: np.ndarray) -> list[float]:

@@ -11,7 +11,7 @@ from posefilter.filters.refine import require_scorer
 from posefilter.protocols import Method, Scene
 from posefilter.types import BeliefBatch
 
-_LONGEST = 1.5  # standard deviations of the perturbations, by which a round moves at most
+_LONGEST = 1.5  # standard deviations of the perturbations, by which an iteration moves at most
 
 
 class QuadraticFit:
@@ -24,7 +24,7 @@ class QuadraticFit:
     holds what the likelihood leaves open: a constant likelihood leaves the estimate in place.
 
     Args:
-        rounds: Number of fits, each about the estimate of the one before.
+        iterations: Number of fits, each about the estimate of the one before.
         pairs: Antithetic pairs of a fit, at least 8.
         spread: Standard deviation of the perturbations [m on the object's surface].
         sigma: Noise level of the likelihood [m].
@@ -38,14 +38,14 @@ class QuadraticFit:
 
     def __init__(
         self,
-        rounds: int = 1,
+        iterations: int = 1,
         pairs: int = 16,
         spread: float = 0.006,
         sigma: float = 0.004,
         pixels: int = 256,
         reach: float = 2.0,
     ) -> None:
-        self.rounds, self.pairs, self.spread, self.sigma = rounds, pairs, spread, sigma
+        self.iterations, self.pairs, self.spread, self.sigma = iterations, pairs, spread, sigma
         self.pixels, self.reach = pixels, reach
 
     @torch.no_grad()
@@ -54,7 +54,7 @@ class QuadraticFit:
     ) -> BeliefBatch:
         """Return the belief with the estimate moved."""
         scorer, best, space = require_scorer(method), belief.best, method.space
-        for _ in range(self.rounds):
+        for _ in range(self.iterations):
             scale = space.noise_scale(best.new_tensor(self.spread))
             noise = draw_orthogonal(best, self.pairs, space.dimensions, generator)
             moves = torch.cat([noise, -noise], dim=1) * scale

@@ -9,26 +9,26 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.protocols import Space
 
-_UNKNOWN = 2.0  # the factor while the last motion is not known
+_UNKNOWN = 2.0  # the noise scale while the last motion is not known
 _JUMP = 3.0  # standard deviations of an innovation, beyond which it is no motion
 _MEMORY = 0.5  # share of the frames before in the mean of what the innovations tell
 
 
-class RandomWalk:
-    """A random walk on SE(3) about the motion of the last frame, as wide as innovations tell.
+class ConstantVelocity:
+    """A damped constant-velocity model on SE(3), whose process noise adapts to the innovations.
 
     Between two frames a pose moves by `move_about` (geometry/pose.py): the object's center by a
     shift in the camera's axes, then a turn about that center in the object's own axes. Both are
-    Gaussian about a drift, with the standard deviations s that are given, times a factor f.
+    Gaussian about a drift, with the standard deviations s that are given, times a noise scale f.
 
-    The drift is momentum (1 - 1 / d)_+ v, where v is the last frame's motion, a difference of two
-    estimates, and d the sum of its three shifts' squares, each over its own s^2: the positive-part
-    estimator of James and Stein (1961). What the walk explains is not continued: below one s there
-    is no drift. With momentum 1 and a fast motion it is the model of constant velocity (Bar-Shalom,
-    Li and Kirubarajan 2001, section 6.3); with momentum 0, and f = 1, the covariance of t frames is
-    t times that of one.
+    The drift is velocity_gain (1 - 1 / d)_+ v, where v is the last frame's motion, a difference of
+    two estimates, and d the sum of its three shifts' squares, each over its own s^2: the
+    positive-part estimator of James and Stein (1961). What the noise explains is not continued:
+    below one s there is no drift. With a gain of 1 and a fast motion it is the model of constant
+    velocity (Bar-Shalom, Li and Kirubarajan 2001, section 6.3); with a gain of 0, and f = 1, it is
+    a random walk: the covariance of t frames is t times that of one.
 
-    The factor follows the innovations e, which are the estimates less what was predicted
+    The noise scale follows the innovations e, which are the estimates less what was predicted
     (adjustable process noise; Bar-Shalom, Li and Kirubarajan 2001, section 11.2):
     f^2 = max(1, q), q <- (q + z^2) / 2, where z^2 is the mean of (e / s)^2 over the three shifts.
     In the first frame of a motion that is not known f is 2, and q then becomes z^2. Turns have no
@@ -39,8 +39,8 @@ class RandomWalk:
             three [mm].
         rotation_deg: Least standard deviation a frame about the object's x, y, z, one for all or
             three [degrees].
-        momentum: Share of the last frame's motion that is expected again, in [0, 1].
-        widest: The factor at most; 1: the deviations stay as given.
+        velocity_gain: Share of the last frame's motion that is expected again, in [0, 1].
+        max_noise_scale: The noise scale at most; 1: the deviations stay as given.
 
     Raises:
         UserError: A number is out of range.
@@ -54,43 +54,51 @@ class RandomWalk:
         self,
         translation_mm: float | Sequence[float] = 5.0,
         rotation_deg: float | Sequence[float] = 2.0,
-        momentum: float = 1.0,
-        widest: float = 10.0,
+        velocity_gain: float = 1.0,
+        max_noise_scale: float = 10.0,
     ) -> None:
         shift = _three(translation_mm, "translation_mm")
         turn = _three(rotation_deg, "rotation_deg")
-        if not 0 <= momentum <= 1:
-            raise UserError(f"motion.momentum={momentum}: must lie between 0 and 1")
-        if not 1 <= widest < math.inf:
-            raise UserError(f"motion.widest={widest}: must be a number, 1 or more")
+        if not 0 <= velocity_gain <= 1:
+            raise UserError(f"motion.velocity_gain={velocity_gain}: must lie between 0 and 1")
+        if not 1 <= max_noise_scale < math.inf:
+            raise UserError(
+                f"motion.max_noise_scale={max_noise_scale}: must be a number, 1 or more"
+            )
         self.scale = (*(x / 1000 for x in shift), *(math.radians(x) for x in turn))
-        self.momentum, self.widest = float(momentum), float(widest)
+        self.velocity_gain = float(velocity_gain)
+        self.max_noise_scale = float(max_noise_scale)
 
     def expect(self, velocity: Tensor) -> Tensor:
         """Return the drift (1, 6) after a motion (1, 6) [m, rad]."""
         d = 3 * float(self._measure(velocity)[0])
-        return velocity * (self.momentum * max(0.0, 1 - 1 / d) if d else 0.0)
+        return velocity * (self.velocity_gain * max(0.0, 1 - 1 / d) if d else 0.0)
 
-    def adapt(self, square: float | None, innovation: Tensor) -> float:
-        """Return q after an innovation (1, 6) [m, rad]; `square` is q before, None if unknown."""
+    def adapt(self, squared_innovation: float | None, innovation: Tensor) -> float:
+        """Return q after an innovation (1, 6) [m, rad].
+
+        Args:
+            squared_innovation: q before; None where it is not known.
+            innovation: The estimate less what was predicted.
+        """
         found = float(self._measure(innovation)[0])
-        if square is not None:
-            found = _MEMORY * square + (1 - _MEMORY) * found
-        return min(found, self.widest**2)
+        if squared_innovation is not None:
+            found = _MEMORY * squared_innovation + (1 - _MEMORY) * found
+        return min(found, self.max_noise_scale**2)
 
-    def is_jump(self, innovation: Tensor, square: float | None) -> bool:
+    def is_jump(self, innovation: Tensor, squared_innovation: float | None) -> bool:
         """Return whether an innovation (1, 6) is so large that it is the end of an error rather
         than a motion, and tells nothing of the next: three standard deviations of shifts, or six of
         turns.
         """
         shift, turn = self._measure(innovation).tolist()
-        return max(shift, turn / 4) > (_JUMP * self.widen(square)) ** 2
+        return max(shift, turn / 4) > (_JUMP * self.noise_scale(squared_innovation)) ** 2
 
-    def widen(self, square: float | None) -> float:
-        """Return the factor f of the standard deviations, 1 or more; `square` as of `adapt`."""
-        if square is None:
-            return min(_UNKNOWN, self.widest)
-        return math.sqrt(max(1.0, square))
+    def noise_scale(self, squared_innovation: float | None) -> float:
+        """Return the noise scale f, 1 or more; the innovation as of `adapt`."""
+        if squared_innovation is None:
+            return min(_UNKNOWN, self.max_noise_scale)
+        return math.sqrt(max(1.0, squared_innovation))
 
     def _measure(self, motion: Tensor) -> Tensor:
         """Return the mean squares (2,) of shift and turn, in standard deviations."""
@@ -98,14 +106,14 @@ class RandomWalk:
         return (motion[0] / scale).square().view(2, 3).mean(1)
 
     def __call__(
-        self, state: Tensor, drift: Tensor, factor: float, space: Space, generator: Generator
+        self, state: Tensor, drift: Tensor, noise_scale: float, space: Space, generator: Generator
     ) -> Tensor:
         """Move poses to the next frame.
 
         Args:
             state: (B, N, 4, 4) camera_from_object [m].
             drift: (B, 6) expected motion, shift [m] and turn [rad].
-            factor: Of the standard deviations about it.
+            noise_scale: Of the standard deviations about it.
             space: The space of poses.
             generator: Source of randomness.
 
@@ -115,7 +123,9 @@ class RandomWalk:
         noise = torch.randn(
             *state.shape[:2], 6, generator=generator, device=state.device, dtype=state.dtype
         )
-        return space.move(state, drift[:, None] + factor * noise * state.new_tensor(self.scale))
+        return space.move(
+            state, drift[:, None] + noise_scale * noise * state.new_tensor(self.scale)
+        )
 
 
 def _three(value: float | Sequence[float], name: str) -> tuple[float, ...]:

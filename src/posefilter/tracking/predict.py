@@ -8,15 +8,15 @@ from posefilter.filters.resample import Multinomial
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Method, Scene
 from posefilter.tracking.kld import bin_poses, count_needed
-from posefilter.tracking.motion import RandomWalk
+from posefilter.tracking.motion import ConstantVelocity
 from posefilter.types import Batch, Particles
 
 
 def draw_predicted(
     belief: Particles,
     drift: Tensor,
-    factor: float,
-    motion: RandomWalk,
+    noise_scale: float,
+    motion: ConstantVelocity,
     most: int,
     space: PoseSpace,
     generator: Generator,
@@ -26,7 +26,7 @@ def draw_predicted(
     Args:
         belief: Of the frame before, one image.
         drift: (1, 6) expected motion [m, rad].
-        factor: Of the walk's standard deviations.
+        noise_scale: Of the motion model's standard deviations.
         motion: Moves poses to the next frame.
         most: Number of draws.
         space: The space of poses.
@@ -36,7 +36,7 @@ def draw_predicted(
         Poses (1, most, 4, 4) [m].
     """
     drawn = Multinomial()(belief, most, space, generator)
-    return motion(inherit(belief.state, drawn), drift, factor, space, generator)
+    return motion(inherit(belief.state, drawn), drift, noise_scale, space, generator)
 
 
 def take_enough(

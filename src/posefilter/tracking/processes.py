@@ -122,11 +122,11 @@ def _end(process: subprocess.Popen[bytes]) -> None:
             pipe.close()
 
 
-class SideBySide:
+class MultiprocessTracker:
     """Tracks that this process and others update, a share of them each.
 
-    What a track remembers goes to the process that updates it and comes back with the answer, so
-    that a frame's work can be shared out anew, and nothing is lost with a process. Until another
+    A track's snapshot goes to the process that updates it and comes back with the answer, so that
+    a frame's work can be shared out anew, and nothing is lost with a process. Until another
     process has started, this one does all by itself. One that ended is replaced.
 
     Args:
@@ -155,14 +155,14 @@ class SideBySide:
         """Update all tracks with a frame."""
         self._replace_ended()
         ready = [worker for worker in self.workers if worker.ready]
-        shares = share_out([track.burden for track in self.tracks], len(ready) + 1)
+        shares = share_out([track.estimated_cost for track in self.tracks], len(ready) + 1)
         out: dict[int, TrackResult] = {}
         asked: list[tuple[WorkerProcess, list[int]]] = []
         error: Exception | None = None
         try:
             for worker, share in zip(ready, shares[1:], strict=True):
                 asked.append((worker, share))
-                if not worker.ask(Task(frame.images, {i: self.tracks[i].memory for i in share})):
+                if not worker.ask(Task(frame.images, {i: self.tracks[i].snapshot for i in share})):
                     asked.pop()  # it has ended; its share is done below
             out |= {i: self.tracks[i].update(frame) for i in shares[0]}
             while asked:
@@ -215,14 +215,14 @@ class SideBySide:
         self.workers = []
 
 
-def share_out(burdens: Sequence[float], processes: int) -> list[list[int]]:
+def share_out(costs: Sequence[float], processes: int) -> list[list[int]]:
     """Return which of the tracks each process updates: the longest first, each to the process
     that has the least to do (Graham 1969).
     """
     loads = [0.0] * processes
     shares: list[list[int]] = [[] for _ in range(processes)]
-    for i in sorted(range(len(burdens)), key=lambda i: -burdens[i]):
+    for i in sorted(range(len(costs)), key=lambda i: -costs[i]):
         least = loads.index(min(loads))
-        loads[least] += burdens[i]
+        loads[least] += costs[i]
         shares[least].append(i)
     return shares

@@ -69,18 +69,18 @@ def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, A
         of a first frame and the median of the others; and where truths are known `add` and `add_s`
         as in metrics.json, `false_tracks`, and the jitter of frames that follow each other.
     """
-    found = [row.result.found for row in rows]
+    tracked = [row.result.is_tracked for row in rows]
     later = [r.result.seconds for r in rows if r.result.status == "tracked"]
     gaps = [
         gap.length if gap.ended else None
         for video in dict.fromkeys(row.video for row in rows)
-        for gap in find_gaps([row.result.found for row in rows if row.video == video])
+        for gap in find_gaps([row.result.is_tracked for row in rows if row.video == video])
     ]
     seconds = float(np.median(later)) if later else math.nan
     started = [row.result.seconds for row in rows if row.result.status == "started"]
     out: dict[str, Any] = {
         "frames": len(rows),
-        "lost": len(rows) - sum(found),
+        "lost": len(rows) - sum(tracked),
         "gaps": gaps,
         "seconds_started": started[0] if started else None,
         "seconds_tracked": seconds,
@@ -90,10 +90,10 @@ def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, A
     if not known:
         return out
     for name in ("add", "add_s"):
-        errors = [getattr(row, name) if row.result.found else math.inf for row in known]
+        errors = [getattr(row, name) if row.result.is_tracked else math.inf for row in known]
         out[name] = summarize(torch.tensor(errors), model.diameter)
-    wrong = [row for row in known if row.result.found and row.add_s >= 0.1 * model.diameter]
-    absent = [row for row in rows if row.truth is None and row.result.found]
+    wrong = [row for row in known if row.result.is_tracked and row.add_s >= 0.1 * model.diameter]
+    absent = [row for row in rows if row.truth is None and row.result.is_tracked]
     out["false_tracks"] = len(wrong) + len(absent)
     jitters = [measure_row_jitter(run, model) for run in _follow_ups(known)]
     shifts, turns = zip(*jitters, strict=True) if jitters else ((), ())
@@ -109,11 +109,11 @@ def measure_row_jitter(pair: Sequence[TrackRow], model: ObjectModel) -> tuple[fl
 
 
 def _follow_ups(rows: Sequence[TrackRow]) -> list[tuple[TrackRow, TrackRow]]:
-    """Return the pairs of rows, one after the other in a video, in which the object was found."""
+    """Return the pairs of rows, one after the other in a video, in which the object was tracked."""
     return [
         (a, b)
         for a, b in pairwise(rows)
-        if a.video == b.video and a.result.found and b.result.found
+        if a.video == b.video and a.result.is_tracked and b.result.is_tracked
     ]
 
 

@@ -34,8 +34,8 @@ class SupportsQuasiMonteCarlo(Protocol):
         ...
 
 
-class Glance:
-    """An encoded frame whose poses are scored by few image points: a `Method` for the filter.
+class FrameScorer:
+    """Score poses in an encoded frame by few image points: a `Method` for the filter.
 
     Args:
         method: Scores and proposes poses.

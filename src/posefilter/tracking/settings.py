@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from posefilter.errors import UserError
-from posefilter.tracking.motion import RandomWalk
+from posefilter.tracking.motion import ConstantVelocity
 
 
 def check_whole(settings: object, **least: int) -> None:
@@ -15,8 +15,8 @@ def check_whole(settings: object, **least: int) -> None:
 
 
 @dataclass(frozen=True)
-class FrameBudget:
-    """What a frame may cost.
+class FilterSettings:
+    """Settings of the filter that runs in a frame.
 
     Attributes:
         min_particles: Particles of the belief at least.
@@ -61,12 +61,12 @@ class TrackerSettings:
 
     Attributes:
         motion: How an object may move between two frames.
-        follow: What a frame costs while the object is tracked.
-        look: What a first look at the whole image costs while the object is lost.
-        search: What a search costs that starts from the best of that look.
+        follow: The filter while the object is tracked.
+        probe: The filter that probes the whole image for an object that is lost.
+        search: The filter of a search, which starts from the best of a probe.
         move_scale: Standard deviation of the move between two steps, over the noise level.
-        rounds: Fits of a quadratic to the likelihood about the mode's mean that end a frame; 0: the
-            mean as it is.
+        quadratic_fits: Fits of a quadratic to the likelihood about the mode's mean that end a
+            frame; 0: the mean as it is.
         fit_pixels: Image points that a pose is scored from in these fits.
         icp_prior: Standard deviation of that estimate, as the prior of ICP with the measured depth
             [m on the object's surface]; 0: no ICP. A method that keeps no depth has none.
@@ -85,21 +85,21 @@ class TrackerSettings:
         found_above: What a search finds is taken up where its presence is above. While a track's is
             not, the network sees the whole image in the next frame.
         patience: Frames in a row that count against an object that is lost.
-        search_above: While the object is lost, a look whose presence is above is worth a search.
-        look_every: While it is lost and other objects are tracked, too, it is looked for in every
-            so many frames; one object alone is in each.
-        search_every: While it is lost, every so many looks it is searched for anyway; 0: never.
+        search_above: While the object is lost, a probe whose presence is above is worth a search.
+        probe_every: While it is lost and other objects are tracked, too, one frame in so many is
+            probed for it; for one object alone each is.
+        search_every: While it is lost, every so many probes it is searched for anyway; 0: never.
 
     Raises:
         UserError: A number is out of range.
     """
 
-    motion: RandomWalk = field(default_factory=RandomWalk)
-    follow: FrameBudget = FrameBudget(32, 300, 8, 1, 0.008, 0.008, 64)
-    look: FrameBudget = FrameBudget(32, 32, 64, 1, 0.02, 0.02, 32)
-    search: FrameBudget = FrameBudget(64, 64, 64, 6, 0.04, 0.004, 32)
+    motion: ConstantVelocity = field(default_factory=ConstantVelocity)
+    follow: FilterSettings = FilterSettings(32, 300, 8, 1, 0.008, 0.008, 64)
+    probe: FilterSettings = FilterSettings(32, 32, 64, 1, 0.02, 0.02, 32)
+    search: FilterSettings = FilterSettings(64, 64, 64, 6, 0.04, 0.004, 32)
     move_scale: float = 0.4
-    rounds: int = 1
+    quadratic_fits: int = 1
     fit_pixels: int = 128
     icp_prior: float = 0.004
     jump_penalty: float = 5.0
@@ -114,12 +114,12 @@ class TrackerSettings:
     found_above: float = 0.5
     patience: int = 2
     search_above: float = 0.1
-    look_every: int = 2
+    probe_every: int = 2
     search_every: int = 3
 
     def __post_init__(self) -> None:
         """Check the numbers."""
-        check_whole(self, rounds=0, fit_pixels=1, patience=1, look_every=1)
+        check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0)
         least = min(self.move_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
         if not (least >= 0 and self.window_scale >= 1):

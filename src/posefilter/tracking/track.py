@@ -27,11 +27,11 @@ from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
 from posefilter.tracking.frame import Frame
-from posefilter.tracking.loss_detector import LOST, TRACKED, LossDetector
 from posefilter.tracking.objectness import measure_objectness, measure_presence
 from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
-from posefilter.tracking.scoring import Glance, check_method
-from posefilter.tracking.settings import FrameBudget, TrackerSettings
+from posefilter.tracking.scoring import FrameScorer, check_method
+from posefilter.tracking.settings import FilterSettings, TrackerSettings
+from posefilter.tracking.track_loss import LOST, TRACKED, TrackLossDetector
 from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, BeliefBatch, Particles, Trace
 
@@ -45,20 +45,20 @@ class TrackResult(Result):
 
     Attributes:
         status: "started" by an estimate on a single image, "tracked" from the frame before,
-            "found" again after a loss, or "lost": then the pose is no more than a guess.
+            "recovered" after a loss, or "lost": then the pose is no more than a guess.
         objectness: What the network says of the pixels that the object covers: the mean probability
             that they show it. Occlusion lowers it. It is not calibrated.
 
     `presence` and `probability` are those of an estimate on a single image with the same features;
-    a track is judged lost or found by the presence.
+    a track is judged lost or recovered by the presence.
     """
 
     status: str
     objectness: float
 
     @property
-    def found(self) -> bool:
-        """Whether the pose is one to go by."""
+    def is_tracked(self) -> bool:
+        """Whether the pose is one to go by: the object is not lost."""
         return self.status != LOST
 
 
@@ -68,15 +68,15 @@ class State(NamedTuple):
     belief: Particles  # of one image
     best: Tensor  # (1, 4, 4) the estimate, smoothed over time [m]
     velocity: Tensor  # (1, 6) its motion in the last frame [m, rad]
-    surprise: float | None  # what innovations tell of the motion; see `RandomWalk.adapt`
+    squared_innovation: float | None  # fading mean; see `ConstantVelocity.adapt`
 
 
-class Memory(NamedTuple):
+class TrackSnapshot(NamedTuple):
     """All that a track remembers, so that another process can go on with it."""
 
     random: Tensor  # state of the generator
     state: State | None
-    loss_detector: LossDetector
+    loss_detector: TrackLossDetector
     frames: int
 
 
@@ -100,10 +100,10 @@ class Track:
             the image's.
         settings: Of the tracker.
         seed: Decides every random draw.
-        turn: Frames by which its looks at the whole image, and its searches while it is lost, come
+        phase: Frames by which the whole image, and the probes and searches while it is lost, come
             sooner: objects that are tracked together take turns.
-        beside: Whether other objects are tracked, too: while it is lost it is then looked for in
-            every `look_every`-th frame alone.
+        multi_object: Whether other objects are tracked, too: while it is lost, only every
+            `probe_every`-th frame is then probed for it.
 
     Raises:
         UserError: The method cannot be tracked with.
@@ -115,35 +115,36 @@ class Track:
         size: tuple[int | None, int | None],
         settings: TrackerSettings,
         seed: int = 0,
-        turn: int = 0,
-        beside: bool = False,
+        phase: int = 0,
+        multi_object: bool = False,
     ) -> None:
         check_method(method)
         assert isinstance(method.space, PoseSpace)
         self.method, self.space = method, method.space
-        self.size, self.settings, self.seed, self.turn = size, settings, seed, turn
-        self.beside = beside
+        self.size, self.settings, self.seed, self.phase = size, settings, seed, phase
+        self.multi_object = multi_object
         self.reset()
 
     def reset(self) -> None:
         """Forget the object: the next frame is the first."""
         self.generator = torch.Generator(device=self.method.device).manual_seed(self.seed)
         self.state: State | None = None
-        self.loss_detector = LossDetector(self.settings)
+        self.loss_detector = TrackLossDetector(self.settings)
         self.frames = 0
 
     @property
-    def memory(self) -> Memory:
+    def snapshot(self) -> TrackSnapshot:
         """What the next frame depends on."""
-        return Memory(self.generator.get_state(), self.state, self.loss_detector, self.frames)
+        random = self.generator.get_state()
+        return TrackSnapshot(random, self.state, self.loss_detector, self.frames)
 
-    @memory.setter
-    def memory(self, memory: Memory) -> None:
-        self.generator.set_state(memory.random)
-        self.state, self.loss_detector, self.frames = memory[1:]
+    @snapshot.setter
+    def snapshot(self, snapshot: TrackSnapshot) -> None:
+        self.generator.set_state(snapshot.random)
+        self.state, self.loss_detector, self.frames = snapshot[1:]
 
     @property
-    def burden(self) -> float:
+    def estimated_cost(self) -> float:
         """About what the next frame will cost, in frames that are tracked in a window."""
         if self.state is None:
             return 8.0
@@ -177,16 +178,16 @@ class Track:
     def _predict(self, state: State) -> State:
         """Return where the object is expected: draws of the moved belief, of equal weight."""
         settings = self.settings
-        budget = settings.look if self.loss_detector.lost else settings.follow
+        filter_settings = settings.probe if self.loss_detector.lost else settings.follow
         motion = settings.motion
         drift = motion.expect(state.velocity)
         expected = self.space.move(state.best, drift)
         draws = draw_predicted(
             state.belief,
             drift,
-            motion.widen(state.surprise),
+            motion.noise_scale(state.squared_innovation),
             motion,
-            budget.max_particles,
+            filter_settings.max_particles,
             self.space,
             self.generator,
         )
@@ -197,7 +198,7 @@ class Track:
             settings.kld_cell,
             settings.kld_epsilon,
             settings.kld_quantile,
-            budget.min_particles,
+            filter_settings.min_particles,
         )
         return state._replace(belief=make_particles(draws, 0), best=expected)
 
@@ -218,65 +219,67 @@ class Track:
         batch = self._take(seen)
         if frame.blank or not bool(batch.depth.any()):
             return FrameEstimate(batch, None, 0.0, 0.0, None)
-        settings, budget = self.settings, self.settings.follow
-        factor, against = settings.motion.widen(predicted.surprise), settings.jump_penalty
-        if factor > 1:
+        settings, follow = self.settings, self.settings.follow
+        scale = settings.motion.noise_scale(predicted.squared_innovation)
+        against = settings.jump_penalty
+        if scale > 1:
             # from wide levels down; what the network proposes gains on a prior that is thinner
-            # by the factor in each of six dimensions
-            steps = budget.steps + math.ceil(math.log(factor, 4))
-            level = max(budget.initial_sigma, min(_WIDE, factor * budget.initial_sigma))
-            budget = replace(
-                budget, steps=steps, initial_sigma=level, proposals=3 * budget.proposals
+            # by the scale in each of six dimensions
+            steps = follow.steps + math.ceil(math.log(scale, 4))
+            level = max(follow.initial_sigma, min(_WIDE, scale * follow.initial_sigma))
+            follow = replace(
+                follow, steps=steps, initial_sigma=level, proposals=3 * follow.proposals
             )
-            against = max(0.0, against - 6 * math.log(factor))
+            against = max(0.0, against - 6 * math.log(scale))
         elif window is not None:  # what it shows is the predicted belief's already
-            budget = replace(budget, proposals=0)
+            follow = replace(follow, proposals=0)
         scene, start = self.method.encode(batch), predicted.belief.state
-        return self._filter(batch, scene, start, budget, settings.rounds, against)
+        return self._filter(batch, scene, start, follow, settings.quadratic_fits, against)
 
     def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
-        """Look for a lost object in the whole image, and search where that is worth it."""
+        """Probe the whole image for a lost object, and search where that is worth it."""
         batch = self._take(frame.see_whole(self.size))
         if frame.blank or not bool(batch.depth.any()):
             return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, scene = self.settings, self.method.encode(batch)
-        seen = self._filter(batch, scene, predicted.belief.state, settings.look, 0)
-        if seen.presence < settings.search_above and not self._search_is_due:
-            return seen
-        assert seen.belief is not None
-        begun, budget = begin(seen.belief).belief, settings.search
-        drawn = Multinomial()(begun, budget.min_particles, self.space, self.generator)
+        probed = self._filter(batch, scene, predicted.belief.state, settings.probe, 0)
+        if probed.presence < settings.search_above and not self._search_is_due:
+            return probed
+        assert probed.belief is not None
+        begun, search = begin(probed.belief).belief, settings.search
+        drawn = Multinomial()(begun, search.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
-        return self._filter(batch, scene, start, budget, settings.rounds)
+        return self._filter(batch, scene, start, search, settings.quadratic_fits)
 
     def _filter(
         self,
         batch: Batch,
         scene: Any,
         start: Tensor,
-        budget: FrameBudget,
-        rounds: int,
+        filter_settings: FilterSettings,
+        quadratic_fits: int,
         against: float = 0.0,
     ) -> FrameEstimate:
         """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
-        settings = self.settings
+        particles = min(start.shape[1], 2 * filter_settings.min_particles)
         filter = ParticleFilter(
-            particles=min(start.shape[1], 2 * budget.min_particles),  # after the first step
-            steps=budget.steps,
-            initialize=FromBelief(start, budget.proposals),
-            schedule=Geometric(budget.initial_sigma, budget.final_sigma),
+            particles=particles,  # after the first step
+            steps=filter_settings.steps,
+            initialize=FromBelief(start, filter_settings.proposals),
+            schedule=Geometric(filter_settings.initial_sigma, filter_settings.final_sigma),
             reweight=CurrentLikelihood(),
             resample=Systematic(),
-            propagate=Gaussian(settings.move_scale),
+            propagate=Gaussian(self.settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=self._refine(rounds),
+            refine=self._refine(quadratic_fits),
         )
-        glance = Glance(self.method, scene, budget.pixels, budget.proposals, against)
-        return self._weigh(batch, filter(batch, glance, self.generator))
+        pixels, proposals = filter_settings.pixels, filter_settings.proposals
+        scorer = FrameScorer(self.method, scene, pixels, proposals, against)
+        return self._weigh(batch, filter(batch, scorer, self.generator))
 
-    def _refine(self, rounds: int) -> Refine:
+    def _refine(self, quadratic_fits: int) -> Refine:
         """Return what improves a frame's estimate: the likelihood, then the measured depth."""
-        fit = QuadraticFit(rounds, pixels=self.settings.fit_pixels)
+        fit = QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)
         if not self.settings.icp_prior or "depth" not in self.method.capabilities:
             return fit
         return Compose([fit, PointToPlaneIcp(prior=self.settings.icp_prior)])
@@ -292,45 +295,47 @@ class Track:
         if belief is None:
             if predicted is None:
                 return None
-            # what is hidden must not be looked for all over the image, by a track's low bar
-            return predicted._replace(velocity=torch.zeros_like(predicted.velocity), surprise=0.0)
+            # what is hidden must not be searched for all over the image, by a track's low bar
+            still = torch.zeros_like(predicted.velocity)
+            return predicted._replace(velocity=still, squared_innovation=0.0)
         begun = begin(belief)
         if predicted is None or self.state is None or status != TRACKED:
             return begun
         center = belief.best.new_tensor(self.space.center)
         innovation = twist_between(predicted.best, belief.best, center)
-        if motion.is_jump(innovation, predicted.surprise):
+        if motion.is_jump(innovation, predicted.squared_innovation):
             return begun
         best = smooth(predicted.best, belief.best, self.space, self.settings.smoothing_noise)
         return begun._replace(
             best=best,
             velocity=twist_between(self.state.best, best, center),
-            surprise=motion.adapt(predicted.surprise, innovation),
+            squared_innovation=motion.adapt(predicted.squared_innovation, innovation),
         )
 
     # -- what is looked at, and what it says ------------------------------------------------------
 
     @property
-    def _looks(self) -> tuple[int, bool]:
-        """How often it has been its turn to be looked for, and whether it is now."""
-        every = self.settings.look_every if self.beside else 1
-        number, left = divmod(self.frames + self.turn, every)
+    def _probes(self) -> tuple[int, bool]:
+        """How often a probe would have been due, and whether one is due now."""
+        every = self.settings.probe_every if self.multi_object else 1
+        number, left = divmod(self.frames + self.phase, every)
         return number, left == 0
 
     @property
     def _rests(self) -> bool:
-        return self.state is not None and self.loss_detector.lost and not self._looks[1]
+        return self.state is not None and self.loss_detector.lost and not self._probes[1]
 
     @property
     def _search_is_due(self) -> bool:
         every = self.settings.search_every
-        return every > 0 and self._looks[0] % every == 0
+        return every > 0 and self._probes[0] % every == 0
 
     @property
     def _whole_is_due(self) -> bool:
         every = self.settings.whole_image_every
         # what a window leaves in doubt the whole image may tell
-        return not self.loss_detector.sure or (every > 0 and (self.frames + self.turn) % every == 0)
+        due = every > 0 and (self.frames + self.phase) % every == 0
+        return not self.loss_detector.sure or due
 
     def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
@@ -339,7 +344,7 @@ class Track:
         if self._whole_is_due:
             return None
         motion = settings.motion
-        more = 2 * (motion.widen(predicted.surprise) - 1) * max(motion.scale[:3])
+        more = 2 * (motion.noise_scale(predicted.squared_innovation) - 1) * max(motion.scale[:3])
         return place_window(
             predicted.best[0].double().cpu().numpy(),
             self.method.model,

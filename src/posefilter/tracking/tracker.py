@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 from posefilter.estimator import Estimator, check_seed, get_trained_size
 from posefilter.images import Images, check_depth_unit, check_images, check_intrinsics
 from posefilter.tracking.frame import Frame
-from posefilter.tracking.processes import SideBySide
+from posefilter.tracking.processes import MultiprocessTracker
 from posefilter.tracking.settings import TrackerSettings
 from posefilter.tracking.track import Track, TrackResult
 
@@ -22,13 +22,13 @@ class Tracker:
     tracker = posefilter.Tracker(posefilter.load("003_cracker_box"))
     for rgb, depth in frames:
         result = tracker.update(rgb, depth, intrinsics)
-        if result.found:
+        if result.is_tracked:
             result.pose, result.covariance
     ```
 
     The first frame is estimated as a single image is. Later ones are measured by a filter of few
-    particles that starts from the belief of the frame before, moved by a random walk. What is lost
-    is searched for in every frame, and found again by itself.
+    particles that starts from the belief of the frame before, moved by a motion model of constant
+    velocity. What is lost is searched for, and recovered by itself.
 
     Args:
         estimator: What `posefilter.load` returns, for one object or several; or a list of these.
@@ -70,10 +70,10 @@ class Tracker:
                 get_trained_size(method.recipe.get("settings", {})),
                 self.settings,
                 seed,
-                turn,
-                beside=len(methods) > 1,
+                phase,
+                multi_object=len(methods) > 1,
             )
-            for turn, method in enumerate(methods)
+            for phase, method in enumerate(methods)
         )
         self._others = _open_processes(self.tracks, threads)
         self._size: tuple[int, ...] | None = None
@@ -157,7 +157,7 @@ class Tracker:
         return images
 
 
-def _open_processes(tracks: Sequence[Track], threads: int | None) -> SideBySide | None:
+def _open_processes(tracks: Sequence[Track], threads: int | None) -> MultiprocessTracker | None:
     """Start processes for objects side by side; None where there is nothing to share out."""
     if threads is None:
         return None
@@ -167,4 +167,4 @@ def _open_processes(tracks: Sequence[Track], threads: int | None) -> SideBySide 
         return None
     processes = min(threads, len(tracks))
     torch.set_num_threads(threads // processes)
-    return None if processes == 1 else SideBySide(tracks, processes, threads // processes)
+    return None if processes == 1 else MultiprocessTracker(tracks, processes, threads // processes)

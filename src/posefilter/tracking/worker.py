@@ -17,7 +17,7 @@ import torch
 from posefilter.images import Images
 from posefilter.memory import keep_freed_memory
 from posefilter.tracking.frame import Frame
-from posefilter.tracking.track import Memory, Track, TrackResult
+from posefilter.tracking.track import Track, TrackResult, TrackSnapshot
 
 
 class Start(NamedTuple):
@@ -31,26 +31,26 @@ class Task(NamedTuple):
     """What it is to do in one frame."""
 
     images: Images
-    memories: dict[int, Memory]  # of the tracks that it is to update, by their number
+    snapshots: dict[int, TrackSnapshot]  # of the tracks that it is to update, by their number
 
 
 class Answer(NamedTuple):
     """What became of one track."""
 
-    memory: Memory
+    snapshot: TrackSnapshot
     result: dict[str, Any]  # the attributes of a `TrackResult`, without its `object_model`
 
 
-def update(track: Track, memory: Memory, frame: Frame) -> Answer:
+def update(track: Track, snapshot: TrackSnapshot, frame: Frame) -> Answer:
     """Update a track that was elsewhere in the last frame."""
-    track.memory = memory
+    track.snapshot = snapshot
     content = vars(track.update(frame))
-    return Answer(track.memory, {key: x for key, x in content.items() if key != "object_model"})
+    return Answer(track.snapshot, {key: x for key, x in content.items() if key != "object_model"})
 
 
 def restore(track: Track, answer: Answer) -> TrackResult:
     """Take over what another process made of a track."""
-    track.memory = answer.memory
+    track.snapshot = answer.snapshot
     return TrackResult(**answer.result, object_model=track.method.model)
 
 
@@ -71,8 +71,8 @@ def main() -> None:
                 tracks, answer = given.tracks, None
             else:
                 frame = Frame(given.images)
-                memories = given.memories.items()
-                answer = [update(tracks[i], memory, frame) for i, memory in memories]
+                snapshots = given.snapshots.items()
+                answer = [update(tracks[i], snapshot, frame) for i, snapshot in snapshots]
         except EOFError:
             return
         except Exception as error:

@@ -2,15 +2,15 @@
 
 from posefilter.tracking.settings import TrackerSettings
 
-STARTED, TRACKED, FOUND, LOST = "started", "tracked", "found", "lost"
+STARTED, TRACKED, RECOVERED, LOST = "started", "tracked", "recovered", "lost"
 
 
-class LossDetector:
+class TrackLossDetector:
     """Judge a track by the presence of its object, frame after frame.
 
     A track is lost after `patience` frames in a row whose presence is below `lost_below`; a lost
-    one is found by a frame whose presence is above `found_above`. Between the two it stays what it
-    is. What is lost at first has never been found.
+    one is recovered, or started where it has never been tracked, by a frame whose presence is above
+    `found_above`. Between the two it stays what it is. At first it is lost.
 
     Args:
         settings: Of the tracker.
@@ -18,7 +18,7 @@ class LossDetector:
 
     def __init__(self, settings: TrackerSettings) -> None:
         self.settings = settings
-        self.lost, self.ever_found = True, False
+        self.lost, self.ever_tracked = True, False
         self.doubts = 0
         self.sure = False  # of the last frame
 
@@ -32,13 +32,13 @@ class LossDetector:
         self.sure = presence > settings.found_above
         if self.lost:
             trusted = self.sure
-            status = LOST if not trusted else FOUND if self.ever_found else STARTED
+            status = LOST if not trusted else RECOVERED if self.ever_tracked else STARTED
         else:
             trusted = presence > settings.lost_below
             self.doubts = 0 if trusted else self.doubts + 1
             status = LOST if self.doubts >= settings.patience else TRACKED
         self.lost = status == LOST
-        self.ever_found |= not self.lost
+        self.ever_tracked |= not self.lost
         if self.lost:
             self.doubts = 0
         return trusted, status
