@@ -72,7 +72,7 @@ def check_overrides(overrides: Sequence[str]) -> None:
     """
     if isinstance(overrides, str) or not all(isinstance(one, str) for one in overrides):
         raise UserError(
-            f"overrides={overrides!r}: a list is due, such as ['filter.particles=1000']"
+            f"overrides={overrides!r}: must be a list, such as ['filter.particles=1000']"
         )
     for one in overrides:
         key = one.lstrip("+~").split("=")[0].split("@")[0]

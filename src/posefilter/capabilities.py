@@ -40,14 +40,14 @@ Capabilities = tuple[Capability, ...]
 
 # what is needed where a name is required, after "needs"
 MEANINGS: Mapping[str, str] = {
-    "belief_maps": "a training on maps of keypoints alone",
+    "belief_maps": "training on maps of keypoints alone",
     "candidates": "scored candidate poses",
     "color": "a method whose scenes keep the image's colors",
-    "correspondences": "a training on dense object coordinates alone",
+    "correspondences": "training on dense object coordinates alone",
     "depth": "a method whose scenes keep the measured depth",
     "displacement": "particles with a learned displacement",
     "free_latent": "a latent that is no input of the network",
-    "grid_scores": "a training on crops scored against rotations",
+    "grid_scores": "training on crops scored against rotations",
     "image_patches": "particles that see a patch of the image",
     "score_points": "a likelihood that scores single image points",
     "score_samples": "a likelihood that scores colored points by themselves",
@@ -58,7 +58,7 @@ MEANINGS: Mapping[str, str] = {
     "propose_poses": "a method that proposes poses",
     "ray_samples": "scored points along labeled rays",
     "objectness": "an objectness map of the image",
-    "rollout": "a training that rolls out the filter",
+    "rollout": "training that rolls out the filter",
     "score_poses": "a method that scores any pose",
     "surface_point_loss": "a loss on each particle's predicted object point",
     "surface_points": "particles with a measured point of the object",

@@ -57,7 +57,9 @@ def check_images(rgb: Any, depth: Any, intrinsics: Any, empty: bool = False) -> 
     if not len(z):
         raise UserError("rgb: is a batch of no images")
     if max(z.shape[1:]) > MOST_SIDE or not all(z.shape):
-        raise UserError(f"rgb: {z.shape[2]}x{z.shape[1]} pixels cannot be taken")
+        raise UserError(
+            f"rgb: has {z.shape[2]}x{z.shape[1]} pixels; each side must be 1 to {MOST_SIDE}"
+        )
     K = check_intrinsics(K, len(z), (z.shape[1], z.shape[2]))
     return Images(_check_color(color), _check_depth(z, empty), K), batched
 
@@ -70,7 +72,7 @@ def to_picture(rgb: Any) -> np.ndarray:
     """
     color = _as_channels_last(rgb)
     if color.ndim != 3:
-        raise UserError(f"rgb: has shape {color.shape}; one image is due, (H, W, 3)")
+        raise UserError(f"rgb: has shape {color.shape}; expected one image (H, W, 3)")
     color = _check_color(color)
     return color if color.dtype == np.uint8 else (255 * color).round().astype(np.uint8)
 
@@ -92,7 +94,10 @@ def to_pose(pose: Any) -> np.ndarray:
     """
     out = _as_array(pose, "pose")
     if out.shape != (4, 4) or out.dtype.kind not in "fiu":
-        raise UserError(f"pose: has shape {out.shape}; camera_from_object (4, 4) [m] is due")
+        raise UserError(
+            f"pose: has shape {out.shape} and type {out.dtype}; "
+            "expected camera_from_object (4, 4) [m]"
+        )
     return out.astype(np.float64)
 
 
@@ -131,27 +136,29 @@ def make_batch(images: Images, image_width: int | None, image_height: int | None
 def _as_channels_last(rgb: Any) -> np.ndarray:
     color = _as_array(rgb, "rgb")
     if color.ndim not in (3, 4) or 3 not in (color.shape[-1], color.shape[-3]):
-        raise UserError(f"rgb: has shape {color.shape}; (H, W, 3) is due, or a batch (B, H, W, 3)")
+        raise UserError(
+            f"rgb: has shape {color.shape}; expected (H, W, 3), or a batch (B, H, W, 3)"
+        )
     return color if color.shape[-1] == 3 else np.moveaxis(color, -3, -1)
 
 
 def _as_array(value: Any, name: str) -> np.ndarray:
     if value is None or isinstance(value, str | Path):
-        raise UserError(f"{name}: is {value!r}; an array or tensor is due, not a file's name")
+        raise UserError(f"{name}: is {value!r}; must be an array or tensor, not a file name")
     if isinstance(value, torch.Tensor):
         plain = value.detach().cpu()
         return np.asarray((plain.float() if plain.dtype == torch.bfloat16 else plain).numpy())
     try:
         return np.asarray(value)
     except ValueError as error:  # a list of arrays of unequal shape
-        raise UserError(f"images: arrays of one size are due ({error})") from error
+        raise UserError(f"images: expected arrays of one size ({error})") from error
 
 
 def _check_color(color: np.ndarray) -> np.ndarray:
     if color.dtype == np.uint8:
         return np.ascontiguousarray(color)
     if color.dtype.kind != "f":
-        raise UserError(f"rgb: is {color.dtype}; uint8 is due, or float in [0, 1]")
+        raise UserError(f"rgb: is {color.dtype}; expected uint8, or float in [0, 1]")
     if not np.isfinite(color).all():
         raise UserError("rgb: holds NaN or infinity")
     if not (color.min() >= 0 and color.max() <= 1):
@@ -176,7 +183,7 @@ def check_depth_unit(depth: np.ndarray) -> None:
 def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
     if depth.dtype.kind != "f":
         raise UserError(
-            f"depth: is {depth.dtype}; meters are due, as float: divide by the depth image's units "
+            f"depth: is {depth.dtype}; expected meters as float: divide by the depth image's units "
             f"in a meter (1000 where it is in millimeters)"
         )
     z = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
@@ -197,7 +204,7 @@ def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = N
 
     Args:
         K: Camera matrix (3, 3), or one each (count, 3, 3) [px].
-        count: How many are due.
+        count: How many are expected.
         size: Height and width of the images [px], for which focal lengths and principal points
             must be plausible; None: not checked.
 
@@ -205,7 +212,10 @@ def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = N
         UserError: They are none.
     """
     if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
-        raise UserError(f"intrinsics: has shape {K.shape}; a camera matrix (3, 3) [px] is due")
+        raise UserError(
+            f"intrinsics: has shape {K.shape} and type {K.dtype}; "
+            "expected a camera matrix (3, 3) [px]"
+        )
     K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)
     if not np.isfinite(K).all():
         raise UserError("intrinsics: hold NaN or infinity")

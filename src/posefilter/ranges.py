@@ -359,8 +359,8 @@ def check_ranges(settings: Mapping[str, Any], command: str) -> None:
         command: The command's name, or `data` for the settings of the data alone.
 
     Raises:
-        UserError: A setting is outside of its range, or no number where one is due; or any number
-            is not finite.
+        UserError: A setting is outside of its range, or no number where one is expected; or any
+            number is not finite.
     """
     for key, value, ours in _list_nodes(settings):
         if value is None or (isinstance(value, str) and "${" in value) or value == "???":

@@ -38,7 +38,7 @@ def find_weights(weights: str | Path | None) -> Path:
             "checkpoint: is missing; give checkpoint=RUN/checkpoints/best.ckpt, or one of weights/"
         )
     if not isinstance(weights, str | os.PathLike):
-        raise UserError(f"checkpoint={weights}: a file, a run's folder or a name is due")
+        raise UserError(f"checkpoint={weights}: must be a file, a run's folder or a name")
     path, name = Path(weights), str(weights)
     if path.exists():
         return path
@@ -85,7 +85,7 @@ def expand_weights(weights: str | Path | Sequence[str | Path]) -> list[str | Pat
     """
     found: list[str | Path]
     if not isinstance(weights, str | Path | Iterable):
-        raise UserError(f"checkpoint={weights}: a name or a file of weights is due, or a list")
+        raise UserError(f"checkpoint={weights}: must be a name or a file of weights, or a list")
     if not isinstance(weights, str | Path):
         found = [one for part in weights for one in expand_weights(part)]
     elif not is_several(weights):

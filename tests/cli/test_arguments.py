@@ -86,4 +86,7 @@ def test_every_command_shows_where_a_mistake_came_from(
     assert "debug" not in said.splitlines()[-1]
     assert run_command(command, HOME, [wrong, "debug=smoke"]) == 2
     (line,) = capfd.readouterr().err.splitlines()
-    assert line == f"{command}: debug=smoke: is of train; {command} has debug=traceback alone"
+    assert (
+        line
+        == f"{command}: debug=smoke: only valid for train; {command} accepts only debug=traceback"
+    )

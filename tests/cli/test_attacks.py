@@ -231,7 +231,7 @@ def test_an_export_overwrites_nothing(tmp_path: Path, capfd: pytest.CaptureFixtu
     (tmp_path / "link.ckpt").symlink_to(own)
     for out in (own, tmp_path / "link.ckpt"):
         assert run_command("export", HOME, [f"checkpoint={own}", f"out={out}"]) == 2
-        assert f"out={out}: is there already" in capfd.readouterr().err
+        assert f"out={out}: already exists" in capfd.readouterr().err
     assert own.read_bytes() == before
 
 

@@ -2,6 +2,7 @@
 in one good line.
 """
 
+import re
 from itertools import product
 from pathlib import Path
 
@@ -105,6 +106,35 @@ def test_a_papers_choices_are_had_at_the_working_size(model: str) -> None:
         assert OmegaConf.select(small.cfg, key) == OmegaConf.select(working.cfg, key), key
     assert small.cfg.model.net.width == working.cfg.model.net.width
     assert small.cfg.model.truncate is working.cfg.model.truncate is None
+
+
+def read_comments(preset: Path) -> dict[str, list[str]]:
+    """Return what comments of a preset, and of those that it includes, call the paper's choices."""
+    found = {}
+    for line in preset.read_text().splitlines():
+        inner = re.match(r"  - (?:/preset/)?(_\w+)$", line)
+        if inner and inner[1] != "_self_":
+            found |= read_comments(CONF / "preset" / f"{inner[1]}.yaml")
+        said = re.match(r"  - /([\w/]+): \w+ #.*\bpaper: ([\w, .=]+)", line)
+        if said:
+            found[said[1]] = [word.strip() for word in said[2].split(",")]
+    return found
+
+
+@pytest.mark.parametrize("model", sorted({*MODELS} - {*COMPARISONS}))
+def test_a_presets_comments_name_the_papers_choices(model: str) -> None:
+    paper = compose_once(f"model={model}", "variant=paper")
+    comments = read_comments(CONF / "preset" / model / "working.yaml")
+    assert len(comments) > 9
+    for group, words in comments.items():
+        for word in words:
+            if "=" in word:
+                key, value = word.split("=")
+                assert OmegaConf.select(paper.cfg, key) == value, word
+            elif not word.isdigit():
+                assert word in list_choices(CONF / group), f"{group}: {word}"
+        if words[0] in list_choices(CONF / group):
+            assert paper.choices[group] in words, group
 
 
 def test_the_papers_pose_filter_has_the_papers_figures(tmp_path: Path) -> None:

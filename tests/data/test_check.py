@@ -103,7 +103,7 @@ WRONG = {
     "inverse": ({"poses": inverted}, "wrong way round"),
     "frame": (
         {"native": np.eye(4)},
-        "poses are of the mesh file's frame already|google_16k\\) frame",
+        "poses are in the mesh file's frame already|google_16k\\) frame",
     ),
     "640 wide": ({"K": wide(4.0)}, "intrinsics belong to pictures 640 px wide, not 160"),
     "half pixel": (

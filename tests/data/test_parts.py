@@ -77,7 +77,7 @@ def test_a_face_belongs_to_the_first_part_that_has_it(meshes: MeshStore) -> None
         ('{"head": {"vertices": [99]}}', "the mesh has vertices 0 to 15"),
         ('{"head": {"vertices": [0.5, 1.5]}}', "counted from 0"),
         ('{"head": {"box": [[500, 0, 0], [900, 1, 1]]}}', "has no face of the mesh; mind the unit"),
-        ('{"a/b": {"vertices": [0, 1, 2, 3]}}', "a name is of letters"),
+        ('{"a/b": {"vertices": [0, 1, 2, 3]}}', "a name must consist of letters"),
         ('{"head": {"ball": 3, "box": 4}}', "a part is"),
         ('{"obj_000002": [1]}', "should map names of parts"),
     ],

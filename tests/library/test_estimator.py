@@ -284,7 +284,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
         plain = draw(rgb, K)
         for image in (tensor, tensor.float() / 255, (rgb / 255).astype(np.float64)):
             assert np.array_equal(draw(image, matrix), plain)
-        with pytest.raises(posefilter.UserError, match=r"rgb: .* one image is due"):
+        with pytest.raises(posefilter.UserError, match=r"rgb: .* expected one image"):
             draw(rgb[None], K)
         with pytest.raises(posefilter.UserError, match="rgb: is int64"):
             draw(rgb.astype(np.int64), K)
@@ -303,7 +303,7 @@ def test_pictures_take_the_images_that_predict_takes(small: posefilter.Estimator
         ({"depth": np.zeros((240, 320))}, "no pixel has depth"),
         ({"rgb": np.ones((240, 320))}, "rgb: has shape"),
         ({"rgb": np.full((240, 320, 3), 255.0)}, "rgb: floats should lie in"),
-        ({"rgb": np.ones((240, 320, 3), np.int64)}, "uint8 is due"),
+        ({"rgb": np.ones((240, 320, 3), np.int64)}, "expected uint8"),
         ({"intrinsics": np.ones(4)}, "camera matrix"),
         ({"intrinsics": np.array([[300.0, 0, 0], [0, 300, 0], [160, 120, 1]])}, "transposed"),
         ({"intrinsics": np.diag([300.0, 0, 1])}, "fy 0"),
@@ -360,7 +360,7 @@ def test_an_override_without_an_effect_is_refused(override: str, told: str) -> N
 
 
 def test_overrides_are_a_list() -> None:
-    with pytest.raises(posefilter.UserError, match="a list is due"):
+    with pytest.raises(posefilter.UserError, match="must be a list"):
         posefilter.load(NAME, overrides="filter.particles=3")
 
 
@@ -417,13 +417,16 @@ def test_what_is_typed_first_is_answered_or_refused_in_one_line(
 ) -> None:
     rgb, depth, K = read_scene()
     for wrong, told in (
-        (lambda: small.predict("a.png", depth, K), "rgb: is 'a.png'; an array"),
+        (lambda: small.predict("a.png", depth, K), "rgb: is 'a.png'; must be an array"),
         (lambda: small.predict(rgb, None, K), "depth: is None"),
         (lambda: small.predict(rgb[None][:0], depth[None][:0], K), "rgb: is a batch of no images"),
-        (lambda: posefilter.load(3), "checkpoint=3: a name"),  # type: ignore[arg-type]
+        (lambda: posefilter.load(3), "checkpoint=3: must be a name"),  # type: ignore[arg-type]
         (lambda: posefilter.load(NAME, costs={"miss": 2}), "costs={'miss': 2}: posefilter.Costs"),
         (lambda: posefilter.Tracker(small, {"patience": 3}), "settings={'patience': 3}: posefilt"),
-        (lambda: posefilter.figures.draw_poses(rgb, K, np.eye(4), NAME), "shape: is str; a mesh"),
+        (
+            lambda: posefilter.figures.draw_poses(rgb, K, np.eye(4), NAME),
+            "shape: is str; expected a mesh",
+        ),
     ):
         with pytest.raises(posefilter.UserError, match=re.escape(told)):
             wrong()
@@ -451,5 +454,5 @@ def test_fewer_looks_keep_the_calibration() -> None:
     assert once.methods[0].filter.looks == 1
     assert result.probability is not None
     assert 0 <= result.probability <= result.presence
-    with pytest.raises(posefilter.UserError, match=r"filter\.looks=4: 1, 2 or 3"):
+    with pytest.raises(posefilter.UserError, match=r"filter\.looks=4: must be 1, 2 or 3"):
         posefilter.load("003_cracker_box", overrides=["filter.looks=4"], device="cpu")

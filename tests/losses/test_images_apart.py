@@ -101,7 +101,7 @@ def test_a_confidence_by_hand(batch, model, make_trace) -> None:
 
 
 def test_regression_by_hand(batch, model, make_trace) -> None:
-    """Scores of 50 and -50 where 100 and -100 are due; weights are even."""
+    """Scores of 50 and -50 where 100 and -100 are expected; weights are even."""
 
     def label(trace: Trace, batch: Batch, model: Any) -> torch.Tensor:
         return torch.tensor([[[0.0, 0.0]], [[100.0, -100.0]]]).double()

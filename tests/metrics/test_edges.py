@@ -175,16 +175,16 @@ def test_a_rotation_may_be_rounded_but_not_wrong(tmp_path: Path) -> None:
         with pytest.raises(UserError, match="R is no rotation"):
             read_poses_csv(write_row(file, R=R))
     for name, cell, told in (
-        ("R", "1 0 0", "R has 3 numbers where 9"),
-        ("t", "1 2", "t has 2 numbers where 3"),
-        ("score", "1 2", "score has 2 numbers where 1"),
+        ("R", "1 0 0", "R has 3 numbers, expected 9"),
+        ("t", "1 2", "t has 2 numbers, expected 3"),
+        ("score", "1 2", "score has 2 numbers, expected 1"),
         ("time", "x", "time holds something that is no number"),
         ("im_id", "1.5", "im_id is '1.5'"),
     ):
         with pytest.raises(UserError, match=f"line 2: {told}"):
             read_poses_csv(write_row(file, **{name: cell}))
     file.write_text("1,2,3\n")
-    with pytest.raises(UserError, match="line 1: 3 columns where 7"):
+    with pytest.raises(UserError, match="line 1: 3 columns, expected 7"):
         read_poses_csv(file)
 
 

@@ -39,7 +39,7 @@ FILES: dict[str, tuple[Any, str]] = {
     "texts": ({"conv1.weight": "x"}, "should hold tensors by name"),
     "a tensor is missing": ({"conv1.weight": None}, r"lacks conv1\.weight"),
     "a tensor too many": ({"x": torch.zeros(1)}, "has the unexpected x"),
-    "another shape": ({"conv1.weight": torch.zeros(1)}, r"conv1\.weight is of shape \(1,\), not"),
+    "another shape": ({"conv1.weight": torch.zeros(1)}, r"conv1\.weight has shape \(1,\), not"),
 }
 
 

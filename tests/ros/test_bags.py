@@ -300,11 +300,11 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     (tmp_path / "there.mcap").write_text("mine")
     cases = [
         ([str(bag)], ["color=/nothing"], "/rgb (sensor_msgs/msg/Image)"),
-        ([str(bag)], ["color=/info"], "is of sensor_msgs/msg/CameraInfo"),
+        ([str(bag)], ["color=/info"], "has type sensor_msgs/msg/CameraInfo"),
         ([str(bag)], [], "no color image has depth within tolerance=0.01"),
         ([str(broken)], [], "bag="),
         ([str(tmp_path / "no.mcap")], [], "no such file"),
-        ([str(bag), str(tmp_path / "there.mcap")], [], "exists already"),
+        ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),
         ([str(bag)], ["track=maybe"], "choose true or false"),
     ]
     for places, settings, said in cases:

@@ -218,11 +218,11 @@ def test_the_users_own_run_and_what_the_user_types_count(
 
 
 RESUMED = {
-    "hydra.searchpath=[file:///tmp]": "no setting of a training",
-    "+hydra.callbacks.x._target_=os.system": "no setting of a training",
-    "hydra/launcher=submitit_local": "no setting of a training",
-    "--config-dir=/tmp": "no setting of a training",
-    "--multirun": "no setting of a training",
+    "hydra.searchpath=[file:///tmp]": "not a setting of a training run",
+    "+hydra.callbacks.x._target_=os.system": "not a setting of a training run",
+    "hydra/launcher=submitit_local": "not a setting of a training run",
+    "--config-dir=/tmp": "not a setting of a training run",
+    "--multirun": "not a setting of a training run",
     "data.root={secret}": "type it as well",
     "data.root=../secret": "type it as well",
     "data.meshes='{secret}'": "type it as well",

@@ -252,7 +252,7 @@ class Belief:
         """
         at = self.center if points is None else np.asarray(points, dtype=np.float64)
         if at.ndim > 2 or at.shape[-1] != 3:
-            raise UserError(f"points: have shape {at.shape}; (P, 3) is due")
+            raise UserError(f"points: have shape {at.shape}; expected (P, 3)")
         at = np.atleast_2d(at)
         K = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
@@ -321,7 +321,7 @@ def _as_poses(poses: np.ndarray) -> np.ndarray:
         top = torch.from_numpy(given)
         given = make_pose(top[..., :3], top[..., 3]).numpy()
     if given.shape[-2:] != (4, 4):
-        raise UserError(f"poses: have shape {given.shape}; (*, 4, 4) is due")
+        raise UserError(f"poses: have shape {given.shape}; expected (*, 4, 4) or (*, 3, 4)")
     if not np.isfinite(given).all() or not is_rigid(torch.from_numpy(given)):
         raise UserError("poses: should be rigid transforms")
     return given

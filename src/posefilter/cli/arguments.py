@@ -41,7 +41,9 @@ def without_trace(arguments: list[str], name: str) -> list[str]:
     left = [a for a in arguments if a != "debug=traceback"]
     for argument in left:
         if argument.startswith("debug=") and argument != "debug=null":
-            raise UserError(f"{argument}: is of train; {name} has debug=traceback alone")
+            raise UserError(
+                f"{argument}: only valid for train; {name} accepts only debug=traceback"
+            )
     return left
 
 

@@ -55,7 +55,7 @@ def build_trainer(job: Job) -> Trainer:
     cfg.folder = str(job.folder)
     steps, interval = cfg.trainer.get("max_steps", -1), cfg.trainer.get("val_check_interval")
     if steps is None:
-        raise UserError("trainer.max_steps: is missing; a whole number is due, or -1 for no limit")
+        raise UserError("trainer.max_steps: is missing; must be a whole number, or -1 for no limit")
     if interval == 0 and not isinstance(interval, float):  # by a reference, too
         raise UserError("trainer.val_check_interval=0: must be 1 or more steps, or a share")
     # else it would never be validated, and have no best checkpoint

@@ -51,8 +51,8 @@ def calibrate(job: Job) -> None:
     settle(cfg.threads, cfg.seed)
     if changes(cfg):
         raise UserError(
-            "filter: a calibration is of the filter as the checkpoint has it; export.py writes a "
-            "checkpoint with another"
+            "filter: a calibration belongs to the filter as the checkpoint has it; export.py "
+            "writes a checkpoint with another"
         )
     file = find_checkpoint(cfg.checkpoint)
     out = file if cfg.out is None else Path(str(cfg.out))
@@ -95,7 +95,7 @@ def check_out(checkpoint: dict[str, Any], file: Path, out: Path, replace: bool) 
         raise UserError(f"out={out}: must end in .ckpt")
     same = out.exists() and out.samefile(file)
     if out.exists() and not same:
-        raise UserError(f"out={out}: is there already")
+        raise UserError(f"out={out}: already exists")
     if same and checkpoint.get("calibration") is not None and not replace:
         raise UserError(f"{file}: is calibrated already; replace=true calibrates it anew")
 

@@ -29,7 +29,7 @@ def convert_bag(job: Job) -> None:
     cfg = job.cfg
     out = Path(str(cfg.out))
     if out.exists():
-        raise UserError(f"out={out}: exists already; choose another")
+        raise UserError(f"out={out}: already exists; choose another")
     topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
     with BagReader(Path(str(cfg.bag)), topics, float(cfg.tolerance)) as reader:
         settle(cfg.threads, cfg.seed)

@@ -180,8 +180,8 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             iou.update(guess, truth)
     if not used:
         raise UserError(
-            f"estimates={job.cfg.estimates}: none of its {len(rows)} rows is of an "
-            f"instance of this data"
+            f"estimates={job.cfg.estimates}: none of its {len(rows)} rows belongs to "
+            f"an instance of this data"
         )
     results = {
         **errors.compute(),

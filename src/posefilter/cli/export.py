@@ -32,7 +32,7 @@ def export(job: Job) -> None:
     if out.suffix != ".ckpt":
         raise UserError(f"out={out}: must end in .ckpt")
     if os.path.lexists(out):  # it may be a training's own
-        raise UserError(f"out={out}: is there already; choose another file, or remove it")
+        raise UserError(f"out={out}: already exists; choose another file, or remove it")
     stripped = strip(read_checkpoint(job.cfg.checkpoint), job.cfg.points, job.cfg.quantize)
     recipe = stripped["recipe"]
     before = recipe["settings"]

@@ -14,7 +14,7 @@ from posefilter.errors import UserError
 from posefilter.ranges import check_ranges
 
 _ACCELERATORS = ("auto", "cpu", "gpu", "cuda", "mps", "tpu")
-# settings that a command cannot do without
+# settings that a command requires a value of
 _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
     "predict": ("depth_scale", "seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
@@ -124,7 +124,7 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     check_out(cfg)
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:
-            raise UserError(f"{key}=null: {command} cannot do without; leave it out")
+            raise UserError(f"{key}=null: {command} requires a value; leave it out for the default")
     check_ranges(_resolve(cfg), command)  # what is made of other settings, too
     accelerator = (plain.get("trainer") or {}).get("accelerator", "auto")
     if accelerator not in _ACCELERATORS:

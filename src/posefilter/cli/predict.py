@@ -322,7 +322,7 @@ def read_intrinsics(numbers: Any) -> np.ndarray:
     try:
         fx, fy, cx, cy = (float(part) for part in parts)
     except ValueError as error:
-        raise UserError(f"intrinsics={numbers}: four numbers are due, fx,fy,cx,cy [px]") from error
+        raise UserError(f"intrinsics={numbers}: expected four numbers, fx,fy,cx,cy [px]") from error
     if not np.isfinite([fx, fy, cx, cy]).all():
         raise UserError(f"intrinsics={numbers}: hold NaN or infinity")
     if fx <= 0 or fy <= 0:

@@ -119,7 +119,9 @@ def _check_video(cfg: DictConfig) -> None:
         raise UserError(f"scene={cfg.scene}: is one of a dataset; frames=DIR is one video")
     for key in ("intrinsics", "depth_scale"):
         if data and cfg[key] is not None:
-            raise UserError(f"{key}: is of frames=DIR; a dataset brings its own, leave it out")
+            raise UserError(
+                f"{key}: only valid with frames=DIR; a dataset has its own {key}, leave it out"
+            )
     if cfg.frames and cfg.intrinsics is None:
         raise UserError("intrinsics: is missing; frames=DIR needs intrinsics=fx,fy,cx,cy [px]")
     if data and data.root is None:

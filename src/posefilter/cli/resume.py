@@ -91,8 +91,8 @@ def check_override(override: str, folder: Path) -> None:
     found = _OVERRIDE.fullmatch(override)
     if found is None or not override.isprintable() or re.match(r"hydra\b", found[2]):
         raise UserError(
-            f"resume={folder}: {override[:80]!r} in its .hydra/overrides.yaml is no "
-            f"setting of a training"
+            f"resume={folder}: {override[:80]!r} in its .hydra/overrides.yaml is not a "
+            f"setting of a training run"
         )
     key, value = found[2], (found[3] or "").strip("'\"")
     if re.search(r"\$\{[^}]*:", value):

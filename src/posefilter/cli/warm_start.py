@@ -66,7 +66,7 @@ def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> 
         if count < len(wanted) / 2:
             raise UserError(
                 f"warm_start: only {count} of {len(wanted)} tensors fit; "
-                "the checkpoint is of another model, or of other widths"
+                "the checkpoint comes from another model, or has other widths"
             )
     copied = 0
     with torch.no_grad():

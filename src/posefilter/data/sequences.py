@@ -170,7 +170,7 @@ def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> tuple[lis
     """Return the pictures of a folder within and their numbers, in order."""
     inner = folder / name
     if not inner.is_dir():
-        raise UserError(f"frames={folder}: has no folder {name}/; rgb/ and depth/ are due")
+        raise UserError(f"frames={folder}: has no folder {name}/; expected rgb/ and depth/")
     found = sorted(inner / one for one in list_folder(inner) if Path(one).suffix.lower() in endings)
     if not found:
         raise UserError(f"frames={folder}: no pictures in {name}/ ({', '.join(endings)})")

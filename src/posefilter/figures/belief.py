@@ -119,7 +119,7 @@ def select_single(
     )
     if poses.ndim == 4:
         if len(poses) != 1:
-            raise ValueError(f"a belief about one image is due, not about {len(poses)}")
+            raise ValueError(f"expected a belief about one image, got one about {len(poses)}")
         poses, log_weights, best = poses[0], log_weights[0], best[0]
     return poses, torch.softmax(log_weights, 0), best
 

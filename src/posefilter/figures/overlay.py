@@ -210,7 +210,7 @@ def get_vertices(shape: Shape) -> np.ndarray:
     vertices = shape.detach().cpu().numpy() if isinstance(shape, Tensor) else shape
     if not isinstance(vertices, np.ndarray) or vertices.ndim != 2 or vertices.shape[1] != 3:
         raise UserError(
-            f"shape: is {type(shape).__name__}; a mesh is due, or the vertices of a hull (V, 3) "
+            f"shape: is {type(shape).__name__}; expected a mesh, or the vertices of a hull (V, 3) "
             "[m], such as result.object_model.hull"
         )
     return vertices.astype(np.float64)

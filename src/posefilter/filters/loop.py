@@ -92,7 +92,7 @@ class ParticleFilter(nn.Module):
                 f"steps={steps} must be 1 or more"
             )
         if not 1 <= looks <= 3:
-            raise UserError(f"filter.looks={looks}: 1, 2 or 3 is due")
+            raise UserError(f"filter.looks={looks}: must be 1, 2 or 3")
         self.particles, self.steps, self.looks = particles, steps, looks
         self.first_particles = first
         self.initialize, self.schedule = initialize, schedule

@@ -76,7 +76,9 @@ def assign(wholes: Mapping[str, np.ndarray], said: str) -> dict[str, np.ndarray]
     out = {}
     for part, faces in wholes.items():
         if not part.replace("_", "").replace("-", "").isalnum():
-            raise UserError(f"{said}: part '{part}': a name is of letters, digits, - and _")
+            raise UserError(
+                f"{said}: part '{part}': a name must consist of letters, digits, - and _"
+            )
         own = faces if taken is None else faces & ~taken
         if not own.any():
             raise UserError(f"{said}: part '{part}' has no face of the mesh; mind the unit")

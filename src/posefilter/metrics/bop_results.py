@@ -92,7 +92,7 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
 def _parse(cells: Sequence[str], where: str) -> PoseRow:
     if len(cells) != len(HEADER):
         raise UserError(
-            f"{where}: {len(cells)} columns where {len(HEADER)} are due ({','.join(HEADER)})"
+            f"{where}: {len(cells)} columns, expected {len(HEADER)} ({','.join(HEADER)})"
         )
     scene, image, object_id = (
         _whole(cell, name, where) for cell, name in zip(cells[:3], HEADER[:3], strict=True)
@@ -102,7 +102,7 @@ def _parse(cells: Sequence[str], where: str) -> PoseRow:
     pose[:3, 3] = [float(x.scaleb(-3)) for x in _numbers(cells[5], 3, "t", where)]
     R = pose[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 0.01 or np.linalg.det(R) < 0:
-        raise UserError(f"{where}: R is no rotation (nine numbers, row by row, are due)")
+        raise UserError(f"{where}: R is no rotation; expected nine numbers, row by row")
     score, seconds = (_numbers(cells[i], 1, HEADER[i], where)[0] for i in (3, 6))
     return PoseRow(scene, image, object_id, float(score), pose, float(seconds))
 
@@ -121,7 +121,7 @@ def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
         raise UserError(f"{where}: {name} holds something that is no number: {cell!r}") from error
     if len(numbers) != count:
         raise UserError(
-            f"{where}: {name} has {len(numbers)} numbers where {count} are due, separated by blanks"
+            f"{where}: {name} has {len(numbers)} numbers, expected {count} separated by blanks"
         )
     if name in "Rt" and not all(number.is_finite() for number in numbers):
         raise UserError(f"{where}: {name} is not finite: {cell!r}")

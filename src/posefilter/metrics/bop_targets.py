@@ -36,7 +36,9 @@ def read_targets(path: Path) -> list[Target]:
     except (ValueError, RecursionError) as error:
         raise UserError(f"targets={path}: not readable as JSON ({error})") from error
     if not isinstance(content, list):
-        raise UserError(f"targets={path}: a list of targets is due")
+        raise UserError(
+            f"targets={path}: expected a list of targets, got a {type(content).__name__}"
+        )
     targets = [_read_one(one, f"targets={path}, entry {i}") for i, one in enumerate(content)]
     if len({one[:3] for one in targets}) < len(targets):
         raise UserError(f"targets={path}: names a class of an image twice")

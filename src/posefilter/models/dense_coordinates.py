@@ -1,4 +1,4 @@
-"""A comparison without a filter: dense object coordinates, and the best rigid fit to them.
+"""A baseline without a filter: dense object coordinates, and the best rigid fit to them.
 
 As NOCS has it (Wang et al. 2019): a network predicts which point of the object each cell shows,
 depth gives the cell's point in the camera, and RANSAC finds the pose that most of them agree with.

@@ -325,7 +325,7 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
     """
     if rolled.steps > 1 and rolled.first_particles != rolled.particles:
         raise UserError(
-            f"{name}.first_particles={rolled.first_particles}: a training needs as many as "
+            f"{name}.first_particles={rolled.first_particles}: training needs as many as "
             f"{name}.particles={rolled.particles}; choose {name}.first_particles=null or "
             f"model/train_rollout=short (evaluate.py takes any)"
         )

@@ -1,4 +1,4 @@
-"""A comparison without a filter: belief maps of the box's corners, and a pose from their peaks.
+"""A baseline without a filter: belief maps of the box's corners, and a pose from their peaks.
 
 As DOPE has it (Tremblay et al. 2018): a network predicts a map for each corner of the object's
 bounding box and for its center, the maps' peaks are found, and perspective-n-point (EPnP, Lepetit

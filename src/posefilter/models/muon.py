@@ -29,8 +29,8 @@ class Muon(Optimizer):
         betas: Decay rates of AdamW.
         eps: Of AdamW.
         weight_decay: Of all parameters, decoupled.
-        adam_layers: Names of layers that AdamW trains, such as the first and the last of each
-            network.
+        adam_layers: Layers that AdamW trains, such as the first and the last of each network: a
+            parameter is one of them where a part of its dotted name is in here.
     """
 
     def __init__(

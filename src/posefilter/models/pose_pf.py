@@ -288,8 +288,8 @@ class PosePF(PoseParticles):
         super().on_load_checkpoint(checkpoint)
         if "candidate_sampler" not in checkpoint:
             log.warning(
-                "resume: the checkpoint is of an earlier version, without the candidate sampler's "
-                "persistent particles: every frame's start anew"
+                "resume: the checkpoint is from an earlier version, without the candidate "
+                "sampler's persistent particles: every frame's start anew"
             )
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 

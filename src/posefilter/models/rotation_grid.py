@@ -1,4 +1,4 @@
-"""A comparison: Rao-Blackwellized particles, each with a distribution over a grid of rotations.
+"""A baseline: Rao-Blackwellized particles, each with a distribution over a grid of rotations.
 
 As PoseRBPF has it (Deng et al. 2019): a particle is where the object's center is. Its crop of the
 image becomes a code; the cosine of the angle to the code of a render of the object, in each

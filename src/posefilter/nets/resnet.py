@@ -136,7 +136,7 @@ def load_trunk(trunk: ResNet, weights: str) -> None:
     for name, value in trunk.state_dict().items():
         if name in own and state[name].shape != value.shape:
             raise UserError(
-                f"{said}: its {name} is of shape {tuple(state[name].shape)}, not "
+                f"{said}: its {name} has shape {tuple(state[name].shape)}, not "
                 f"{tuple(value.shape)}; is it another network than trunk.kind says?"
             )
     trunk.load_state_dict({**trunk.state_dict(), **{name: state[name] for name in own}})

@@ -99,7 +99,7 @@ class BagReader:
                     f"{key}={topic}: the bag has no such topic; it has {some or 'none'}"
                 )
             if kinds[topic] not in fits:
-                raise UserError(f"{key}={topic}: is of {kinds[topic]}, not {' or '.join(fits)}")
+                raise UserError(f"{key}={topic}: has type {kinds[topic]}, not {' or '.join(fits)}")
 
     def messages(self) -> Iterator[tuple[Any, int, bytes]]:
         """Yield each message as it is stored: its connection, when it was recorded, its bytes.
@@ -171,14 +171,14 @@ class BagWriter:
         topic: Where detections go.
 
     Raises:
-        UserError: The path exists already, or another process is about to write it.
+        UserError: The path already exists, or another process is about to write it.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
         from rosbags.rosbag2 import StoragePlugin, Writer
 
         if path.exists():
-            raise UserError(f"out={path}: exists already; choose another")
+            raise UserError(f"out={path}: already exists; choose another")
         self.path, self.topic = path, topic
         self.parts = path.with_name(f".{path.name}.part")
         hold(self.parts)

@@ -233,7 +233,7 @@ def _check(job: Job, frames: int, workers: int) -> None:
     }
     check_ranges(numbers, "generate")
     if high < low:
-        raise UserError(f"distractors={low},{high}: needs 0 <= least <= most")
+        raise UserError(f"distractors={low},{high}: needs 0 <= min <= max")
     if job.motion.covered_frames > job.frames_per_scene:
         raise UserError(
             f"covered_frames={job.motion.covered_frames}: a scene has {job.frames_per_scene} "

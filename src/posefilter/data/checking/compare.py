@@ -185,7 +185,7 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
     if not np.allclose(native, np.eye(4)):
         out.append(
             (
-                "poses are of the mesh file's frame already, not of the dataset's own",
+                "poses are in the mesh file's frame already, not in the dataset's own",
                 np.linalg.inv(native),
             )
         )
@@ -198,11 +198,11 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
     if view.mesh.name in ycb.CLASSES and view.mesh.name not in ycb.WITHOUT_GEOMETRY:
         step = ycb.ycbvideo_from_original(view.mesh.name)
         out.append(
-            ("poses are of YCB-Video's object frame, meshes in the original (google_16k) one", step)
+            ("poses are in YCB-Video's object frame, meshes in the original (google_16k) one", step)
         )
         out.append(
             (
-                "poses are of the original (google_16k) frame, meshes in YCB-Video's",
+                "poses are in the original (google_16k) frame, meshes in YCB-Video's",
                 np.linalg.inv(step),
             )
         )
@@ -210,7 +210,7 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
     center[:3, 3] = -view.mesh.bounds.mean(0)
     out.append(
         (
-            "poses are of a frame at the center of the bounding box (as BOP's), the mesh has "
+            "poses are in a frame at the center of the bounding box (as BOP's), the mesh has "
             "another origin",
             center,
         )

@@ -33,7 +33,7 @@ def register_reader(source: str, reader: Callable[..., Reader]) -> None:
         UserError: Another reader has the name.
     """
     if READERS.get(source, reader) is not reader:
-        raise UserError(f"data.source={source}: there is a reader of this name already")
+        raise UserError(f"data.source={source}: a reader of this name already exists")
     READERS[source] = reader
 
 
