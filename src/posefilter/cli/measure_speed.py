@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,14 +11,15 @@ from lightning import Callback, LightningModule, Trainer
 from posefilter.cli.job import Job
 from posefilter.cli.train import build, rehearse
 
-_STEPS, _SKIPPED = 7, 3  # the first steps fill caches
+_STEPS, _SKIPPED = 9, 3  # the first steps fill caches
+_IMAGES = 3
 
 
 class Speed(NamedTuple):
     """Of a training on this machine."""
 
-    step: float  # [s]
-    image: float  # of the filter, [s]
+    step: float  # the fastest of some, as what else runs here may end [s]
+    image: float  # of the filter, the median of some [s]
 
 
 class _Clock(Callback):
@@ -47,11 +49,17 @@ def measure_speed(job: Job) -> Speed:
     trial = Job(cfg, job.choices, job.overrides, job.folder, job.name, False)
     try:
         run, clock = build(trial), _Clock()
-        began = time.perf_counter()
-        rehearse(run.method, run.data)
-        image = time.perf_counter() - began
+        images = [_time(lambda: rehearse(run.method, run.data)) for _ in range(_IMAGES)]
         run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
         run.trainer.fit(run.method, datamodule=run.data)
     finally:
         shutil.rmtree(job.folder, ignore_errors=True)
-    return Speed(float(np.median(np.diff(clock.times)[_SKIPPED - 1 :])), image)
+    steps = np.diff(clock.times)[_SKIPPED - 1 :]
+    return Speed(float(steps.min()), float(np.median(images)))
+
+
+def _time(work: Callable[[], None]) -> float:
+    """Return how long a piece of work takes [s]."""
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began

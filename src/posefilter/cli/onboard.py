@@ -54,9 +54,10 @@ _VALIDATED = 8  # images, once at the end
 _CALIBRATED = 40  # images with the object, and as many without
 _POINTS = 2000  # of the surface, as the shipped files have: the alignment with the depth uses them
 _REST = 25.0  # [s] reserved for figures, weights and report
-# Of the time of a step that is measured at the start, which is rather long. If steps take longer
-# than so, the learning rate keeps pace with the clock.
-_HOPED = 0.75
+# The learning rate keeps pace with the clock, so that a training of too many steps ends in time,
+# and one of too few leaves time unused. So steps are hoped to be shorter than the measured one, and
+# never taken for longer than this, however busy the machine was then [s].
+_HOPED, _SLOWEST = 0.75, 0.4
 
 
 class Stage(NamedTuple):
@@ -243,8 +244,7 @@ def train(work: Onboarding) -> None:
         if steps is None:
             spent = sum(work.stages.seconds.values())
             room = 60 * work.cfg.budget_minutes - spent - work.rest(speed)
-            steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / (_HOPED * speed.step))))
-            seconds = speed.step if steps == _FEWEST_STEPS else min(speed.step, room / steps)
+            steps, seconds = choose_steps(room, speed.step)
         work.stages.keep(steps=int(steps), seconds_per_step=seconds, seconds_per_image=speed.image)
         duration = format_duration(steps * seconds)
         fixed = f"{steps} steps of {seconds:.2f} s each: {duration}"
@@ -287,6 +287,18 @@ def calibrate(work: Onboarding) -> None:
     calibration = learn(method, [data.val_dataset], [without], data.source, shown)
     save_whole({**checkpoint, "calibration": calibration.to_plain()}, work.weights)
     work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
+
+
+def choose_steps(room: float, step: float) -> tuple[int, float]:
+    """Return how many steps a training is given at most, and how long one may take [s].
+
+    Args:
+        room: Time for all of them [s].
+        step: How long one took when it was measured [s].
+    """
+    hoped = _HOPED * min(step, _SLOWEST)
+    steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / hoped)))
+    return steps, step if steps == _FEWEST_STEPS else room / steps
 
 
 def evaluate(work: Onboarding) -> None:
