@@ -56,7 +56,7 @@ class Estimator:
             why = str(error).splitlines()[0]
             raise UserError(f"device={device}: cannot be used ({why})") from error
         if not isinstance(costs, Costs | None):
-            raise UserError(f"costs={costs!r}: posefilter.Costs(...) is due")
+            raise UserError(f"costs={costs!r}: expected posefilter.Costs(...)")
         self.costs = costs or Costs()
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
 
@@ -194,7 +194,7 @@ def check_seed(seed: Any) -> int:
         UserError: It is no whole number, 0 or more.
     """
     if isinstance(seed, bool) or not isinstance(seed, Integral) or seed < 0:
-        raise UserError(f"seed={seed!r}: a whole number, 0 or more, is due")
+        raise UserError(f"seed={seed!r}: must be a whole number, 0 or more")
     return int(seed)
 
 
@@ -217,7 +217,7 @@ def count_instances(instances: int | Mapping[str, int], objects: Sequence[str]) 
     for count in counts:
         whole = isinstance(count, Integral) and not isinstance(count, bool)
         if not whole or not 1 <= count <= _MOST:
-            raise UserError(f"instances={count!r}: a whole number from 1 to {_MOST} is due")
+            raise UserError(f"instances={count!r}: must be a whole number from 1 to {_MOST}")
     return counts
 
 

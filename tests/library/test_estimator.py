@@ -441,9 +441,9 @@ def test_what_is_typed_first_is_answered_or_refused_in_one_line(
 
 @pytest.mark.parametrize("seed", ["a", None, 1.5, -1, True])
 def test_what_is_no_seed_is_refused_in_one_line(small: posefilter.Estimator, seed: object) -> None:
-    with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):
+    with pytest.raises(posefilter.UserError, match=r"^seed=.*: must be a whole number"):
         small.predict(*read_scene(), seed=seed)  # type: ignore[arg-type]
-    with pytest.raises(posefilter.UserError, match=r"^seed=.*: a whole number"):
+    with pytest.raises(posefilter.UserError, match=r"^seed=.*: must be a whole number"):
         posefilter.Tracker(small, seed=seed)  # type: ignore[arg-type]
 
 

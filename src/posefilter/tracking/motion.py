@@ -132,7 +132,7 @@ def _three(value: float | Sequence[float], name: str) -> tuple[float, ...]:
     try:
         parts = tuple(float(x) for x in ([value] * 3 if isinstance(value, int | float) else value))
     except (TypeError, ValueError) as error:
-        raise UserError(f"motion.{name}={value}: one number or three are due") from error
+        raise UserError(f"motion.{name}={value}: expected one number or three") from error
     if len(parts) != 3 or not all(math.isfinite(x) and x >= 0 for x in parts):
         raise UserError(f"motion.{name}={value}: one number or three, 0 or more")
     return parts

@@ -62,7 +62,7 @@ class Tracker:
             raise UserError("a tracker needs an estimator of one object at least")
         seed = check_seed(seed)
         if not isinstance(settings, TrackerSettings | None):
-            raise UserError(f"settings={settings!r}: posefilter.TrackerSettings(...) is due")
+            raise UserError(f"settings={settings!r}: expected posefilter.TrackerSettings(...)")
         self.settings = settings or TrackerSettings()
         self.tracks = tuple(
             Track(
@@ -162,7 +162,7 @@ def _open_processes(tracks: Sequence[Track], threads: int | None) -> Multiproces
     if threads is None:
         return None
     if not isinstance(threads, int) or isinstance(threads, bool) or threads < 1:
-        raise UserError(f"threads={threads}: a whole number is due, 1 or more")
+        raise UserError(f"threads={threads}: must be a whole number, 1 or more")
     if any(track.method.device.type != "cpu" for track in tracks):
         return None
     processes = min(threads, len(tracks))
