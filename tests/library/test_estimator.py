@@ -421,8 +421,14 @@ def test_what_is_typed_first_is_answered_or_refused_in_one_line(
         (lambda: small.predict(rgb, None, K), "depth: is None"),
         (lambda: small.predict(rgb[None][:0], depth[None][:0], K), "rgb: is a batch of no images"),
         (lambda: posefilter.load(3), "checkpoint=3: must be a name"),  # type: ignore[arg-type]
-        (lambda: posefilter.load(NAME, costs={"miss": 2}), "costs={'miss': 2}: posefilter.Costs"),
-        (lambda: posefilter.Tracker(small, {"patience": 3}), "settings={'patience': 3}: posefilt"),
+        (
+            lambda: posefilter.load(NAME, costs={"miss": 2}),
+            "costs={'miss': 2}: expected posefilter.Costs",
+        ),
+        (
+            lambda: posefilter.Tracker(small, {"patience": 3}),
+            "settings={'patience': 3}: expected posefilt",
+        ),
         (
             lambda: posefilter.figures.draw_poses(rgb, K, np.eye(4), NAME),
             "shape: is str; expected a mesh",
