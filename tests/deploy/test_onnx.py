@@ -146,11 +146,11 @@ def test_the_example_aligns_as_torch_does(
     image = {"depth": batch.depth[0, 0].numpy(), "intrinsics": batch.intrinsics[0].numpy()}
     for number in range(3):
         noise = torch.randn(6, generator=torch.Generator().manual_seed(number))
-        start = method.space.move(found, 0.004 * noise)[None]
+        start = method.space.move(found, 0.006 * noise)[None]
         given = BeliefBatch(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
         theirs = icp(given, method.encode(batch), method, torch.Generator()).best[0].numpy()
         ours = own.align(image, start[0].numpy(), surface, **vars(icp))
-        assert np.abs(theirs - start[0].numpy()).max() > 4e-3  # where processors start differs
+        assert np.abs(theirs - start[0].numpy()).max() > 8e-3
         assert np.abs(ours - theirs).max() < 1e-3  # pixels are rounded in another precision
 
 

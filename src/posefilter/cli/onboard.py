@@ -256,6 +256,18 @@ def train(work: Onboarding) -> None:
     work.stages.keep(training=fit(work.run))
 
 
+def choose_steps(room: float, step: float) -> tuple[int, float]:
+    """Return how many steps a training is given at most, and how long one may take [s].
+
+    Args:
+        room: Time for all of them [s].
+        step: How long one took when it was measured [s].
+    """
+    hoped = _HOPED * min(step, _SLOWEST)
+    steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / hoped)))
+    return steps, step if steps == _FEWEST_STEPS else room / steps
+
+
 def export(work: Onboarding) -> None:
     """Write the weights that predict."""
     checkpoint = read_checkpoint(work.training / "checkpoints" / "best.ckpt")
@@ -289,26 +301,13 @@ def calibrate(work: Onboarding) -> None:
     work.stages.keep(calibration={"counts": calibration.counts, "quality": calibration.quality})
 
 
-def choose_steps(room: float, step: float) -> tuple[int, float]:
-    """Return how many steps a training is given at most, and how long one may take [s].
-
-    Args:
-        room: Time for all of them [s].
-        step: How long one took when it was measured [s].
-    """
-    hoped = _HOPED * min(step, _SLOWEST)
-    steps = min(_MOST_STEPS, max(_FEWEST_STEPS, int(room / hoped)))
-    return steps, step if steps == _FEWEST_STEPS else room / steps
-
-
 def evaluate(work: Onboarding) -> None:
     """Test the weights that predict on held-out renders, with the second look that their
     calibration allows.
     """
-    training = {**work.stages.values["training"]}
-    training["tested_step"] = int(read_checkpoint(work.run.best)["global_step"])
-    checkpoint = read_checkpoint(work.weights)
-    finish(work.run, training, test(work.run, checkpoint), work.weights)
+    training = {**work.stages.values["training"], "tested_step": step_of(work.run.best)}
+    results = test(work.run, read_checkpoint(work.weights))
+    finish(work.run, training, results, work.weights)
 
 
 def report(work: Onboarding) -> None:
