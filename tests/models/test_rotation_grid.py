@@ -65,13 +65,16 @@ def make(render: bool = True) -> RotationGrid:
 
 def train(method: RotationGrid, steps: int) -> RotationGrid:
     optimizer = torch.optim.AdamW(method.parameters(), 3e-3)
+    # without a rate that falls, the last step's chance decides, which the number of threads changes
+    scheduler = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.0, steps)
     method.train()
     for step in range(steps):
         generator = torch.Generator().manual_seed(step)
-        losses = method.training_losses(scenes(8, seed=step), generator)
+        losses = method.training_losses(scenes(16, seed=step), generator)
         optimizer.zero_grad()
         losses["loss"].mean().backward()
         optimizer.step()
+        scheduler.step()
     method.eval()
     return method
 
