@@ -37,6 +37,21 @@ def test_a_setting_that_no_job_has_is_refused_with_the_nearest(
     assert "model.net.widht: there is no such setting" in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("tracker={rounds: 2}", "tracker.rounds: is now tracker.quadratic_fits"),
+        ("tracker.motion={momentum: 1}", "tracker.motion.momentum: is now tracker.motion.vel"),
+        ("tracker={patiense: 2}", "tracker.patiense: there is no such setting; did you mean"),
+    ],
+)
+def test_a_wrong_key_within_a_mapping_is_named(
+    typed: str, told: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("track", HOME, ["checkpoint=003_cracker_box", typed]) == 2
+    assert told in capfd.readouterr().err
+
+
 def test_a_sweep_over_numbers_is_left_as_typed() -> None:
     typed = ["-m", "filter.particles=50,100", "model.net.width=16", "model=patch_pf"]
     assert defer_settings(typed, HOME / "conf") == typed

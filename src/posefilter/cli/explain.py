@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.cli.instantiate import hint
-from posefilter.cli.renamed import rename_argument
+from posefilter.cli.renamed import rename, rename_argument
 
 # choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
@@ -49,8 +49,12 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
     if isinstance(error, ConfigCompositionException):
         found = re.search(r"Could not override '([^']+)'", text)
         if found:
-            key = found[1]
-            cfg = compose_without(key, name, conf, arguments)
+            # within a mapping, the cause names the key: tracker={rounds: 2}
+            key = str(getattr(error.__cause__, "full_key", None) or found[1])
+            new = rename(key)
+            if new is not None:
+                return f"{key}: is now {new}"
+            cfg = compose_without(found[1], name, conf, arguments)
             section, _, last = key.rpartition(".")
             target = OmegaConf.select(cfg, f"{section}._target_", throw_on_resolution_failure=False)
             new = rename_argument(target, last)
