@@ -32,10 +32,10 @@ def make_lookalike(
     printed = target.corner_uv is not None and min(target.texture.shape[:2]) >= 16
     if printed and kind < 0.2:
         return stretch(target, name, _clear_stretch(rng), target.texture)
-    if printed and kind < 0.4:
-        return stretch(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
     if printed and kind < 0.55:
-        return stretch(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
+        texture = recolor(rng, target.texture) if kind < 0.4 else None
+        texture = random_texture(rng, 256, photos) if texture is None else texture
+        return stretch(target, name, rng.uniform(0.7, 1.3, 3), texture)
     sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
     base = find_dominant_color(target.texture) if kind < 0.85 else None
     return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])
