@@ -58,6 +58,7 @@ def render_commands(
         "frames_per_scene=2",
         "size=[320,240]",
         "distractors=[4,10]",
+        "lookalike_texture=own",
         f"meshes={root / 'meshes'}",
     ]
     return [

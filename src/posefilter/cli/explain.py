@@ -51,6 +51,7 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
         if found:
             # within a mapping, the cause names the key: tracker={rounds: 2}
             key = str(getattr(error.__cause__, "full_key", None) or found[1])
+            key = re.sub(r"\[(\d+)\]", r".\1", key)
             new = rename(key)
             if new is not None:
                 return f"{key}: is now {new}"

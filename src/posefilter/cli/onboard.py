@@ -136,6 +136,7 @@ class Onboarding:
             f"data.generate.frames={self.frames}",
             f"data.generate.workers={self.cfg.workers}",
             "data.generate.frames_per_scene=2",  # few scenes would be learned by heart
+            "data.generate.lookalike_texture=other",
             f"data.generate.seed={self.cfg.seed}",
             f"data.split={_split(self.frames)}",
             f"data.limit_val={_VALIDATED}",

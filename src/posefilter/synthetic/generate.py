@@ -32,7 +32,7 @@ from posefilter.synthetic.workers import render_frames
 log = logging.getLogger(__name__)
 
 GENERATOR = "_generator.json"
-VERSION = 5  # of the scenes that a seed gives: raise it when they change
+VERSION = 4  # of the scenes that a seed gives: raise it when they change
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
 
@@ -79,6 +79,7 @@ def generate(
     moving_mm: float = 5.0,
     moving_deg: float = 1.0,
     covered_frames: int = 0,
+    lookalike_texture: str = "other",
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or resume one that was begun.
 
@@ -114,6 +115,8 @@ def generate(
         moving_mm: Its shift from frame to frame, root mean square [mm].
         moving_deg: Its turn likewise [degrees].
         covered_frames: Frames in a row of each scene in which something hides the object wholly.
+        lookalike_texture: "other": distractors of the object's shape have another texture than it;
+            "own": some have its own, stretched or recolored.
 
     Returns:
         What was done.
@@ -130,6 +133,7 @@ def generate(
         settle=bool(settle),
         absent_share=float(absent_share),
         instances=int(instances),
+        lookalike_texture=str(lookalike_texture),
     )
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
@@ -239,6 +243,10 @@ def _check(job: Job, frames: int, workers: int) -> None:
             f"covered_frames={job.motion.covered_frames}: a scene has {job.frames_per_scene} "
             f"frames only (frames_per_scene)"
         )
+    if job.scenes.lookalike_texture not in ("other", "own"):
+        raise UserError(
+            f"lookalike_texture={job.scenes.lookalike_texture}: unknown; choose other or own"
+        )
     sensor_model(job.sensor)
     make_renderer(job.renderer)
     if job.scenes.settle:
@@ -310,6 +318,7 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
-    scenes = {"absent_share": 0.0, "instances": 1, **settings.get("scenes", {})}
+    defaults = {"absent_share": 0.0, "instances": 1, "lookalike_texture": "own"}
+    scenes = {**defaults, **settings.get("scenes", {})}
     out = {"mesh_scale": 1.0, "motion": asdict(MotionSettings()), **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out

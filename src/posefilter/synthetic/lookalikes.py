@@ -1,5 +1,5 @@
-"""Distractors that look like the target: its shape with another texture, its texture on another
-shape, boxes of its color.
+"""Distractors that look like the target: its shape with another texture, boxes of its color, and
+if wanted its texture on another shape.
 """
 
 from collections.abc import Sequence
@@ -18,24 +18,33 @@ from posefilter.synthetic.textures import (
 
 
 def make_lookalike(
-    target: Mesh, name: str, photos: Sequence[np.ndarray], rng: np.random.Generator
+    target: Mesh,
+    name: str,
+    photos: Sequence[np.ndarray],
+    rng: np.random.Generator,
+    own_texture: bool = False,
 ) -> Mesh:
-    """Draw a look-alike: the target scaled, recolored or with another texture, or a printed box.
+    """Draw a look-alike: the target stretched and with another texture, or a printed box.
+
+    With the target's own texture, some are the target in other proportions, or with its color
+    channels permuted. A network that learns to reject these rejects the target in photographs,
+    whose colors are not those of the renders.
 
     Args:
         target: The target's mesh.
         name: Of the new mesh.
         photos: Textures to crop from, (h, w, 3) uint8.
         rng: Source of randomness.
+        own_texture: Whether four in ten have the target's texture.
     """
-    kind = rng.random()
+    kind = rng.random() if own_texture else 0.4 + 0.6 * rng.random()
     printed = target.corner_uv is not None and min(target.texture.shape[:2]) >= 16
     if printed and kind < 0.2:
         return stretch(target, name, _clear_stretch(rng), target.texture)
+    if printed and kind < 0.4:
+        return stretch(target, name, rng.uniform(0.7, 1.3, 3), recolor(rng, target.texture))
     if printed and kind < 0.55:
-        texture = recolor(rng, target.texture) if kind < 0.4 else None
-        texture = random_texture(rng, 256, photos) if texture is None else texture
-        return stretch(target, name, rng.uniform(0.7, 1.3, 3), texture)
+        return stretch(target, name, rng.uniform(0.7, 1.3, 3), random_texture(rng, 256, photos))
     sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
     base = find_dominant_color(target.texture) if kind < 0.85 else None
     return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])

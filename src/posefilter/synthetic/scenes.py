@@ -46,6 +46,7 @@ class SceneSettings:
     tabletop_share: float = 0.65
     lookalike_share: float = 0.25  # chance that a distractor is a look-alike
     lookalikes: int = 4  # different ones a scene set
+    lookalike_texture: str = "other"  # than the target's; or own: some have the target's
     classes: int = 14  # distractor classes a scene set
     distance: tuple[float, float] = (0.45, 1.4)  # [m] camera to target
     elevation_deg: tuple[float, float] = (10.0, 85.0)
@@ -122,7 +123,10 @@ def draw_scene_set(
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
     names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
-    lookalikes = tuple(make_solid(make_lookalike(goal.mesh, name, photos, rng)) for name in names)
+    own = settings.lookalike_texture == "own"
+    lookalikes = tuple(
+        make_solid(make_lookalike(goal.mesh, name, photos, rng, own)) for name in names
+    )
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
     tiles = (
         float(rng.uniform(0.2, 1.2)),

@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 
 Color = np.ndarray  # (3,) float in [0, 1]
-_BLACK = 40  # of 255
-_CLEARLY = 0.2  # of the brightness, mean difference of two textures' channels
 
 
 def noise_field(
@@ -179,41 +177,20 @@ def crop_texture(rng: np.random.Generator, photo: np.ndarray, size: int) -> np.n
     return out / 255.0
 
 
-def recolor(rng: np.random.Generator, texture: np.ndarray) -> np.ndarray | None:
-    """Return a texture in clearly different colors: its channels permuted, or inverted.
+def recolor(rng: np.random.Generator, texture: np.ndarray) -> np.ndarray:
+    """Return a texture with its color channels permuted (never the identity) or inverted.
 
-    Yellow stays yellow where red and green are swapped, and gray stays gray: what such a change
-    leaves as it was is not returned.
-
-    Returns:
-        (h, w, 3) uint8; None where none of these changes makes the colors clearly different.
+    A permutation changes gray little or not at all.
     """
     orders = ((1, 0, 2), (2, 1, 0), (1, 2, 0), (2, 0, 1), (0, 2, 1))
-    permuted = [texture[..., list(orders[i])] for i in rng.permutation(len(orders))]
-    others = [255 - permuted[0], *permuted]
-    if rng.random() >= 0.15:
-        others = [*permuted, 255 - permuted[0]]
-    return next((np.ascontiguousarray(one) for one in others if differs(texture, one)), None)
-
-
-def differs(texture: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether two textures (h, w, 3) uint8 of one layout have clearly different colors.
-
-    The black of the first is left out, as the unused parts of an atlas have it.
-    """
-    first, second = (
-        cv2.resize(np.ascontiguousarray(one), (64, 64), interpolation=cv2.INTER_AREA).astype(float)
-        for one in (texture, other)
-    )
-    painted = first.max(-1) > _BLACK
-    difference = np.abs(first - second)[painted].sum() / 3
-    return bool(difference > _CLEARLY * first.max(-1)[painted].sum())
+    out = texture[..., list(orders[int(rng.integers(len(orders)))])]
+    return 255 - out if rng.random() < 0.15 else np.ascontiguousarray(out)
 
 
 def find_dominant_color(texture: np.ndarray) -> Color:
     """Return the mean color (3,) of the largest bin of a coarse histogram, black left out."""
     small = cv2.resize(texture, (64, 64), interpolation=cv2.INTER_AREA).reshape(-1, 3)
-    small = small[small.max(1) > _BLACK] if (small.max(1) > _BLACK).any() else small
+    small = small[small.max(1) > 40] if (small.max(1) > 40).any() else small
     cell = (small // 43).astype(int) @ [36, 6, 1]
     return small[cell == np.bincount(cell).argmax()].mean(0) / 255
 
