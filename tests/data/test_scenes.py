@@ -195,7 +195,7 @@ def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
         generate(tmp_path / "a", 1, object="carton", lookalike_texture="none")
     small = {"object": "carton", "size": (96, 72), "workers": 1, "progress": False}
     generate(tmp_path / "b", 1, **small)  # type: ignore[arg-type]
-    with pytest.raises(UserError, match="begun with other settings"):
+    with pytest.raises(UserError, match=r"begun with other settings \(lookalike_texture\)"):
         generate(tmp_path / "b", 1, lookalike_texture="own", **small)  # type: ignore[arg-type]
     # what was rendered before the choice existed had the target's texture
     record = tmp_path / "b" / "_generator.json"

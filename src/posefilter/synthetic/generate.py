@@ -292,7 +292,7 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
             raise UserError(
                 f"{path}: not a generator's record any more ({error}); choose another out="
             ) from error
-        differing = sorted(k for k in {*there, *settings} if there.get(k) != settings.get(k))
+        differing = _list_differing(there, settings)
         if not any(out.glob("mixed/*/[0-9]*.json")):
             # an earlier start failed before its first frame: nothing is kept of it
             for folder in out.glob("mixed/scene*_0"):
@@ -314,6 +314,18 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
     versions = {name: importlib.metadata.version(name) for name in packages}
     fat.write_json(path, {"settings": settings, "frames": frames, "versions": versions})
+
+
+def _list_differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Return the names of settings that differ, of sections those within."""
+    names: list[str] = []
+    for key in sorted({*one, *other}):
+        first, second = one.get(key), other.get(key)
+        if isinstance(first, dict) and isinstance(second, dict):
+            names += _list_differing(first, second)
+        elif first != second:
+            names.append(key)
+    return names
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
