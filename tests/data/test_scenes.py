@@ -3,6 +3,7 @@ when asked.
 """
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
+from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.synthetic.generate import camera_matrix, generate
@@ -161,28 +163,28 @@ def test_lookalikes_have_the_targets_texture_only_if_wanted(
     """Neither as it is, nor with its channels swapped or inverted; all differ from the target."""
     target = library.store.load("carton")
     sides = target.bounds[1] - target.bounds[0]
-    known = _channels(target.texture)
     shapes, alike = set(), 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
         other = make_lookalike(target, "lookalike_00", [], rng, own_texture)
         assert other.name == "lookalike_00"
         shapes.add(len(other.faces))
-        same_layout = other.texture.shape == target.texture.shape
-        if (
-            same_layout
-            and min(
-                np.abs(_channels(texture) - known).max()
-                for texture in (other.texture, 255 - other.texture)
-            )
-            < 0.5
-        ):
+        if _has_texture(other, target):
             alike += 1
             reshaped = np.abs((other.bounds[1] - other.bounds[0]) / sides - 1).max() > 0.1
             assert reshaped or (other.texture != target.texture).any()
         np.testing.assert_allclose(np.linalg.norm(other.corner_normals, axis=-1), 1, atol=1e-4)
     assert shapes == {len(target.faces), 12}  # stretched ones and boxes
     assert (alike > 8) if own_texture else (alike == 0)
+
+
+def _has_texture(mesh: Mesh, target: Mesh) -> bool:
+    """Return whether a mesh has the target's texture, be its channels swapped or inverted."""
+    if mesh.texture.shape != target.texture.shape:
+        return False
+    known = _channels(target.texture)
+    both = (mesh.texture, 255 - mesh.texture)
+    return any(np.abs(_channels(texture) - known).max() < 0.5 for texture in both)
 
 
 def _channels(texture: np.ndarray) -> np.ndarray:
@@ -193,16 +195,18 @@ def _channels(texture: np.ndarray) -> np.ndarray:
 def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="lookalike_texture=none: unknown; choose other or own"):
         generate(tmp_path / "a", 1, object="carton", lookalike_texture="none")
-    small = {"object": "carton", "size": (96, 72), "workers": 1, "progress": False}
-    generate(tmp_path / "b", 1, **small)  # type: ignore[arg-type]
+    render = partial(
+        generate, tmp_path / "b", 1, object="carton", size=(96, 72), workers=1, progress=False
+    )
+    render()
     with pytest.raises(UserError, match=r"begun with other settings \(lookalike_texture\)"):
-        generate(tmp_path / "b", 1, lookalike_texture="own", **small)  # type: ignore[arg-type]
+        render(lookalike_texture="own")
     # what was rendered before the choice existed had the target's texture
     record = tmp_path / "b" / "_generator.json"
     plain = json.loads(record.read_text())
     del plain["settings"]["scenes"]["lookalike_texture"]
     record.write_text(json.dumps(plain))
-    assert generate(tmp_path / "b", 1, lookalike_texture="own", **small).rendered == 0  # type: ignore[arg-type]
+    assert render(lookalike_texture="own").rendered == 0
 
 
 def test_the_second_camera_stands_to_the_right(scene: SceneSet) -> None:
