@@ -28,7 +28,7 @@ FIRST_SEED = 301  # trainings and tests have seeds below
 def render_commands(root: Path, each: int) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object."""
     common = [f"frames={each}", "frames_per_scene=2", "size=[320,240]", "distractors=[4,10]"]
-    common += [f"meshes={root / 'meshes'}", "progress=false", "lookalike_texture=own"]
+    common += [f"meshes={root / 'meshes'}", "progress=false", "lookalike_texture=other"]
     return [
         ["generate.py", f"out={root / 'data' / name}", f"object={name}", f"seed={seed}", *common]
         for seed, name in enumerate(TARGETS, start=FIRST_SEED)

@@ -41,7 +41,9 @@ FAR = f"{_STEPS}.1.pivot=center {_STEPS}.1.zoom=[0.75,1.3]"
 NEAR = f"{_STEPS}.1.zoom=[0.7,2.2]"
 SPLIT = "data.split={train: 0.8, val: 0.05, test: 0.15}"
 # a third set of scenes, to learn from alone: tests are on those held out of the second
-THIRD, THIRD_SPLIT = "data_third", "data.split={train: 0.93, val: 0.05, test: 0.02}"
+THIRD, TRAIN_SPLIT = "data_third", "data.split={train: 0.93, val: 0.05, test: 0.02}"
+# a fourth, likewise, whose look-alikes of the target have another texture than it
+FOURTH = "data_fourth"
 
 
 class Run(NamedTuple):

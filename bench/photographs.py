@@ -26,10 +26,11 @@ from photograph_runs import (
     CRACKER,
     DIM,
     FAR,
+    FOURTH,
     SPLIT,
     TARGETS,
     THIRD,
-    THIRD_SPLIT,
+    TRAIN_SPLIT,
     Run,
     plan,
 )
@@ -45,7 +46,11 @@ TABLES += (("ycb_video renders", "photographs", True),)
 
 
 def render_commands(
-    root: Path, frames: int = 300, folder: str = "data", first_seed: int = 1
+    root: Path,
+    frames: int = 300,
+    folder: str = "data",
+    first_seed: int = 1,
+    lookalike_texture: str = "own",
 ) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object.
 
@@ -58,7 +63,7 @@ def render_commands(
         "frames_per_scene=2",
         "size=[320,240]",
         "distractors=[4,10]",
-        "lookalike_texture=own",
+        f"lookalike_texture={lookalike_texture}",
         f"meshes={root / 'meshes'}",
     ]
     return [
@@ -74,7 +79,7 @@ def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
         f"data.root={root / run.scenes}",
         f"data.meshes={root / 'meshes'}",
         f"data.object={run.object}",
-        SPLIT if run.scenes == "data" else THIRD_SPLIT,
+        SPLIT if run.scenes == "data" else TRAIN_SPLIT,
     ]
     interval = max(500, run.steps // 4)
     budget = [
@@ -214,6 +219,7 @@ def main() -> int:
     link_meshes(options.root, options.meshes)
     sets = [render_commands(options.root)]
     sets.append(render_commands(options.root, 400, THIRD, first_seed=101))
+    sets.append(render_commands(options.root, 400, FOURTH, 201, lookalike_texture="other"))
     commands = [(words, None) for each in sets for words in each]
     for run in plan():
         if options.only and run.name not in options.only:

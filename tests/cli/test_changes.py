@@ -48,6 +48,6 @@ def test_what_is_not_there_is_named(typed: str, told: str, tmp_path: Path) -> No
 
 
 def test_a_setting_that_earlier_recipes_leave_out_is_taken(tmp_path: Path) -> None:
-    assert change("filter.looks=1", tmp_path)["filter"]["looks"] == 1
+    assert change("filter.max_searches=1", tmp_path)["filter"]["max_searches"] == 1
     with pytest.raises(UserError, match=r"filter\.look: the checkpoint's"):
         change("filter.look=1", tmp_path)

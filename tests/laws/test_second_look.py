@@ -35,8 +35,10 @@ class Toy:
 
     model = MODEL
 
-    def __init__(self, looks: int = 3, calibration: Calibration | None = CALIBRATION) -> None:
-        self.calibration, self.filter = calibration, ToyFilter(looks)
+    def __init__(
+        self, max_searches: int = 3, calibration: Calibration | None = CALIBRATION
+    ) -> None:
+        self.calibration, self.filter = calibration, ToyFilter(max_searches)
 
     def encode(self, batch: Batch) -> Tensor:
         return batch.rgb
@@ -50,8 +52,8 @@ class Toy:
 class ToyFilter:
     """What the search needs of a filter.  The particle's pose holds the pixel that was found."""
 
-    def __init__(self, looks: int) -> None:
-        self.looks, self.runs, self.draws = looks, 0, False
+    def __init__(self, max_searches: int) -> None:
+        self.max_searches, self.runs, self.draws = max_searches, 0, False
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Trace:
         self.runs += 1
@@ -144,7 +146,11 @@ def test_other_draws_are_tried_in_the_whole_image() -> None:
 
 @pytest.mark.parametrize(
     "toy",
-    [Toy(looks=1), Toy(calibration=None), Toy(calibration=replace(CALIBRATION, choice=None))],
+    [
+        Toy(max_searches=1),
+        Toy(calibration=None),
+        Toy(calibration=replace(CALIBRATION, choice=None)),
+    ],
 )
 def test_one_look_is_all_without_a_choice(toy: Toy) -> None:
     first, last = run(toy, draw([[WRONG, RIGHT]]))
@@ -153,14 +159,14 @@ def test_one_look_is_all_without_a_choice(toy: Toy) -> None:
 
 
 def test_two_looks_are_one_more() -> None:
-    toy = Toy(looks=2)
+    toy = Toy(max_searches=2)
     run(toy, draw([[(5, 5, 1.0, 0.0), (40, 30, 0.8, 0.1)]]))
     assert toy.filter.runs == 2
 
 
 def test_an_image_without_depth_beside_the_answer_is_not_searched_for_more() -> None:
     toy = Toy()
-    toy.filter.looks = 2
+    toy.filter.max_searches = 2
     _, last = run(toy, draw([[WRONG]], wall=0.0))
     assert places(last) == [(5, 5)]
     assert toy.filter.runs == 1

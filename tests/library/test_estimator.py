@@ -455,10 +455,10 @@ def test_what_is_no_seed_is_refused_in_one_line(small: posefilter.Estimator, see
 
 def test_fewer_looks_keep_the_calibration() -> None:
     rgb, depth, K = read_scene()
-    once = posefilter.load("003_cracker_box", overrides=["filter.looks=1"], device="cpu")
+    once = posefilter.load("003_cracker_box", overrides=["filter.max_searches=1"], device="cpu")
     result = once.predict(rgb, depth, K)
-    assert once.methods[0].filter.looks == 1
+    assert once.methods[0].filter.max_searches == 1
     assert result.probability is not None
     assert 0 <= result.probability <= result.presence
-    with pytest.raises(posefilter.UserError, match=r"filter\.looks=4: must be 1, 2 or 3"):
-        posefilter.load("003_cracker_box", overrides=["filter.looks=4"], device="cpu")
+    with pytest.raises(posefilter.UserError, match=r"filter\.max_searches=4: must be 1, 2 or 3"):
+        posefilter.load("003_cracker_box", overrides=["filter.max_searches=4"], device="cpu")

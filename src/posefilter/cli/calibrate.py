@@ -164,7 +164,7 @@ def learn(
     """
     method.calibration, first = None, None
     frames = collect_frames(method, present, absent, shown)
-    if method.filter.looks > 1:
+    if method.filter.max_searches > 1:
         method.calibration = first = fit_choice(frames, source)
         frames = collect_frames(method, present, absent, shown)
     held = measure_quality(frames, cross_validate(frames, first=first))

@@ -138,7 +138,7 @@ def method_of(
     """
     recipe = checkpoint["recipe"]
     settings = changed(recipe["settings"], wanted or {})
-    same = _without_looks(settings) == _without_looks(recipe["settings"])
+    same = _without_max_searches(settings) == _without_max_searches(recipe["settings"])
     recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
@@ -164,11 +164,14 @@ def method_of(
     return method.eval()
 
 
-def _without_looks(settings: dict[str, Any]) -> dict[str, Any]:
+def _without_max_searches(settings: dict[str, Any]) -> dict[str, Any]:
     """Return settings without how often an image is searched: fewer answers to choose from are
     judged by the same features.
     """
     own = settings.get("filter")
     if not isinstance(own, dict):
         return settings
-    return {**settings, "filter": {key: value for key, value in own.items() if key != "looks"}}
+    return {
+        **settings,
+        "filter": {key: value for key, value in own.items() if key != "max_searches"},
+    }

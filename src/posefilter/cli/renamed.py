@@ -57,6 +57,7 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.objectness_weight",
+    "filter.looks": "filter.max_searches",
     "tracker.walk": "tracker.move_scale",
     "tracker.jump": "tracker.jump_penalty",
     "tracker.epsilon": "tracker.kld_epsilon",
@@ -181,6 +182,7 @@ _LOSSES = {"relevance": "objectness"}
 _OBJECTNESS = {"relevance": "objectness_weight", "relevance_weight": "objectness_weight"}
 # arguments of classes, by today's place of the class below posefilter
 ARGUMENTS = {
+    "filters.loop.ParticleFilter": {"looks": "max_searches"},
     "filters.propagate.Compose": {"pieces": "components"},
     "filters.propagate.Gaussian": {"factor": "noise_scale"},
     "filters.propagate.HalfTurns": {"share": "probability"},

@@ -83,8 +83,8 @@ def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generato
         The trace; of an image whose answer was replaced, of the search that found it. The scene
         stays that of the whole images.
     """
-    calibration, looks = method.calibration, method.filter.looks
-    if calibration is None or calibration.choice is None or looks < 2:
+    calibration, searches = method.calibration, method.filter.max_searches
+    if calibration is None or calibration.choice is None or searches < 2:
         return first
     ranks = calibration.rank(method.collect_features(first, batch))
     trace = first
@@ -114,7 +114,7 @@ def _search(
     # of a single image, its first search has encoded it
     known = first.scene is not None and len(first.belief.best) == 1
     whole = first.scene if known else method.encode(image)
-    for part in (blank(image, hidden), image)[: method.filter.looks - 1]:
+    for part in (blank(image, hidden), image)[: method.filter.max_searches - 1]:
         if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
             continue
         scene = whole if part is image else method.encode(part)

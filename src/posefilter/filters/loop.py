@@ -63,11 +63,11 @@ class ParticleFilter(nn.Module):
         estimate: Chooses one pose of the last particles.
         refine: Improves the estimate, or replaces the particles.
         first_particles: Number of particles at the first step; `particles` if None.
-        looks: How often an image is searched at most, while a calibrated answer is doubtful
+        max_searches: How often an image is searched at most, while a calibrated answer is doubtful
             (confidence/second_look.py); 1 to 3.
 
     Raises:
-        UserError: A number is below 1, or `looks` above 3.
+        UserError: A number is below 1, or `max_searches` above 3.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class ParticleFilter(nn.Module):
         estimate: Estimate,
         refine: Refine,
         first_particles: int | None = None,
-        looks: int = 3,
+        max_searches: int = 3,
     ) -> None:
         super().__init__()
         first = particles if first_particles is None else first_particles
@@ -91,9 +91,9 @@ class ParticleFilter(nn.Module):
                 f"filter: particles={particles}, first_particles={first_particles} and "
                 f"steps={steps} must be 1 or more"
             )
-        if not 1 <= looks <= 3:
-            raise UserError(f"filter.looks={looks}: must be 1, 2 or 3")
-        self.particles, self.steps, self.looks = particles, steps, looks
+        if not 1 <= max_searches <= 3:
+            raise UserError(f"filter.max_searches={max_searches}: must be 1, 2 or 3")
+        self.particles, self.steps, self.max_searches = particles, steps, max_searches
         self.first_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
