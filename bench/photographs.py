@@ -72,6 +72,12 @@ def render_commands(
     ]
 
 
+def list_sets(root: Path) -> list[list[list[str]]]:
+    """Return the commands of each set but the first: that of the tests, and two to learn from."""
+    third = render_commands(root, 400, THIRD, 101)
+    return [render_commands(root), third, render_commands(root, 400, FOURTH, 201, "other")]
+
+
 def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:
     """Return what to run to train and test one filter on renders."""
     data = [
@@ -217,10 +223,7 @@ def main() -> int:
     if not options.meshes or not options.frames:
         parser.error("--meshes and --frames are needed")
     link_meshes(options.root, options.meshes)
-    sets = [render_commands(options.root)]
-    sets.append(render_commands(options.root, 400, THIRD, first_seed=101))
-    sets.append(render_commands(options.root, 400, FOURTH, 201, lookalike_texture="other"))
-    commands = [(words, None) for each in sets for words in each]
+    commands = [(words, None) for each in list_sets(options.root) for words in each]
     for run in plan():
         if options.only and run.name not in options.only:
             continue
