@@ -1,8 +1,16 @@
-"""The number of steps of an onboarding fills the time that there is, whatever was measured."""
+"""The number of steps of an onboarding fills the time that there is, whatever was measured; what is
+left is the time of the stages that are not done.
+"""
+
+from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
-from posefilter.cli.onboard import choose_steps
+from posefilter.cli.measure_speed import Speed
+from posefilter.cli.onboard import STAGES, Onboarding, choose_steps
+from posefilter.cli.stages import Stages
+from posefilter.meshes.builtin.catalog import build, names
 
 
 @pytest.mark.parametrize("step", [0.05, 0.3, 0.4, 4.0])
@@ -19,3 +27,22 @@ def test_a_slow_measure_does_not_shorten_the_training() -> None:
 
 def test_some_steps_are_taken_even_if_no_time_is_left() -> None:
     assert choose_steps(-5.0, 0.5) == (100, 0.5)
+
+
+def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path) -> None:
+    cfg = OmegaConf.create({"frames": 400, "test_frames": 60, "symmetries": "none"})
+    work = Onboarding(cfg, build(names()[0]), tmp_path, Stages(tmp_path / "record.json"))
+    speed = Speed(step=0.5, image=1.0)
+    left = []
+    for stage in STAGES:
+        left.append(work.rest(speed))
+        work.stages.run(stage.name, work.settings_of(stage), lambda: None)
+    found = dict(zip([stage.name for stage in STAGES], left, strict=True))
+    # 280 images of the calibration, 60 of the test, 8 of the training, and 25 s for all else
+    assert found["mesh"] == found["train"] == 280 + 60 + 8 + 25
+    assert found["export"] == found["calibrate"] == 280 + 60 + 25
+    assert found["test"] == 60 + 25
+    assert found["report"] == 25
+    assert work.rest(speed) == 0
+    cfg.test_frames = 30  # the test is to be made again
+    assert work.rest(speed) == 30 + 25

@@ -102,17 +102,22 @@ class Onboarding:
         wanted = round(_FRAMES_A_MINUTE * self.cfg.budget_minutes)
         return min(_MOST_FRAMES, max(_FEWEST_FRAMES, wanted))
 
+    @cached_property
+    def mesh_digest(self) -> str:
+        """What decides how the mesh looks, in short."""
+        parts = (self.mesh.vertices, self.mesh.faces, self.mesh.texture, self.mesh.corner_colors)
+        content = b"".join(np.asarray(part).tobytes() for part in parts if part is not None)
+        return sha256(content).hexdigest()[:16]
+
     @property
     def digests(self) -> dict[str, str]:
         """What stages depend on beside settings: the mesh, and the symmetries that are in use."""
         file = self.out / "meshes" / self.mesh.name / "symmetries.json"
-        parts = (self.mesh.vertices, self.mesh.faces, self.mesh.texture, self.mesh.corner_colors)
-        content = b"".join(np.asarray(part).tobytes() for part in parts if part is not None)
         own = str(self.cfg.symmetries)
         if Path(own).is_file():
             own = Path(own).read_text()
         return {
-            "mesh": sha256(content).hexdigest()[:16],
+            "mesh": self.mesh_digest,
             "symmetries": sha256(own.encode()).hexdigest()[:16],
             "used": sha256(file.read_bytes()).hexdigest()[:16] if file.is_file() else "",
         }
@@ -179,16 +184,20 @@ class Onboarding:
         done = 0
         with suppress(UserError):  # none yet, or a broken one
             done = step_of(self.training / "checkpoints" / LAST)
-        tested = self.stages.seconds.get("test", 0.0) > 0
-        training = speed.step * (values["steps"] - done)
-        return float(training) + (0.0 if tested else self.rest(speed))
+        return float(speed.step * (values["steps"] - done)) + self.rest(speed)
 
     def rest(self, speed: Speed) -> float:
-        """Return how long all that follows the training takes [s]."""
+        """Return how long what follows the training, and is not done, takes [s]."""
         # frames with and without the object, run twice; doubtful ones, once or twice more each
         searches = 7 * min(_CALIBRATED, self.frames // 10)
-        images = _VALIDATED + self.cfg.test_frames + searches
-        return float(speed.image * images + _REST)
+        images = {"train": _VALIDATED, "calibrate": searches, "test": int(self.cfg.test_frames)}
+        ahead = [one.name for one in STAGES if not self.is_done(one)]
+        seconds = speed.image * sum(images.get(name, 0) for name in ahead)
+        return float(seconds + (_REST if ahead else 0.0))
+
+    def is_done(self, stage: Stage) -> bool:
+        """Tell whether a stage was finished, with the settings that it would have now."""
+        return self.stages.is_done(stage.name, self.settings_of(stage))
 
 
 def onboard(job: Job) -> None:
@@ -200,15 +209,15 @@ def onboard(job: Job) -> None:
     hold_folder(out)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD, FOUND))
     for number, stage in enumerate(STAGES, 1):
-        settings = work.settings_of(stage)
         head = f"[{number}/{len(STAGES)}] {stage.doing}"
-        if work.stages.is_done(stage.name, settings):
+        if work.is_done(stage):
             say(cfg.console, "stage", f"{head}: done before", stage=stage.name, done=True)
             continue
         left = work.seconds_left
         tail = "" if left is None else f"; about {format_duration(left)} left"
         say(cfg.console, "stage", head + tail, stage=stage.name, done=False, seconds_left=left)
-        work.stages.run(stage.name, settings, partial(stage.do, work), stage.costly)
+        doing = partial(stage.do, work)
+        work.stages.run(stage.name, work.settings_of(stage), doing, stage.costly)
     tell(work)
 
 
