@@ -201,6 +201,10 @@ def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
     render()
     with pytest.raises(UserError, match=r"begun with other settings \(lookalike_texture\)"):
         render(lookalike_texture="own")
+    with pytest.raises(UserError, match=r"other settings \(frames_per_scene, moving, moving_mm\)"):
+        render(moving="camera", moving_mm=3.0)
+    with pytest.raises(UserError, match=r"other settings \(size\)"):
+        render(size=(160, 120))
     # what was rendered before the choice existed had the target's texture
     record = tmp_path / "b" / "_generator.json"
     plain = json.loads(record.read_text())

@@ -35,6 +35,9 @@ GENERATOR = "_generator.json"
 VERSION = 4  # of the scenes that a seed gives: raise it when they change
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
+# settings as they are typed, by how a dataset records them
+_TYPED = {"width": "size", "height": "size", "K": "camera", "moves": "moving"}
+_TYPED |= {"translation_mm": "moving_mm", "rotation_deg": "moving_deg"}
 
 
 @dataclass(frozen=True)
@@ -298,7 +301,7 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
             for folder in out.glob("mixed/scene*_0"):
                 shutil.rmtree(folder)
         elif differing:
-            keys = ", ".join(differing)
+            keys = ", ".join(_as_typed(differing))
             raise UserError(
                 f"{path}: this dataset was begun with other settings ({keys}); choose another out="
             )
@@ -326,6 +329,12 @@ def _list_differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
         elif first != second:
             names.append(key)
     return names
+
+
+def _as_typed(names: list[str]) -> list[str]:
+    """Return settings by the names that are typed; a size changes intrinsics too: it stands alone."""
+    typed = {_TYPED.get(name, name) for name in names}
+    return sorted(typed - {"camera"} if "size" in typed else typed)
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
