@@ -332,7 +332,7 @@ def _list_differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
 
 
 def _as_typed(names: list[str]) -> list[str]:
-    """Return settings by the names that are typed; a size, which changes intrinsics, without them."""
+    """Return settings as they are typed; a size, which changes the intrinsics, without these."""
     typed = {_TYPED.get(name, name) for name in names}
     return sorted(typed - {"camera"} if "size" in typed else typed)
 
