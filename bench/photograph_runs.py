@@ -213,6 +213,11 @@ def plan() -> list[Run]:
     # after turns by texture
     fourth = [("sugar", sugar, 3000), ("mug", mug, 2000), ("soup", soup, 1500)]
     judged += [shipped(f"{name}_v", *rest)._replace(scenes=THIRD) for name, *rest in fourth]
+    # of the fourth set, validated at the end alone
+    for name, target in (("sugar", sugar), ("mug", mug)):
+        last = shipped(f"{name}_w", target, 1200)
+        words = f"{last.words} trainer.val_check_interval=1200"
+        judged.append(last._replace(words=words, scenes=FOURTH))
     return [*map(_without_surface, earlier), *judged]
 
 

@@ -40,8 +40,8 @@ class PoseFilter:
         s, rng = self.settings, np.random.default_rng(seed)
         names = [output.name for output in self.encode.get_outputs()]
         image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
-        scene = dict(zip(names, self.encode.run(names, image), strict=True))
-        poses = draw_poses(*(scene[name] for name in ("point", "weight", "share", "position")),
+        encoding = dict(zip(names, self.encode.run(names, image), strict=True))
+        poses = draw_poses(*(encoding[name] for name in ("point", "weight", "share", "position")),
                            self.center, self.radius, s["first_particles"], rng)  # fmt: skip
         weights = np.ones(len(poses)) / len(poses)
         for number, sigma in enumerate(s["levels"]):
@@ -50,7 +50,7 @@ class PoseFilter:
                     poses = poses[resample(weights, s["particles"], rng)]
                 for kernel in s["propagate"]:
                     poses = self.propagate(poses, kernel, sigma, rng)
-            scores = self.score(scene, poses, sigma, s["points"], rng)
+            scores = self.score(encoding, poses, sigma, s["points"], rng)
             weights = softmax(scores)
         best, score = poses[scores.argmax()], scores.max()
         for step in s["refine"]:
@@ -58,16 +58,16 @@ class PoseFilter:
                 best = self.align(image, best, **step)
                 continue
             if step["kind"] == "texture":
-                best, poses = self.turn(scene, image, best, poses, rng, **step)
+                best, poses = self.turn(encoding, image, best, poses, rng, **step)
                 continue
             refine = self.rescore if step["kind"] == "rescore" else self.shift
-            best, score = refine(scene, best, poses, weights, rng, **step)
+            best, score = refine(encoding, best, poses, weights, rng, **step)
         return best, float(score), poses, weights
 
-    def score(self, scene, poses, sigma, points, rng):
+    def score(self, encoding, poses, sigma, points, rng):
         """Log-likelihoods (N,) at a noise level [m], from so many image points."""
         noise = draw_points(points, self.settings["quasi_monte_carlo"], rng)
-        given = {"poses": poses, "sigma": np.array(sigma, np.float32), "noise": noise, **scene}
+        given = {"poses": poses, "sigma": np.array(sigma, np.float32), "noise": noise, **encoding}
         names = [one.name for one in self.measure.get_inputs()]
         return self.measure.run(None, {name: given[name] for name in names})[0]
 
@@ -87,14 +87,14 @@ class PoseFilter:
         turn = np.float32(axes * angle[:, None])
         return move(poses, np.concatenate([np.zeros_like(turn), turn], 1), self.center)
 
-    def rescore(self, scene, best, poses, weights, rng, top_k, pixels, sigma, **_):
+    def rescore(self, encoding, best, poses, weights, rng, top_k, pixels, sigma, **_):
         """The best of the estimate and the heaviest particles, by more points."""
         poses = np.concatenate([best[None], poses[np.argsort(-weights)[:top_k]]])
-        scores = self.score(scene, poses, sigma, pixels, rng)
+        scores = self.score(encoding, poses, sigma, pixels, rng)
         return poses[scores.argmax()], scores.max()
 
-    def shift(self, scene, best, poses, weights, rng, iterations, antithetic_pairs, initial_scale,
-              final_scale, sigma, pixels, **_):  # fmt: skip
+    def shift(self, encoding, best, poses, weights, rng, iterations, antithetic_pairs,
+              initial_scale, final_scale, sigma, pixels, **_):  # fmt: skip
         """Mean shift: the likelihood-weighted mean of pairs of opposite moves."""
         for index in range(iterations):
             share = index / max(iterations - 1, 1)
@@ -102,9 +102,9 @@ class PoseFilter:
             noise = rng.standard_normal((antithetic_pairs, 6), dtype=np.float32)
             moves = np.concatenate([noise, -noise]) * self.scale(spread)
             near = move(np.broadcast_to(best, (len(moves), 4, 4)), moves, self.center)
-            weight = softmax(self.score(scene, near, sigma, pixels, rng))
+            weight = softmax(self.score(encoding, near, sigma, pixels, rng))
             best = move(best[None], (weight[:, None] * moves).sum(0)[None], self.center)[0]
-        return best, self.score(scene, best[None], sigma, pixels, rng)[0]
+        return best, self.score(encoding, best[None], sigma, pixels, rng)[0]
 
     def align(self, image, best, surface, iterations, initial_gate, final_gate, prior, noise,
               effective, **_):  # fmt: skip
@@ -125,8 +125,8 @@ class PoseFilter:
             pose, moved = move(pose[None], step[None], self.center)[0], moved + step
         return np.float32(pose) if known else best
 
-    def turn(self, scene, image, best, poses, rng, turns, coarse, surface, spacing, learned_weight,
-             pixels, sigma, **_):  # fmt: skip
+    def turn(self, encoding, image, best, poses, rng, turns, coarse, surface, spacing,
+             learned_weight, pixels, sigma, **_):  # fmt: skip
         """Turn the estimate and the particles as the object's print says."""
         turns = np.float32(np.pad(np.reshape(turns, (-1, 3, 4)), ((0, 0), (0, 1), (0, 0))))
         turns[:, 3, 3] = 1
@@ -136,7 +136,7 @@ class PoseFilter:
         def weigh(some_poses, still):
             return compare(image, some_poses, own, self.center, spacing, size, still)
 
-        learned = learned_weight * self.score(scene, best @ some, sigma, pixels, rng)
+        learned = learned_weight * self.score(encoding, best @ some, sigma, pixels, rng)
         total = learned + weigh(best @ some, len(some) > 12)
         tried = np.array(coarse)
         if len(some) > 12:  # the best are compared at the best turn beside each

@@ -42,9 +42,9 @@ Capabilities = tuple[Capability, ...]
 MEANINGS: Mapping[str, str] = {
     "belief_maps": "training on maps of keypoints alone",
     "candidates": "scored candidate poses",
-    "color": "a method whose scenes keep the image's colors",
+    "color": "a method whose encodings keep the image's colors",
     "correspondences": "training on dense object coordinates alone",
-    "depth": "a method whose scenes keep the measured depth",
+    "depth": "a method whose encodings keep the measured depth",
     "displacement": "particles with a learned displacement",
     "free_latent": "a latent that is no input of the network",
     "grid_scores": "training on crops scored against rotations",

@@ -22,7 +22,7 @@ from posefilter.types import (
     Trace,
 )
 
-Scene = Any  # a method's encoded images: nothing, a pyramid, a feature map, proposals
+Encoding = Any  # a method's encoded images: nothing, a pyramid, a feature map, proposals
 
 
 class Space(Protocol):
@@ -66,12 +66,12 @@ class Method(Protocol):
         """Return L, the width of a particle's latent (0 for none)."""
         ...
 
-    def encode(self, batch: Batch) -> Scene:
+    def encode(self, batch: Batch) -> Encoding:
         """Encode the images.  Must not use `batch.mask` or `batch.camera_from_object`."""
         ...
 
     def measure(
-        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+        self, encoding: Encoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Measure every particle against the image."""
         ...
@@ -82,7 +82,7 @@ class ScoresPoses(Protocol):
     """A method that can score any poses; required by refinement."""
 
     def score_poses(
-        self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Encoding, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         """Score (B, N, 4, 4) at noise level sigma, from `pixels` image points each -> (B, N),
         differentiable in poses.
@@ -94,7 +94,7 @@ class ScoresPoses(Protocol):
 class ProposesPoses(Protocol):
     """A method that can draw likely poses; required by `filter/initialize=from_proposals`."""
 
-    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: Encoding, particles: int, generator: Generator) -> Tensor:
         """Return (B, particles, 4, 4) camera_from_object."""
         ...
 
@@ -107,7 +107,7 @@ class HasSurfacePoints(Protocol):
 
     model: ObjectModel
 
-    def surface_points(self, scene: Scene, state: Tensor) -> tuple[Tensor, Tensor]:
+    def surface_points(self, encoding: Encoding, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
         N) bool.
         """
@@ -118,14 +118,14 @@ class HasSurfacePoints(Protocol):
 class HasImagePatches(Protocol):
     """A method whose particles each see a patch of the image; required by figures of glimpses."""
 
-    def image_patches(self, scene: Scene, state: Tensor) -> Tensor:
+    def image_patches(self, encoding: Encoding, state: Tensor) -> Tensor:
         """Return what particles (B, N, 2) [px] see: (B, N, C, k, k), color in [-1, 1] first."""
         ...
 
 
 @runtime_checkable
 class HasObjectness(Protocol):
-    """A scene with an objectness map; required by `filter/initialize=from_objectness`."""
+    """An encoding with an objectness map; required by `filter/initialize=from_objectness`."""
 
     @property
     def objectness(self) -> Tensor:
@@ -135,7 +135,7 @@ class HasObjectness(Protocol):
 
 @runtime_checkable
 class HasDepth(Protocol):
-    """A scene that keeps the measured depth; required by refinement that aligns with it."""
+    """An encoding that keeps the measured depth; required by refinement that aligns with it."""
 
     @property
     def measured_depth(self) -> Tensor:
@@ -150,7 +150,7 @@ class HasDepth(Protocol):
 
 @runtime_checkable
 class HasColor(HasDepth, Protocol):
-    """A scene that keeps the image's colors too; required to compare them with a texture."""
+    """An encoding that keeps the image's colors too; required to compare them with a texture."""
 
     @property
     def measured_color(self) -> Tensor:
@@ -170,7 +170,7 @@ class Initialize(Protocol):
     """Draw the first particles' states."""
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return states (B, N, *S)."""
         ...
@@ -223,7 +223,7 @@ class Estimate(Protocol):
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:
@@ -241,7 +241,7 @@ class Refine(Protocol):
     """
 
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with another estimate, or with other particles."""
         ...

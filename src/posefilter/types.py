@@ -120,4 +120,4 @@ class Trace(NamedTuple):
     # (B, T) log of the summed weights at each step; None if no filter made the trace
     log_evidence: Tensor | None = None
     # the encoded images, as the method's `encode` returned them; None if it is not kept
-    scene: Any = None
+    encoding: Any = None

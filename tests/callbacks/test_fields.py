@@ -58,7 +58,7 @@ class Oracle:
         self.truth, self.space = truth, PoseSpace(tuple(CENTER.tolist()), 0.14)
 
     def score_poses(
-        self, scene: object, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: object, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         return -0.5 * (self.space.distance(poses, self.truth) / sigma).square()
 

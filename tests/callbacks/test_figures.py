@@ -100,19 +100,21 @@ class Told(PoseEstimator):
         return move_about(batch.camera_from_object, shift, torch.zeros(3))
 
     def measure(
-        self, scene: torch.Tensor, particles: Particles, step: Step, generator: torch.Generator
+        self, encoding: torch.Tensor, particles: Particles, step: Step, generator: torch.Generator
     ) -> ParticleOutput:
-        likely = -0.5 * (self.space.distance(particles.state, scene[:, None]) / step.sigma).square()
+        likely = (
+            -0.5 * (self.space.distance(particles.state, encoding[:, None]) / step.sigma).square()
+        )
         still = torch.zeros(*particles.state.shape[:2], 6)
         return ParticleOutput(likely, still, particles.state, particles.latent)
 
     def propose_poses(
-        self, scene: torch.Tensor, particles: int, generator: torch.Generator
+        self, encoding: torch.Tensor, particles: int, generator: torch.Generator
     ) -> torch.Tensor:
-        tangent = torch.randn(len(scene), particles, 6, generator=generator) * torch.tensor(
+        tangent = torch.randn(len(encoding), particles, 6, generator=generator) * torch.tensor(
             [0.03] * 3 + [0.2] * 3
         )
-        return move_about(scene[:, None].expand(-1, particles, 4, 4), tangent, torch.zeros(3))
+        return move_about(encoding[:, None].expand(-1, particles, 4, 4), tangent, torch.zeros(3))
 
 
 def validate(folder: Path, *callbacks: Any) -> None:

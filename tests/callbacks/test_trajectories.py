@@ -46,10 +46,10 @@ def test_the_heaviest_are_followed_and_what_they_saw_is_what_is_there() -> None:
     assert states.tolist() == [[[20.0, 8.0]]] * 2
     image = torch.rand(1, 4, 16, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
     method: Any = SimpleNamespace(
-        image_patches=lambda scene, state: IntegerCut(3)(scene.image, state)
+        image_patches=lambda encoding, state: IntegerCut(3)(encoding.image, state)
     )
-    scene: Any = SimpleNamespace(image=image)
-    seen = extract_glimpses(method, scene, states)
+    encoding: Any = SimpleNamespace(image=image)
+    seen = extract_glimpses(method, encoding, states)
     assert seen.shape == (2, 1, 3, 3, 3)
     there = (image[0, :3, 7:10, 19:22].permute(1, 2, 0).numpy() + 1) / 2 * 255
     assert np.abs(seen[1, 0] - there).max() <= 0.5 + 1e-3

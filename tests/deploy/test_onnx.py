@@ -32,17 +32,17 @@ from posefilter.types import BeliefBatch
 from printed_objects import load, look
 
 HOME = Path(__file__).parents[2]
-SCENE = (
+ENCODING = (
     HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
 )  # one mode: random numbers do not choose
 
 
 def read_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return color (H, W, 3) uint8, depth (H, W) float32 [m] and K (3, 3) of a scene that ships."""
-    stem = min(SCENE.glob("*.left.jpg")).name.removesuffix(".left.jpg")
-    rgb = np.ascontiguousarray(cv2.imread(str(SCENE / f"{stem}.left.jpg"))[..., ::-1])
-    depth = cv2.imread(str(SCENE / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED) / 10000
-    (camera,) = json.loads((SCENE / "_camera_settings.json").read_text())["camera_settings"][:1]
+    stem = min(ENCODING.glob("*.left.jpg")).name.removesuffix(".left.jpg")
+    rgb = np.ascontiguousarray(cv2.imread(str(ENCODING / f"{stem}.left.jpg"))[..., ::-1])
+    depth = cv2.imread(str(ENCODING / f"{stem}.left.depth.png"), cv2.IMREAD_UNCHANGED) / 10000
+    (camera,) = json.loads((ENCODING / "_camera_settings.json").read_text())["camera_settings"][:1]
     own = camera["intrinsic_settings"]
     K = np.array([[own["fx"], 0, own["cx"]], [0, own["fy"], own["cy"]], [0, 0, 1]])
     return rgb, depth.astype(np.float32), K
@@ -112,16 +112,18 @@ def compare_networks(
     with torch.no_grad():
         truth = graphs.encode.network(*images)
     given = {"rgb": rgb, "depth": depth, "intrinsics": np.float32(K)}
-    scene = dict(zip(names, own.encode.run(names, given), strict=True))
+    encoding = dict(zip(names, own.encode.run(names, given), strict=True))
     for name, value in zip(names, truth, strict=True):
-        assert np.abs(scene[name] - value.numpy()).max() < 1e-3 * max(1, float(value.abs().max()))
+        assert np.abs(encoding[name] - value.numpy()).max() < 1e-3 * max(
+            1, float(value.abs().max())
+        )
     draw = np.random.default_rng(0)
     for count, points, sigma in ((1, 7, 0.04), (200, 64, 0.01)):
         states = poses.draw_poses(
-            *(scene[name] for name in ("point", "weight", "share", "position")),
+            *(encoding[name] for name in ("point", "weight", "share", "position")),
             own.center, own.radius, count, draw,
         )  # fmt: skip
-        scores = own.score(scene, states, sigma, points, np.random.default_rng(1))
+        scores = own.score(encoding, states, sigma, points, np.random.default_rng(1))
         noise = poses.draw_points(
             points, own.settings["quasi_monte_carlo"], np.random.default_rng(1)
         )
@@ -161,19 +163,19 @@ def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
     assert (len(coarse) > 12) == (name == "soup_can")  # both ways through the stages
     R = random_rotation(1, generator=torch.Generator().manual_seed(2))[0]
     truth = make_pose(R, torch.tensor([0.0, 0, 4.5 * model.radius]) - R @ model.center)
-    scene = look(name, truth)
+    encoding = look(name, truth)
     wrong = truth @ turns[len(turns) // 3]
     given = BeliefBatch(wrong.expand(1, 20, 4, 4), torch.zeros(1, 20), wrong[None], torch.zeros(1))
     method: Any = SimpleNamespace(model=model)
-    theirs = turn(given, scene, method, torch.Generator()).best[0].numpy()
+    theirs = turn(given, encoding, method, torch.Generator()).best[0].numpy()
     own = poses.PoseFilter.__new__(poses.PoseFilter)
     own.center, own.radius = model.center.numpy(), float(model.radius)
     own.settings = {"diameter": model.diameter}
-    own.score = lambda scene, states, *_: np.zeros(len(states))
+    own.score = lambda encoding, states, *_: np.zeros(len(states))
     image = {
-        "rgb": 255 * scene.measured_color[0].movedim(0, 2).numpy(),
-        "depth": scene.measured_depth[0].numpy(),
-        "intrinsics": scene.intrinsics[0].numpy(),
+        "rgb": 255 * encoding.measured_color[0].movedim(0, 2).numpy(),
+        "depth": encoding.measured_depth[0].numpy(),
+        "intrinsics": encoding.intrinsics[0].numpy(),
     }
     (described,) = describe_turns(turn, model)
     ours, particles = own.turn(
@@ -304,10 +306,10 @@ def test_a_traced_program_runs_in_torch_alone(estimator: posefilter.Estimator) -
     measure = torch.export.load(io.BytesIO(to_program(graphs.measure))).module()
     images = torch.from_numpy(rgb), torch.from_numpy(depth), torch.from_numpy(K).float()
     with torch.no_grad():
-        scene = graphs.encode.network(*images)[:5]
+        encoding = graphs.encode.network(*images)[:5]
         states = torch.eye(4).repeat(9, 1, 1)
         states[:, 2, 3] = torch.linspace(0.4, 1.2, 9)
-        given = (states, torch.tensor(0.02), torch.randn(31, 2), *scene)
+        given = (states, torch.tensor(0.02), torch.randn(31, 2), *encoding)
         torch.testing.assert_close(
             measure(*given), graphs.measure.network(*given), atol=1e-3, rtol=1e-4
         )

@@ -25,7 +25,9 @@ class Points:
     def __init__(self, point: torch.Tensor) -> None:
         self.point, self.model = point, MODEL
 
-    def surface_points(self, scene: None, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def surface_points(
+        self, encoding: None, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         return self.point, torch.ones_like(self.point[..., 0], dtype=torch.bool)
 
 
@@ -111,7 +113,7 @@ def test_points_that_are_not_known_do_not_count() -> None:
 
     class Some(Points):
         def surface_points(
-            self, scene: None, state: torch.Tensor
+            self, encoding: None, state: torch.Tensor
         ) -> tuple[torch.Tensor, torch.Tensor]:
             return self.point, known
 
@@ -215,7 +217,7 @@ def test_where_no_point_is_known_all_count() -> None:
 
     class Unknown(Points):
         def surface_points(
-            self, scene: None, state: torch.Tensor
+            self, encoding: None, state: torch.Tensor
         ) -> tuple[torch.Tensor, torch.Tensor]:
             return self.point, torch.zeros_like(self.point[..., 0], dtype=torch.bool)
 

@@ -122,7 +122,7 @@ class Hill:
         self.seeds: list[int] = []
 
     def score_poses(
-        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         self.counts.append(poses.shape[1])
         self.seeds.append(generator.initial_seed())
@@ -181,7 +181,7 @@ def test_shifts_narrow_from_the_start_to_the_end_by_equal_ratios() -> None:
         spreads: list[float]
 
         def score_poses(
-            self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+            self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
         ) -> Tensor:
             if poses.shape[1] > 1:
                 self.spreads.append(float(poses[..., :3, 3].std()))
@@ -201,9 +201,9 @@ def test_the_first_steps_of_a_climb_have_its_length_and_the_last_are_shorter() -
 
     class Score(Hill):
         def score_poses(
-            self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+            self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
         ) -> Tensor:
-            return 1000 * super().score_poses(scene, poses, sigma, generator, pixels)
+            return 1000 * super().score_poses(encoding, poses, sigma, generator, pixels)
 
     climb = Gradient(steps=9, lr=1e-3)
     one = belief(4)
@@ -255,8 +255,8 @@ def test_an_auxiliary_draw_by_hand() -> None:
     children are of the first, each with a quarter of the weight that one of the second has.
     """
     particles = make_particles(torch.tensor([[[0.0, 0.0], [1.0, 0.0]]]), 0)
-    scene = Objectness(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
-    draw = AuxiliaryResampling(Systematic(), floor=0.25).bind(scene, 1, 2)
+    encoding = Objectness(torch.tensor([1.0, 0.01]).view(1, 1, 1, 2))
+    draw = AuxiliaryResampling(Systematic(), floor=0.25).bind(encoding, 1, 2)
     new = draw(particles, 10, PIXELS, Generator().manual_seed(0))
     assert int((new.ancestors == 0).sum()) == 8
     first, last = new.log_weights[0, [0, -1]].exp().tolist()

@@ -117,15 +117,15 @@ def test_the_prior_holds_what_noise_would_move() -> None:
 
 def test_an_occluder_missing_depth_and_a_far_pose_move_nothing() -> None:
     start = SPACE.move(CORNER, torch.full((6,), 0.004))[None]
-    scene = look(CORNER)
+    encoding = look(CORNER)
     far = SPACE.move(CORNER, torch.tensor([0.0, 0.0, 0.2, 0.0, 0.0, 0.0]))[None]
     for depth, pose in (
         (torch.full((1, H, W), 0.4), start),
         (torch.zeros(1, H, W), start),
-        (scene.measured_depth, far),
+        (encoding.measured_depth, far),
     ):
         given = belief(pose)
-        seen = scene._replace(measured_depth=depth)
+        seen = encoding._replace(measured_depth=depth)
         found = PointToPlaneIcp()(given, seen, method(), Generator())
         assert torch.equal(found.best, pose)
         assert found.poses is given.poses
@@ -142,11 +142,13 @@ def test_half_an_object_is_enough() -> None:
 
 
 def test_derivatives_agree_with_moves() -> None:
-    icp, scene = PointToPlaneIcp(), look(CORNER)
-    rows, along, weights = icp._pair(CORNER[None], surface(), MIDDLE, scene, 0.015)
+    icp, encoding = PointToPlaneIcp(), look(CORNER)
+    rows, along, weights = icp._pair(CORNER[None], surface(), MIDDLE, encoding, 0.015)
     step = 1e-4 * torch.randn(6, generator=Generator().manual_seed(1))
     moved = transform(SPACE.move(CORNER, step), surface())
-    seen = look_up(scene.measured_depth, scene.intrinsics, pixels_of(transform(CORNER, surface())))
+    seen = look_up(
+        encoding.measured_depth, encoding.intrinsics, pixels_of(transform(CORNER, surface()))
+    )
     change = ((moved - transform(CORNER, surface())) * seen.normals[0]).sum(-1)
     used = weights[0] > 0
     assert used.sum() > 100
@@ -175,9 +177,9 @@ def test_normals_of_a_slope_and_none_at_edges() -> None:
 
 
 def test_a_method_without_depth_is_refused() -> None:
-    for scene, one in (((), method()), (look(CORNER), SimpleNamespace())):
+    for encoding, one in (((), method()), (look(CORNER), SimpleNamespace())):
         with pytest.raises(UserError, match="no depth to align poses with"):
-            PointToPlaneIcp()(belief(CORNER[None]), scene, one, Generator())
+            PointToPlaneIcp()(belief(CORNER[None]), encoding, one, Generator())
 
 
 @pytest.mark.parametrize(

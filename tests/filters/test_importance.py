@@ -30,7 +30,7 @@ class Known:
     covariance = SCALE[:, None] * mix * SCALE
 
     def score_poses(
-        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         twist = twist_between(torch.eye(4).double(), poses.double(), CENTER)
         square = (twist @ torch.linalg.inv(self.covariance) * twist).sum(-1)
@@ -138,9 +138,9 @@ def test_kernels_are_of_their_own_mode_though_it_has_few_poses() -> None:
     half = make_pose(turn, CENTER - turn @ CENTER)
 
     class Two(Known):
-        def score_poses(self, scene: Any, poses: Tensor, *rest: Any) -> Tensor:
+        def score_poses(self, encoding: Any, poses: Tensor, *rest: Any) -> Tensor:
             ends = torch.stack([poses.double(), poses.double() @ half])
-            return super().score_poses(scene, ends, *rest).logsumexp(0)
+            return super().score_poses(encoding, ends, *rest).logsumexp(0)
 
     g = torch.Generator().manual_seed(0)
     noise = torch.randn(3, 40, 6, generator=g).double() * SCALE

@@ -32,8 +32,8 @@ class Pixels:
 class Poses:
     space = SPACE
 
-    def propose_poses(self, scene: Tensor, particles: int, generator: Generator) -> Tensor:
-        return make_pose(torch.eye(3), scene + torch.rand(2, particles, 3, generator=generator))
+    def propose_poses(self, encoding: Tensor, particles: int, generator: Generator) -> Tensor:
+        return make_pose(torch.eye(3), encoding + torch.rand(2, particles, 3, generator=generator))
 
 
 class Map:
@@ -62,9 +62,9 @@ def images() -> Batch:
 
 
 def run(
-    piece: Initialize, method: object, scene: object = None, particles: int = 4000, seed: int = 0
+    piece: Initialize, method: object, encoding: object = None, particles: int = 4000, seed: int = 0
 ) -> Tensor:
-    return piece(images(), scene, method, particles, Generator().manual_seed(seed))
+    return piece(images(), encoding, method, particles, Generator().manual_seed(seed))
 
 
 def test_uniform_pixels_fill_the_frame() -> None:
@@ -177,9 +177,13 @@ def test_what_does_not_fit_is_refused(piece: Initialize, method: object, words: 
     ids=lambda x: type(x).__name__,
 )
 def test_the_same_generator_draws_the_same(piece: Initialize) -> None:
-    scene = Map(torch.rand(2, 1, 5, 10, generator=Generator().manual_seed(0)))
-    assert torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=4))
-    assert not torch.equal(run(piece, Pixels(), scene, seed=4), run(piece, Pixels(), scene, seed=5))
+    encoding = Map(torch.rand(2, 1, 5, 10, generator=Generator().manual_seed(0)))
+    assert torch.equal(
+        run(piece, Pixels(), encoding, seed=4), run(piece, Pixels(), encoding, seed=4)
+    )
+    assert not torch.equal(
+        run(piece, Pixels(), encoding, seed=4), run(piece, Pixels(), encoding, seed=5)
+    )
 
 
 def test_centers_lie_a_tenth_to_nine_tenths_of_a_radius_behind_the_surface() -> None:

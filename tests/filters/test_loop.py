@@ -42,18 +42,20 @@ class Hill:
         return self.goal
 
     def measure(
-        self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+        self, encoding: Tensor, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         self.seen.append(particles)
-        way = scene[:, None] - particles.state
+        way = encoding[:, None] - particles.state
         pose = EYE.expand(*way.shape[:2], 4, 4).clone()
         pose[..., :2, 3] = particles.state
         latent = torch.stack([particles.latent[..., 0] + 1, particles.state[..., 0].detach()], -1)
         return ParticleOutput(-0.5 * way.square().sum(-1), self.pull * way, pose, latent)
 
 
-def start(batch: None, scene: Tensor, method: Hill, particles: int, generator: Generator) -> Tensor:
-    return 3 * torch.randn(len(scene), particles, 2, generator=generator)
+def start(
+    batch: None, encoding: Tensor, method: Hill, particles: int, generator: Generator
+) -> Tensor:
+    return 3 * torch.randn(len(encoding), particles, 2, generator=generator)
 
 
 def build(
@@ -214,10 +216,10 @@ def test_soft_weights_let_the_likelihood_learn_across_a_resampling() -> None:
             return self.pull * torch.ones_like(self.goal)
 
         def measure(
-            self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+            self, encoding: Tensor, particles: Particles, step: Step, generator: Generator
         ) -> ParticleOutput:
             output = super().measure(
-                scene if step.number == 0 else scene.detach(), particles, step, generator
+                encoding if step.number == 0 else encoding.detach(), particles, step, generator
             )
             return output._replace(displacement=output.displacement.detach())
 
@@ -239,9 +241,9 @@ def test_soft_weights_let_the_likelihood_learn_across_a_resampling() -> None:
 def test_a_dead_filter_says_so(bad: float) -> None:
     class Broken(Hill):
         def measure(
-            self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+            self, encoding: Tensor, particles: Particles, step: Step, generator: Generator
         ) -> ParticleOutput:
-            output = super().measure(scene, particles, step, generator)
+            output = super().measure(encoding, particles, step, generator)
             if step.number == 2:
                 output.log_likelihood.detach()[1] = bad
             return output
@@ -313,12 +315,12 @@ def test_auxiliary_resampling_knows_the_images_of_its_run() -> None:
             return self
 
         def measure(
-            self, scene: object, particles: Particles, step: Step, generator: Generator
+            self, encoding: object, particles: Particles, step: Step, generator: Generator
         ) -> ParticleOutput:
             flat = super().measure(torch.zeros(1, 2), particles, step, generator)
             return flat._replace(log_likelihood=torch.zeros_like(flat.log_likelihood))
 
-    def spread(batch: object, scene: object, method: Hill, count: int, g: Generator) -> Tensor:
+    def spread(batch: object, encoding: object, method: Hill, count: int, g: Generator) -> Tensor:
         return torch.rand(1, count, 2, generator=g) * torch.tensor([30.0, 20.0]) - 0.5
 
     batch = SimpleNamespace(rgb=torch.zeros(1, 3, 20, 30))

@@ -30,11 +30,11 @@ class Peak(nn.Module):
         self.asked: list[tuple[int, float, int]] = []
 
     def score_poses(
-        self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         self.asked.append((poses.shape[1], sigma, pixels))
-        shift = (origin_of(poses, CENTER) - origin_of(scene, CENTER)[:, None]).square().sum(-1)
-        turn = (rotation_of(poses) - rotation_of(scene)[:, None]).square().sum((-1, -2)) / 2
+        shift = (origin_of(poses, CENTER) - origin_of(encoding, CENTER)[:, None]).square().sum(-1)
+        turn = (rotation_of(poses) - rotation_of(encoding)[:, None]).square().sum((-1, -2)) / 2
         noise = 0.01 / pixels**0.5 * torch.randn(1, 1, generator=generator)  # common to all poses
         return self.weight * -(shift + turn * SPACE.radius**2) / (2 * 0.02**2) + noise
 
@@ -95,9 +95,9 @@ def test_a_climb_that_ends_lower_is_not_followed() -> None:
         """A gradient that leads away."""
 
         def score_poses(
-            self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+            self, encoding: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
         ) -> Tensor:
-            right = super().score_poses(scene, poses, sigma, generator, pixels)
+            right = super().score_poses(encoding, poses, sigma, generator, pixels)
             return right if pixels == 1024 else -right
 
     belief = belief_around(0.01)
@@ -133,9 +133,9 @@ class Bumpy(Peak):
     """A peak with bumps of 3 mm on it, steep enough to hold whatever climbs."""
 
     def score_poses(
-        self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
-        smooth = super().score_poses(scene, poses, sigma, generator, pixels)
+        smooth = super().score_poses(encoding, poses, sigma, generator, pixels)
         return smooth + (origin_of(poses, CENTER) * (2 * math.pi / 0.003)).sin().sum(-1)
 
 
@@ -154,7 +154,7 @@ def test_a_mean_shift_walks_over_the_bumps_that_hold_a_climb() -> None:
 def test_a_mean_shift_on_even_ground_stays() -> None:
     class Flat(Peak):
         def score_poses(
-            self, scene: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
+            self, encoding: Tensor, poses: Tensor, sigma: float, generator: Generator, pixels: int
         ) -> Tensor:
             return torch.zeros(poses.shape[:2])
 

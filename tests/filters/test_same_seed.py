@@ -32,7 +32,7 @@ class Slope:
     space = SPACE
 
     def score_poses(
-        self, scene: None, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: None, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         return 100 * poses[..., 0, 3]
 
@@ -59,8 +59,8 @@ def refined_by(refine: Any, part: str) -> Callable[[Generator], Tensor]:
 
 
 def started_by(piece: Any) -> Callable[[Generator], Tensor]:
-    batch, scene = scenes(1), Map(torch.rand(1, 1, 5, 10, generator=Generator().manual_seed(0)))
-    return lambda g: piece(batch, scene, Pixels(), 30, g)
+    batch, encoding = scenes(1), Map(torch.rand(1, 1, 5, 10, generator=Generator().manual_seed(0)))
+    return lambda g: piece(batch, encoding, Pixels(), 30, g)
 
 
 def candidates(g: Generator) -> Tensor:

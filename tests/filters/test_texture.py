@@ -36,8 +36,8 @@ def method(model: ObjectModel) -> SimpleNamespace:
     return SimpleNamespace(model=model)
 
 
-def turn(belief: BeliefBatch, scene: Seen, model: ObjectModel, **settings: float) -> BeliefBatch:
-    out = TextureTurns(**settings)(belief, scene, method(model), Generator().manual_seed(0))  # type: ignore[arg-type]
+def turn(belief: BeliefBatch, encoding: Seen, model: ObjectModel, **settings: float) -> BeliefBatch:
+    out = TextureTurns(**settings)(belief, encoding, method(model), Generator().manual_seed(0))  # type: ignore[arg-type]
     assert torch.equal(out.score, belief.score)
     return out
 
@@ -75,10 +75,12 @@ def test_a_plain_object_says_nothing() -> None:
 
 def test_exposure_white_balance_and_light_hardly_matter() -> None:
     model, pose = load("carton"), draw("carton", 2)[1]
-    scene = look("carton", pose)
-    first = float(measure_texture(pose[None, None], scene, model))
-    tinted = scene.measured_color * torch.tensor([0.9, 0.6, 0.5])[:, None, None]
-    second = float(measure_texture(pose[None, None], scene._replace(measured_color=tinted), model))
+    encoding = look("carton", pose)
+    first = float(measure_texture(pose[None, None], encoding, model))
+    tinted = encoding.measured_color * torch.tensor([0.9, 0.6, 0.5])[:, None, None]
+    second = float(
+        measure_texture(pose[None, None], encoding._replace(measured_color=tinted), model)
+    )
     other = Lights(0.3, ((-0.6, 0.2, -0.8),), (0.8,))
     third = float(measure_texture(pose[None, None], look("carton", pose, other), model))
     assert first > 20
@@ -88,13 +90,13 @@ def test_exposure_white_balance_and_light_hardly_matter() -> None:
 
 def test_what_is_hidden_is_not_compared() -> None:
     model, pose = load("carton"), draw("carton", 1)[0]
-    scene = look("carton", pose)
-    nothing = scene._replace(measured_depth=torch.full_like(scene.measured_depth, 0.1))
+    encoding = look("carton", pose)
+    nothing = encoding._replace(measured_depth=torch.full_like(encoding.measured_depth, 0.1))
     assert float(measure_texture(pose[None, None], nothing, model)) == 0
-    left = scene.measured_depth.clone()
+    left = encoding.measured_depth.clone()
     left[..., W // 2 :] = 0
-    half = float(measure_texture(pose[None, None], scene._replace(measured_depth=left), model))
-    assert 0 < half < float(measure_texture(pose[None, None], scene, model))
+    half = float(measure_texture(pose[None, None], encoding._replace(measured_depth=left), model))
+    assert 0 < half < float(measure_texture(pose[None, None], encoding, model))
 
 
 def test_particles_take_shares_of_the_turns_and_others_stay() -> None:

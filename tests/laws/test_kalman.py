@@ -44,7 +44,7 @@ class LinearGaussian:
         return None
 
     def measure(
-        self, scene: None, particles: Particles, step: Step, generator: Generator
+        self, encoding: None, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         off = (OBSERVED[step.number] - particles.state) / SEEN
         log_p = (-0.5 * off.square() - math.log(SEEN) - 0.5 * math.log(2 * math.pi)).sum(-1)
@@ -63,7 +63,12 @@ class Start:
         self.runs = runs
 
     def __call__(
-        self, batch: None, scene: None, method: LinearGaussian, particles: int, generator: Generator
+        self,
+        batch: None,
+        encoding: None,
+        method: LinearGaussian,
+        particles: int,
+        generator: Generator,
     ) -> Tensor:
         return START * torch.randn(self.runs, particles, 2, generator=generator)
 

@@ -30,7 +30,7 @@ class TwoModes:
         self.mass = mass
 
     def score_poses(
-        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         far = (origin_of(poses, CENTER) - CENTER).square().sum(-1) / SHIFT**2
         modes = torch.stack([torch.eye(3).double(), HALF])

@@ -35,7 +35,7 @@ class Bump:
         return None
 
     def measure(
-        self, scene: None, particles: Particles, step: Step, generator: Generator
+        self, encoding: None, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         var = WIDTH**2 + float(step.sigma) ** 2
         score = -0.5 * (particles.state - PLACE).square().sum(-1) / var
@@ -47,7 +47,9 @@ class Bump:
         )
 
 
-def start(batch: None, scene: None, method: Bump, particles: int, generator: Generator) -> Tensor:
+def start(
+    batch: None, encoding: None, method: Bump, particles: int, generator: Generator
+) -> Tensor:
     return PRIOR * torch.randn(RUNS, particles, 2, generator=generator)
 
 

@@ -14,7 +14,7 @@ from posefilter.losses.belief_maps import BeliefMaps
 STRIDE = 2
 
 
-class Scene(NamedTuple):
+class Encoding(NamedTuple):
     """An image of 10 x 20 pixels, with maps of 5 x 10 cells."""
 
     logits: Tensor
@@ -33,7 +33,7 @@ def test_it_is_the_divergence_of_each_cell(batch, model, make_trace, keypoints: 
     )
     target = draw_gaussians(pixels[:, 0], ahead[:, 0], 5, 10, STRIDE, 1.5)
     logits = torch.randn(1, 2, 5, 10, dtype=torch.float64)
-    trace = make_trace(torch.zeros(1, 1, 2))._replace(scene=Scene(logits, keypoints))
+    trace = make_trace(torch.zeros(1, 1, 2))._replace(encoding=Encoding(logits, keypoints))
     cells = kl_divergence(Bernoulli(probs=target), Bernoulli(logits=logits))
     found = BeliefMaps(1.5)(trace, batch, model)
     torch.testing.assert_close(found, cells.sum((2, 3)).mean(1))
@@ -47,6 +47,6 @@ def test_without_an_opinion_an_empty_map_costs_a_bit_a_cell(
     behind = batch.camera_from_object.clone()
     behind[:, 2, 3] = -1
     logits = torch.zeros(1, 2, 5, 10, dtype=torch.float64)
-    trace = make_trace(torch.zeros(1, 1, 2))._replace(scene=Scene(logits, keypoints))
+    trace = make_trace(torch.zeros(1, 1, 2))._replace(encoding=Encoding(logits, keypoints))
     lost = BeliefMaps()(trace, batch._replace(camera_from_object=behind), model)
     assert lost.tolist() == pytest.approx([50 * math.log(2)])

@@ -133,7 +133,7 @@ class Taste:
         return None
 
     def measure(
-        self, scene: None, particles: Particles, step: Step, generator: Generator
+        self, encoding: None, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         state = particles.state
         like = (state / 20) @ self.taste

@@ -15,7 +15,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.losses.grid_posterior import GridPosterior, squared_distances
 
 
-class Scene(NamedTuple):
+class Encoding(NamedTuple):
     """Scores of crops and rotations."""
 
     scores: Tensor
@@ -31,7 +31,7 @@ CELLS = spread_rotations(40).double()
 
 
 def loss_of(scores: Tensor, batch, model, make_trace, sigma: float = 0.3) -> float:
-    trace = make_trace(torch.zeros(1, 1, 2))._replace(scene=Scene(scores, CENTERS, CELLS))
+    trace = make_trace(torch.zeros(1, 1, 2))._replace(encoding=Encoding(scores, CENTERS, CELLS))
     return float(GridPosterior(sigma)(trace, batch, model))
 
 

@@ -115,7 +115,7 @@ def test_neither_mask_nor_truth_is_used_and_a_seed_repeats(kind: str) -> None:
 def test_the_estimate_is_the_hypothesis_of_highest_score(kind: str) -> None:
     method = make(kind)
     trace, _ = run(method, 4)
-    score = method.score(trace.scene, trace.belief.poses)
+    score = method.score(trace.encoding, trace.belief.poses)
     torch.testing.assert_close(trace.belief.score, score.clamp_min(1e-6).log().amax(1))
     share = score.clamp_min(1e-6)
     torch.testing.assert_close(trace.belief.log_weights.exp(), share / share.sum(1, keepdim=True))
@@ -149,7 +149,7 @@ def test_planted_maps_give_back_the_pose(hidden: int, ghosts: float) -> None:
     method.net = Planted(pixels, hidden, ghosts)  # type: ignore[assignment]
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     assert add(trace.belief.best, truth, method.model.points).median() < 0.02
-    right = method.score(trace.scene, truth[:, None])
+    right = method.score(trace.encoding, truth[:, None])
     assert (trace.belief.score.exp() > right[:, 0] - 0.05).all()
 
 
@@ -160,8 +160,8 @@ def test_maps_that_are_right_cost_nothing_and_a_flipped_one_much() -> None:
     pixels = project_keypoints(truth, keypoints, batch.intrinsics)[0][:, 0]
     losses = []
     for logits in (Planted(pixels).logits, Planted(pixels.flip(1)).logits):
-        scene = method.encode(batch)._replace(logits=logits)
-        empty = Trace((), (), (), None, scene=scene)  # type: ignore[arg-type]
+        encoding = method.encode(batch)._replace(logits=logits)
+        empty = Trace((), (), (), None, encoding=encoding)  # type: ignore[arg-type]
         losses.append(method.loss(empty, batch, method.model))
     assert losses[0].max() < 0.1
     assert losses[1].min() > 3

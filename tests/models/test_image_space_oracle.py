@@ -37,7 +37,7 @@ class Told:
         return None
 
     def measure(
-        self, scene: None, particles: Particles, step: Step, generator: Generator
+        self, encoding: None, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         way = nearest_mask_pixel(self.mask, particles.state) - particles.state
         if self.answer == "mean":

@@ -119,9 +119,9 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
     start = perturb(truth[:, None], torch.full((32, 1), 0.05), trained.space, g)
     belief = BeliefBatch(start, torch.zeros(32, 1), start[:, 0], torch.zeros(32))
     with torch.no_grad():
-        scene = trained.encode(batch)
+        encoding = trained.encode(batch)
         climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])
-        refined = Compose([Rescore(1, 256, SIGMA[0]), climb])(belief, scene, trained, g)
+        refined = Compose([Rescore(1, 256, SIGMA[0]), climb])(belief, encoding, trained, g)
     before, after = (
         add(x, truth, trained.model.points).median() for x in (belief.best, refined.best)
     )
@@ -132,12 +132,12 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
 def test_the_trained_likelihood_prefers_the_truth(trained: PosePF) -> None:
     trained.eval()
     batch = scenes(16, seed=20_000)
-    scene = trained.encode(batch)
+    encoding = trained.encode(batch)
     g = torch.Generator().manual_seed(0)
     truth = batch.camera_from_object[:, None]
-    others = FromDepth()(batch, scene, trained, 60, g)
+    others = FromDepth()(batch, encoding, trained, 60, g)
     with torch.no_grad():
-        scores = trained.score_poses(scene, torch.cat([truth, others], 1), 0.02, g, 128)
+        scores = trained.score_poses(encoding, torch.cat([truth, others], 1), 0.02, g, 128)
     assert (scores[:, :1] > scores[:, 1:]).float().mean() > 0.97
 
 

@@ -101,14 +101,18 @@ def test_rotations_are_drawn_from_the_marginal_and_weigh_the_particle(
     trained: RotationGrid,
 ) -> None:
     batch = scenes(1, seed=3)
-    scene = trained.encode(batch)
+    encoding = trained.encode(batch)
     # many particles at one place
     place = batch.camera_from_object[:, :3, 3][:, None].expand(1, 4000, 3)
     turned = look_at(place) @ trained.grid[:1]
     state = pose_about(turned, place, torch.zeros(3))
     step = Step(0, 1, torch.tensor(0.01))
-    out = trained.measure(scene, make_particles(state, 0), step, torch.Generator().manual_seed(0))
-    scores = trained.net.scale * trained.encode_crops(scene, place[:, :1])[0, 0] @ trained.codes.T
+    out = trained.measure(
+        encoding, make_particles(state, 0), step, torch.Generator().manual_seed(0)
+    )
+    scores = (
+        trained.net.scale * trained.encode_crops(encoding, place[:, :1])[0, 0] @ trained.codes.T
+    )
     mean = scores.exp().mean().log()
     torch.testing.assert_close(out.log_likelihood, mean.expand(1, 4000), atol=1e-3, rtol=0)
     torch.testing.assert_close(out.pose[..., :3, 3], place)
@@ -121,10 +125,10 @@ def test_rotations_are_drawn_from_the_marginal_and_weigh_the_particle(
 @torch.no_grad()
 def test_the_score_of_a_cells_own_pose_is_mostly_its_cosine(trained: RotationGrid) -> None:
     batch = scenes(1, seed=4)
-    scene, place = trained.encode(batch), batch.camera_from_object[:, :3, 3][:, None]
+    encoding, place = trained.encode(batch), batch.camera_from_object[:, :3, 3][:, None]
     poses = pose_about(look_at(place) @ trained.grid[::50], place, torch.zeros(3))
-    found = trained.score_poses(scene, poses, 0.0, torch.Generator(), 0)
-    exact = trained.net.scale * trained.encode_crops(scene, place)[0] @ trained.codes[::50].T
+    found = trained.score_poses(encoding, poses, 0.0, torch.Generator(), 0)
+    exact = trained.net.scale * trained.encode_crops(encoding, place)[0] @ trained.codes[::50].T
     both = torch.stack([found[0], exact[0]])
     assert torch.corrcoef(both)[0, 1] > 0.95
     index, share = trained.find_cells(trained.grid[7])

@@ -74,21 +74,23 @@ def test_a_score_does_not_change_with_the_frame() -> None:
     """
     rgb, depth = image()
     net = PoseLikelihood(width=32, blocks=1)
-    scene = flatten_images(rgb, depth, K)
+    encoding = flatten_images(rgb, depth, K)
     g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
     others = make_pose(random_rotation(1, 5), torch.tensor([0.0, 0.0, 0.9]))
-    alone = net(scene, pose(), torch.tensor(0.02), CENTER, RADIUS, 64, g())
-    among = net(scene, torch.cat([pose(), others], 1), torch.tensor(0.02), CENTER, RADIUS, 64, g())
+    alone = net(encoding, pose(), torch.tensor(0.02), CENTER, RADIUS, 64, g())
+    among = net(
+        encoding, torch.cat([pose(), others], 1), torch.tensor(0.02), CENTER, RADIUS, 64, g()
+    )
     torch.testing.assert_close(alone[:, 0], among[:, 0])
     assert (among[0, 1:] - among[0, 0]).abs().min() > 1e-5
 
 
 def test_the_noise_level_changes_the_score() -> None:
-    scene = flatten_images(*image(), K)
+    encoding = flatten_images(*image(), K)
     net = PoseLikelihood(width=32, blocks=1)
     g = lambda: torch.Generator().manual_seed(3)  # noqa: E731
-    broad = net(scene, pose(), torch.tensor(0.2), CENTER, RADIUS, 64, g())
-    sharp = net(scene, pose(), torch.tensor(0.005), CENTER, RADIUS, 64, g())
+    broad = net(encoding, pose(), torch.tensor(0.2), CENTER, RADIUS, 64, g())
+    sharp = net(encoding, pose(), torch.tensor(0.005), CENTER, RADIUS, 64, g())
     assert (broad - sharp).abs().item() > 1e-4
     assert net.level(torch.tensor([0.003, 0.25]))[:, 0].tolist() == pytest.approx(
         [-1.0, 1.0], abs=1e-5
@@ -96,8 +98,8 @@ def test_the_noise_level_changes_the_score() -> None:
 
 
 def test_without_its_ray_a_point_is_judged_by_where_it_lies_alone() -> None:
-    scene = flatten_images(*image(), K)
-    points = sample_points(scene, pose(), CENTER, RADIUS, torch.randn(1, 1, 50, 2))
+    encoding = flatten_images(*image(), K)
+    points = sample_points(encoding, pose(), CENTER, RADIUS, torch.randn(1, 1, 50, 2))
     turned = points._replace(ray=-points.ray)
     for ray in (True, False):
         net = PoseLikelihood(width=32, blocks=1, ray=ray)
@@ -106,12 +108,12 @@ def test_without_its_ray_a_point_is_judged_by_where_it_lies_alone() -> None:
 
 
 def test_gradients_reach_the_pose() -> None:
-    scene = flatten_images(*image(), K)
+    encoding = flatten_images(*image(), K)
     shift = torch.zeros(3, requires_grad=True)
     moved = make_pose(pose()[..., :3, :3], pose()[..., :3, 3] + shift)
     net = PoseLikelihood(width=32, blocks=1)
     net(
-        scene, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
+        encoding, moved, torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
     ).sum().backward()
     assert shift.grad is not None
     assert shift.grad.abs().max() > 0
@@ -161,9 +163,9 @@ def test_context_is_read_where_the_point_is() -> None:
 def test_gradients_reach_the_features_but_not_the_predicted_coordinates() -> None:
     told = Coordinates(*(x.requires_grad_() for x in predicted()))
     net = PoseLikelihood(width=32, blocks=1, context=2)
-    scene = flatten_images(*image(), K, told)
+    encoding = flatten_images(*image(), K, told)
     net(
-        scene, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
+        encoding, pose(), torch.tensor(0.01), CENTER, RADIUS, 64, torch.Generator().manual_seed(0)
     ).sum().backward()
     assert told.features.grad is not None
     assert told.features.grad.abs().max() > 0

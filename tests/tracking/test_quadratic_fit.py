@@ -1,7 +1,7 @@
 """The quadratic fit: exact on what is quadratic, and steady where scores are noisy or flat."""
 
 import torch
-from tests.tracking.toy import SPACE, ToyScene, make_toy, walk_pose
+from tests.tracking.toy import SPACE, ToyEncoding, make_toy, walk_pose
 
 from posefilter.filters.refine import MeanShift
 from posefilter.protocols import Refine
@@ -47,8 +47,8 @@ def spread_of(refine: Refine, seeds: int = 12) -> float:
             truth[None], 0.004 * SPACE.noise_scale(torch.ones(1)) * torch.randn(6, generator=g)
         )
         belief = BeliefBatch(start[:, None], torch.zeros(1, 1), start, torch.zeros(1))
-        scene = ToyScene(truth, torch.zeros(1))
-        errors.append(SPACE.distance(refine(belief, scene, toy, g).best, truth[None]))
+        encoding = ToyEncoding(truth, torch.zeros(1))
+        errors.append(SPACE.distance(refine(belief, encoding, toy, g).best, truth[None]))
     return float(torch.stack(errors).square().mean().sqrt())
 
 

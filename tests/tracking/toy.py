@@ -32,7 +32,7 @@ RGB[:, :80, 0] = 90  # that it is not blank
 DEPTH = np.tile(np.linspace(0.69, 0.71, 160, dtype=np.float32), (120, 1))
 
 
-class ToyScene(NamedTuple):
+class ToyEncoding(NamedTuple):
     """The true pose, and a map of the cells about where it puts the object."""
 
     truth: Tensor | None
@@ -76,37 +76,39 @@ class Toy(PoseEstimator):
         cells = pixel_grid(height, width, 4).reshape(-1, 2)
         shown = self.ghost if self.truth is None else self.truth
         if shown is None:
-            return ToyScene(None, torch.zeros(1, 1, height // 4, width // 4))
+            return ToyEncoding(None, torch.zeros(1, 1, height // 4, width // 4))
         middle = origin_of(shown.float(), torch.tensor(CENTER))
         reach = SPACE.radius * batch.intrinsics[0, 0, 0] / middle[2]
         near = (cells - project(middle[None], batch.intrinsics[0])).norm(dim=1) < reach
-        return ToyScene(self.truth, near.float().view(1, 1, height // 4, width // 4))
+        return ToyEncoding(self.truth, near.float().view(1, 1, height // 4, width // 4))
 
-    def measure(self, scene: Any, particles: Any, step: Any, generator: Generator) -> Any:
+    def measure(self, encoding: Any, particles: Any, step: Any, generator: Generator) -> Any:
         from posefilter.tracking.scoring import FrameScorer
 
-        return FrameScorer(self, scene, 64).measure(scene, particles, step, generator)
+        return FrameScorer(self, encoding, 64).measure(encoding, particles, step, generator)
 
     def score_poses(
-        self, scene: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Any, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         self.scored.append(poses.shape[1] * pixels)
         noise = 0.2 * torch.randn(poses.shape[:2], generator=generator)
-        if scene.truth is None:
+        if encoding.truth is None:
             return noise - 10
-        distance = SPACE.distance(poses, scene.truth.to(poses)[None, None])
+        distance = SPACE.distance(poses, encoding.truth.to(poses)[None, None])
         return noise - 10 * torch.log1p((distance / (sigma + 0.002)).square() / 5)
 
-    def propose_poses(self, scene: Any, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: Any, particles: int, generator: Generator) -> Tensor:
         """Half of them near the object, if there is one; the others anywhere."""
         place = torch.rand(particles, 3, generator=generator) - 0.5 + torch.tensor([0, 0, 1.0])
         R = random_rotation(particles, generator=generator)
         poses = pose_about(R, place, torch.tensor(CENTER))
-        if scene.truth is not None:
+        if encoding.truth is not None:
             near = torch.randn(particles // 2, 6, generator=generator) * SPACE.noise_scale(
                 torch.tensor(0.03)
             )
-            poses[: particles // 2] = SPACE.move(scene.truth.float().expand(len(near), 4, 4), near)
+            poses[: particles // 2] = SPACE.move(
+                encoding.truth.float().expand(len(near), 4, 4), near
+            )
         return poses[None]
 
 

@@ -36,10 +36,10 @@ class ColorWalk(PoseEstimator):
         return torch.cat([batch.rgb, batch.depth], dim=1)
 
     def measure(
-        self, scene: Tensor, particles: Particles, step: Step, generator: Generator
+        self, encoding: Tensor, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Look at each particle's pixel."""
-        out = self.net(sample(scene, particles.state))
+        out = self.net(sample(encoding, particles.state))
         pose = torch.eye(4, device=out.device).expand(*out.shape[:2], 4, 4)
         displacement = self.reach_px * torch.tanh(out[..., 1:])
         return ParticleOutput(F.logsigmoid(out[..., 0]), displacement, pose, particles.latent)

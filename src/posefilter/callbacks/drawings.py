@@ -46,7 +46,7 @@ class Occasion(NamedTuple):
     one: KeptImage  # the example that most figures are about
     trace: Trace  # its run, on the CPU
     batch: Batch  # the same image as the method reads it
-    scene: Any  # what the method keeps of it
+    encoding: Any  # what the method keeps of it
     when: str
 
     def title(self, what: str) -> str:
@@ -119,7 +119,7 @@ def field(o: Occasion) -> Drawn:
     assert isinstance(o.method, ScoresPoses)
     model = o.method.model
     found = evaluate_pose_field(
-        o.method, o.scene, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps)
+        o.method, o.encoding, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps)
     )
     center = model.center.cpu().double().numpy()
     shift = (
@@ -141,7 +141,7 @@ def points(o: Occasion) -> Drawn:
     slices = [
         evaluate_point_field(
             o.method.likelihood,
-            o.scene.image,
+            o.encoding.image,
             truth,
             model,
             pixel,
@@ -165,7 +165,7 @@ def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
     if not isinstance(o.method, ProposesPoses):
         return None
-    predicted = predict_proposals(o.method, o.scene, o.batch, o.method.model)
+    predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.model)
     if predicted is None:
         return None
     title = o.title("Proposals")
@@ -177,13 +177,13 @@ def proposals(o: Occasion) -> Drawn:
 @needs("pixel_space")
 def objectness(o: Occasion) -> Drawn:
     """Draw the map of objectness beside where particles started and ended."""
-    if not isinstance(o.scene, HasObjectness):
+    if not isinstance(o.encoding, HasObjectness):
         return None
     history = [
         (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
         for c in (o.trace.particles[0], o.trace.particles[-1])
     ]
-    seen = o.scene.objectness[0, 0].detach().float().cpu().numpy()
+    seen = o.encoding.objectness[0, 0].detach().float().cpu().numpy()
     return draw_objectness(seen, o.one.rgb, o.mask(), history[0], history[1], o.title("Objectness"))
 
 
@@ -200,7 +200,7 @@ def glimpses(o: Occasion) -> Drawn:
     """Draw what a few particles saw at each step (the paper, figure 2)."""
     assert isinstance(o.method, HasImagePatches)
     states = follow_particles(o.trace)
-    patches = extract_glimpses(o.method, o.scene, states)
+    patches = extract_glimpses(o.method, o.encoding, states)
     return draw_glimpses(o.one.rgb, o.mask(), states.numpy(), patches, o.title("Glimpses"))
 
 

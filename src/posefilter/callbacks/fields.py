@@ -30,7 +30,7 @@ from posefilter.geometry.rotation import exp_so3
 from posefilter.nets.coordinates import HasCoordinates, query, true_coordinates
 from posefilter.nets.layers import fast_bfloat16
 from posefilter.nets.likelihood import Pixels, Points, sample_points
-from posefilter.protocols import ProposesPoses, Scene, ScoresPoses
+from posefilter.protocols import Encoding, ProposesPoses, ScoresPoses
 from posefilter.types import Batch, ObjectModel, Step
 
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
@@ -46,7 +46,7 @@ class ScoresPoints(Protocol):
 
 @runtime_checkable
 class HasPointLikelihood(Protocol):
-    """A method whose likelihood judges the points of images that it keeps as `scene.image`."""
+    """A method whose likelihood judges the points of images that it keeps as `encoding.image`."""
 
     likelihood: ScoresPoints
 
@@ -62,7 +62,7 @@ def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
 
 def evaluate_pose_field(
     method: ScoresPoses,
-    scene: Scene,
+    encoding: Encoding,
     truth: Tensor,
     model: ObjectModel,
     sigmas: Sequence[float],
@@ -91,7 +91,7 @@ def evaluate_pose_field(
         # as the filter reads
         with torch.autocast(truth.device.type, torch.bfloat16, enabled=fast_bfloat16(truth.device)):
             score = (
-                method.score_poses(scene, poses[None], sigma, generator, pixels)[0].float().cpu()
+                method.score_poses(encoding, poses[None], sigma, generator, pixels)[0].float().cpu()
             )
         less = (score - score[0])[1:].numpy()
         planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
@@ -208,26 +208,29 @@ def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int
 
 def predict_proposals(
     method: ProposesPoses,
-    scene: HasCoordinates,
+    encoding: HasCoordinates,
     batch: Batch,
     model: ObjectModel,
     drawn: int = 24,
 ) -> Proposals | None:
     """Return what the proposal network makes of one image; None where no depth is known."""
-    if not bool(scene.cells.valid.any()):
+    if not bool(encoding.cells.valid.any()):
         return None
     center = model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
-    poses = method.propose_poses(scene, drawn, generator)[0].cpu().double()
+    poses = method.propose_poses(encoding, drawn, generator)[0].cpu().double()
     axes = project_axes(
         poses, model.center.cpu().double(), 0.5 * model.radius, batch.intrinsics[0].cpu().double()
     )
     truth, _, usable = true_coordinates(
-        scene.cells, batch.mask, batch.camera_from_object, center, model.radius
+        encoding.cells, batch.mask, batch.camera_from_object, center, model.radius
     )
     true, on = truth[0], usable[0]
-    off = (scene.coordinates.coordinate[0] - true).norm(dim=-1)[on]
+    off = (encoding.coordinates.coordinate[0] - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan
-    chance, coordinate = torch.sigmoid(scene.coordinates.logit[0]), scene.coordinates.coordinate[0]
+    chance, coordinate = (
+        torch.sigmoid(encoding.coordinates.logit[0]),
+        encoding.coordinates.coordinate[0],
+    )
     arrays = [x.detach().cpu().numpy() for x in (chance, coordinate, true, on)]
     return Proposals(arrays[0], arrays[1], arrays[2], arrays[3], axes, error)

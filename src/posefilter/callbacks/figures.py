@@ -128,9 +128,11 @@ class Figures(TraceCallback):
         one, trace, batch = self._example
         with self.budget.spend(), evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
-            shape, scene = find_shape(trainer, method), method.encode(batch)
+            shape, encoding = find_shape(trainer, method), method.encode(batch)
             when = f"step {trainer.global_step}"
-            occasion = Occasion(method, shape, self._selection.kept, one, trace, batch, scene, when)
+            occasion = Occasion(
+                method, shape, self._selection.kept, one, trace, batch, encoding, when
+            )
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)
                 if drawn is not None:

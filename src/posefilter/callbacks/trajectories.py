@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from posefilter.figures.particles import choose_by_weight, normalize_weights
-from posefilter.protocols import HasImagePatches, Scene
+from posefilter.protocols import Encoding, HasImagePatches
 from posefilter.types import Particles, Trace
 
 
@@ -33,11 +33,11 @@ def follow_particles(trace: Trace, most: int = 8) -> Tensor:
     return trace_lineage(trace.particles)[0][:, chosen]
 
 
-def extract_glimpses(method: HasImagePatches, scene: Scene, states: Tensor) -> np.ndarray:
+def extract_glimpses(method: HasImagePatches, encoding: Encoding, states: Tensor) -> np.ndarray:
     """Return what particles see where they stand in one image, its colors.
 
     (T, n, 2) [px] -> (T, n, k, k, 3) uint8.
     """
-    seen = method.image_patches(scene, states.flatten(0, 1)[None])[0, :, :3]
+    seen = method.image_patches(encoding, states.flatten(0, 1)[None])[0, :, :3]
     colors = ((seen + 1) / 2).clamp(0, 1).mul(255).round().byte().cpu()
     return colors.unflatten(0, states.shape[:2]).permute(0, 1, 3, 4, 2).numpy()

@@ -50,22 +50,22 @@ class Searcher(Protocol):
 class Encoded:
     """A method whose images are encoded already."""
 
-    def __init__(self, method: Any, scene: Any) -> None:
-        self._method, self._scene = method, scene
+    def __init__(self, method: Any, encoding: Any) -> None:
+        self._method, self._encoding = method, encoding
 
     def encode(self, batch: Batch) -> Any:
-        """Return the scene."""
-        return self._scene
+        """Return the encoding."""
+        return self._encoding
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._method, name)
 
 
-def measure_worth(scene: Any) -> float:
+def measure_worth(encoding: Any) -> float:
     """Return the mean probability of the surest cells of one image; 1 where it has none."""
-    if not isinstance(scene, HasObjectness):
+    if not isinstance(encoding, HasObjectness):
         return 1.0
-    objectness = scene.objectness.flatten()
+    objectness = encoding.objectness.flatten()
     return float(objectness.topk(min(_CELLS, len(objectness))).values.mean())
 
 
@@ -80,7 +80,7 @@ def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generato
         generator: Draws the other searches.
 
     Returns:
-        The trace; of an image whose answer was replaced, of the search that found it. The scene
+        The trace; of an image whose answer was replaced, of the search that found it. The encoding
         stays that of the whole images.
     """
     calibration, searches = method.calibration, method.filter.max_searches
@@ -112,17 +112,17 @@ def _search(
     odds = rank / max(1 - rank, 1e-9) * math.exp(MARGIN)
     least = odds / (1 + odds)  # rank that another answer must exceed
     # of a single image, its first search has encoded it
-    known = first.scene is not None and len(first.belief.best) == 1
-    whole = first.scene if known else method.encode(image)
+    known = first.encoding is not None and len(first.belief.best) == 1
+    whole = first.encoding if known else method.encode(image)
     for part in (blank(image, hidden), image)[: method.filter.max_searches - 1]:
         if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
             continue
-        scene = whole if part is image else method.encode(part)
-        if measure_worth(scene) < _WORTH:
+        encoding = whole if part is image else method.encode(part)
+        if measure_worth(encoding) < _WORTH:
             continue
-        found = method.filter(part, Encoded(method, scene), generator)
+        found = method.filter(part, Encoded(method, encoding), generator)
         # what was hidden is there: judged by the whole image, as the first answer
-        found = found._replace(scene=whole)
+        found = found._replace(encoding=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])
         if value > least:
             least, best = value, found

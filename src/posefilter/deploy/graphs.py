@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from posefilter.deploy.resizing import Resize
 from posefilter.filters.agreement import Agreement
-from posefilter.models.image_space import ImageScene, ImageSpace, ObjectnessScene
+from posefilter.models.image_space import ImageEncoding, ImageSpace, ObjectnessEncoding
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.context import ContextMap
 from posefilter.nets.coordinates import Context, Coordinates
@@ -21,10 +21,10 @@ from posefilter.nets.pose_votes import measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Particles, Step
 
-SCENE = ("values", "smooth", "share", "position", "network_intrinsics")
+ENCODING = ("values", "smooth", "share", "position", "network_intrinsics")
 
 
-class EncodePoseScene(nn.Module):
+class EncodeForPoses(nn.Module):
     """A camera's image -> what a filter over poses reads.
 
     Args:
@@ -33,7 +33,7 @@ class EncodePoseScene(nn.Module):
     """
 
     inputs = ("rgb", "depth", "intrinsics")
-    outputs = (*SCENE, "point", "weight")
+    outputs = (*ENCODING, "point", "weight")
 
     def __init__(self, method: PosePF, resize: Resize) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class ScorePoses(nn.Module):
         size: Height and width of the network's image [px].
     """
 
-    inputs = ("poses", "sigma", "noise", *SCENE)
+    inputs = ("poses", "sigma", "noise", *ENCODING)
     outputs = ("log_likelihood",)
 
     def __init__(self, method: PosePF, size: tuple[int, int]) -> None:
@@ -107,7 +107,7 @@ class ScorePoses(nn.Module):
             poses: (N, 4, 4) camera_from_object [m].
             sigma: () noise level [m].
             noise: (P, 2) standard normal: which image points the poses are scored from.
-            values: As `EncodePoseScene` returns it, and all that follow.
+            values: As `EncodeForPoses` returns it, and all that follow.
             smooth: The same.
             share: The same.
             position: The same.
@@ -131,7 +131,7 @@ class ScorePoses(nn.Module):
         return (score + judge.judge_surface(image, hypotheses, sigma, center, self.radius))[0]
 
 
-class EncodePixelScene(nn.Module):
+class EncodeForPixels(nn.Module):
     """A camera's image -> what a filter over pixels reads.
 
     Args:
@@ -166,12 +166,12 @@ class EncodePixelScene(nn.Module):
             `objectness` (h', w'), the probability that each cell shows the object, where particles
             are drawn by it.
         """
-        scene = self.method.encode(_batch(*self.resize(rgb, depth, intrinsics)))
-        kept = [scene.image[0], scene.depth[0], scene.intrinsics[0]]
-        kept += [level[0] for level in scene.context.levels]
+        encoding = self.method.encode(_batch(*self.resize(rgb, depth, intrinsics)))
+        kept = [encoding.image[0], encoding.depth[0], encoding.intrinsics[0]]
+        kept += [level[0] for level in encoding.context.levels]
         if self.objectness:
-            assert isinstance(scene, ObjectnessScene)
-            kept.append(scene.objectness[0, 0])
+            assert isinstance(encoding, ObjectnessEncoding)
+            kept.append(encoding.objectness[0, 0])
         return tuple(kept)
 
 
@@ -202,7 +202,7 @@ class MeasurePixels(nn.Module):
         Args:
             state: (N, 2) particles [px] of the network's image.
             latent: (N, L) what `next_latent` was for their ancestors; zeros at first.
-            image: As `EncodePixelScene` returns it, and all that follow.
+            image: As `EncodeForPixels` returns it, and all that follow.
             surface: The same.
             network_intrinsics: The same.
             levels: The same.
@@ -214,14 +214,14 @@ class MeasurePixels(nn.Module):
             be: probabilities `share` (N, k), `position` (N, k, 3) from the center, in radii.
         """
         context = ContextMap(tuple(level[None] for level in levels), self.strides, None)
-        scene = ImageScene(image[None], surface[None], network_intrinsics[None], context)
+        encoding = ImageEncoding(image[None], surface[None], network_intrinsics[None], context)
         weights = state.new_zeros(1, state.shape[0])  # `len` would fix the number
         particles = Particles(state[None], latent[None], weights, weights.long())
         step = Step(0, 1, state.new_zeros(()))
-        out = self.method.measure(scene, particles, step, torch.Generator())
+        out = self.method.measure(encoding, particles, step, torch.Generator())
         found = [out.log_likelihood, out.displacement, out.latent, out.pose]
         if self.agreement is not None:
-            point, known = self.method.surface_points(scene, state[None])
+            point, known = self.method.surface_points(encoding, state[None])
             model = self.method.model
             share, position = self.agreement.list_object_points(
                 out, point, model.center.to(state), model.radius

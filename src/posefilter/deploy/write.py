@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from posefilter.data.resize import network_size
-from posefilter.deploy.graphs import EncodePixelScene, EncodePoseScene, MeasurePixels, ScorePoses
+from posefilter.deploy.graphs import EncodeForPixels, EncodeForPoses, MeasurePixels, ScorePoses
 from posefilter.deploy.resizing import Resize
 from posefilter.deploy.settings import describe_filter
 from posefilter.errors import UserError
@@ -104,19 +104,19 @@ def make_graphs(method: PoseEstimator, width: int, height: int) -> Graphs:
     method = method.cpu().eval()
     with torch.no_grad():
         if isinstance(method, PosePF):
-            encode = EncodePoseScene(method, resize).eval()
-            scene = encode(*image)[:5]
+            encode = EncodeForPoses(method, resize).eval()
+            encoding = encode(*image)[:5]
             poses = torch.eye(4).repeat(3, 1, 1)
             poses[:, 2, 3] = 1.0
             points = torch.export.Dim("points", min=1)
-            inputs: tuple[Any, ...] = (poses, torch.tensor(0.01), torch.zeros(5, 2), *scene)
+            inputs: tuple[Any, ...] = (poses, torch.tensor(0.01), torch.zeros(5, 2), *encoding)
             dynamic: tuple[Any, ...] = ({0: count}, None, {0: points}, *[None] * 5)
             measure: nn.Module = ScorePoses(method, resize.after)
             measured = Graph(measure.eval(), inputs, dynamic)
             return Graphs(Graph(encode, image, None), measured, resize.after)
         assert isinstance(method, ImageSpace)
         strides, drawn = _find_strides(method, resize, image)
-        encode_pixels = EncodePixelScene(method, resize, len(strides), drawn).eval()
+        encode_pixels = EncodeForPixels(method, resize, len(strides), drawn).eval()
         found = encode_pixels(*image)
         levels = found[3 : 3 + len(strides)]
         state, latent = torch.zeros(3, 2), torch.zeros(3, method.latent_width)

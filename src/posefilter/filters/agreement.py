@@ -9,7 +9,7 @@ from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.geometry.pose import fit_rigid, invert, transform
 from posefilter.geometry.votes import draw_votes
-from posefilter.protocols import HasSurfacePoints, Method, Scene
+from posefilter.protocols import Encoding, HasSurfacePoints, Method
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 
@@ -79,7 +79,7 @@ class Agreement:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:
@@ -89,7 +89,7 @@ class Agreement:
         """
         provider = require_surface_points(method)
         center, radius = provider.model.center.to(particles.state), provider.model.radius
-        point, known = provider.surface_points(scene, particles.state)
+        point, known = provider.surface_points(encoding, particles.state)
         share, position = self.list_object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known
         votes = draw_votes(

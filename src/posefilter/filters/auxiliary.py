@@ -7,7 +7,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.protocols import HasObjectness, Resample, Scene, Space
+from posefilter.protocols import Encoding, HasObjectness, Resample, Space
 from posefilter.types import Batch, Particles, Resampled
 
 
@@ -30,10 +30,10 @@ def gather_objectness(objectness: Tensor, state: Tensor, height: int, width: int
     return objectness.flatten(1).gather(1, row * w + column)
 
 
-def bind_to_scene(resample: Resample, scene: Scene, batch: Batch) -> Resample:
+def bind_to_encoding(resample: Resample, encoding: Encoding, batch: Batch) -> Resample:
     """Return the resampler bound to these images if it is auxiliary, else as it is."""
     if isinstance(resample, AuxiliaryResampling):
-        return resample.bind(scene, *batch.rgb.shape[-2:])
+        return resample.bind(encoding, *batch.rgb.shape[-2:])
     return resample
 
 
@@ -62,23 +62,23 @@ class AuxiliaryResampling:
         self.resampler = resampler
         self.floor = floor
 
-    def bind(self, scene: Scene, height: int, width: int) -> Resample:
-        """Return the resampler for one scene.
+    def bind(self, encoding: Encoding, height: int, width: int) -> Resample:
+        """Return the resampler for one encoding.
 
         Args:
-            scene: The encoded images, with an objectness map.
+            encoding: The encoded images, with an objectness map.
             height: The images' height [px].
             width: The images' width [px].
 
         Raises:
-            UserError: The scene has no objectness map.
+            UserError: The encoding has no objectness map.
         """
-        if not isinstance(scene, HasObjectness):
+        if not isinstance(encoding, HasObjectness):
             raise UserError(
                 "filter/resample=auxiliary: the method makes no map of objectness; choose an "
                 "encoder that does, such as unet"
             )
-        objectness = scene.objectness.detach()
+        objectness = encoding.objectness.detach()
 
         def resample(
             particles: Particles, count: int, space: Space, generator: Generator
@@ -114,4 +114,4 @@ class AuxiliaryResampling:
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
         """Raise UserError: the objectness is known only after `bind`."""
-        raise UserError("filter/resample=auxiliary must be bound to a scene before it draws")
+        raise UserError("filter/resample=auxiliary must be bound to an encoding before it draws")

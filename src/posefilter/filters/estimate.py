@@ -9,7 +9,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Method, Scene, Space
+from posefilter.protocols import Encoding, Method, Space
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 _KERNEL_MASS = (
@@ -39,7 +39,7 @@ class Argmax:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:
@@ -64,7 +64,7 @@ class Mean:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:
@@ -123,7 +123,7 @@ class DensestMode:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:
@@ -154,7 +154,7 @@ class DensestPose:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:

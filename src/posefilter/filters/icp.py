@@ -11,7 +11,7 @@ from posefilter.geometry.camera import back_project, project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import HasDepth, Method, Scene
+from posefilter.protocols import Encoding, HasDepth, Method
 from posefilter.types import BeliefBatch, ObjectModel
 
 _FEW = 10.0  # surface points, by their weights: fewer say nothing
@@ -79,7 +79,7 @@ class PointToPlaneIcp:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate moved; the score stays.
 
@@ -87,7 +87,7 @@ class PointToPlaneIcp:
             UserError: The method has no depth.
         """
         model: ObjectModel | None = getattr(method, "model", None)
-        if not isinstance(scene, HasDepth) or model is None:
+        if not isinstance(encoding, HasDepth) or model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no depth to align poses with; "
                 "choose filter/refine=mean_shift or none"
@@ -102,7 +102,7 @@ class PointToPlaneIcp:
         for index in range(self.iterations):
             part = index / max(self.iterations - 1, 1)
             width = self.initial_gate * (self.final_gate / self.initial_gate) ** part
-            rows, offsets, weights = self._pair(pose, own, center, scene, width)
+            rows, offsets, weights = self._pair(pose, own, center, encoding, width)
             total = weights.sum(-1)
             known = total > _FEW
             share = (self.effective / total.clamp_min(_FEW)).clamp_max(1) / self.noise**2
@@ -119,7 +119,7 @@ class PointToPlaneIcp:
         return points[:: -(-len(points) // self.points)]
 
     def _pair(
-        self, pose: Tensor, own: Tensor, center: Tensor, scene: HasDepth, width: float
+        self, pose: Tensor, own: Tensor, center: Tensor, encoding: HasDepth, width: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Pair surface points with what is measured at their pixels.
 
@@ -127,7 +127,7 @@ class PointToPlaneIcp:
             pose: (B, 4, 4) camera_from_object [m].
             own: (P, 3) surface points [m].
             center: (3,) the object's center [m].
-            scene: Depth and camera.
+            encoding: Depth and camera.
             width: Of the loss [m].
 
         Returns:
@@ -136,8 +136,8 @@ class PointToPlaneIcp:
         """
         points, middle = transform(pose, own), origin_of(pose, center)[:, None]
         ahead = points[..., 2] > _NEAREST
-        pixels = nearest_pixel(project(points, scene.intrinsics))
-        seen = look_up(scene.measured_depth, scene.intrinsics, pixels)
+        pixels = nearest_pixel(project(points, encoding.intrinsics))
+        seen = look_up(encoding.measured_depth, encoding.intrinsics, pixels)
         view = torch.nn.functional.normalize(points, dim=-1)
         facing = ((points - middle) * view).sum(-1) < 0
         frontal = (seen.normals * view).sum(-1) < -_GRAZING

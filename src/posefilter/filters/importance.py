@@ -12,7 +12,7 @@ from posefilter.filters.refine import require_scorer
 from posefilter.geometry.pose_density import fit_density, log_density
 from posefilter.geometry.pose_sampling import draw_poses, widen
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Method, Scene
+from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
 
@@ -63,7 +63,7 @@ class ImportanceSampling:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with new particles; without gradient."""
         poses, log_weights = belief.poses, belief.log_weights
@@ -71,7 +71,7 @@ class ImportanceSampling:
             widening = self.widening if number == 0 else 1.0
             poses, log_q = self.propose(poses, log_weights, method, widening, generator)
             score = require_scorer(method).score_poses(
-                scene, poses, self.sigma, generator, self.pixels
+                encoding, poses, self.sigma, generator, self.pixels
             )
             log_weights = (score.double() / self.temperature - log_q).log_softmax(1)
         return belief._replace(poses=poses, log_weights=log_weights.to(belief.log_weights))

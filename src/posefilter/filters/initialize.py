@@ -11,7 +11,7 @@ from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import HasObjectness, Initialize, Method, ProposesPoses, Scene
+from posefilter.protocols import Encoding, HasObjectness, Initialize, Method, ProposesPoses
 from posefilter.types import Batch
 
 
@@ -95,7 +95,7 @@ class UniformPixels:
     requires: ClassVar[Capabilities] = ("pixel_space",)
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], over the whole area of the image's pixels."""
         require_pixel_space(method, "uniform")
@@ -117,7 +117,7 @@ class FromDepth:
         self.depth_offset = (float(depth_offset[0]), float(depth_offset[1]))
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
         space = require_pose_space(method, "from_depth")
@@ -132,7 +132,7 @@ class FromDepth:
 
 
 class FromObjectness:
-    """Pixels drawn from the scene's objectness map (the paper, section 6, idea 4).
+    """Pixels drawn from the encoding's objectness map (the paper, section 6, idea 4).
 
     Args:
         uniform_fraction: Weight of the uniform distribution that is mixed in, so that every
@@ -145,16 +145,16 @@ class FromObjectness:
         self.uniform_fraction = uniform_fraction
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], uniform within each drawn cell."""
         require_pixel_space(method, "from_objectness")
-        if not isinstance(scene, HasObjectness):
+        if not isinstance(encoding, HasObjectness):
             raise UserError(
                 f"filter/initialize=from_objectness: {type(method).__name__} makes no map of "
                 f"objectness; choose uniform"
             )
-        weight = scene.objectness[:, 0].detach()
+        weight = encoding.objectness[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
         weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
             0
@@ -173,7 +173,7 @@ class FromProposals:
     requires: ClassVar[Capabilities] = ("pose_space", "propose_poses")
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
         if not isinstance(method, ProposesPoses):
@@ -181,7 +181,7 @@ class FromProposals:
                 f"filter/initialize=from_proposals: {type(method).__name__} proposes no "
                 f"poses; choose another start"
             )
-        return method.propose_poses(scene, particles, generator)
+        return method.propose_poses(encoding, particles, generator)
 
 
 class Informed(nn.Module):
@@ -206,10 +206,10 @@ class Informed(nn.Module):
         self.object_fraction, self.sigma_px = object_fraction, sigma_px
 
     def forward(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px]."""
-        state = self.initializer(batch, scene, method, particles, generator)
+        state = self.initializer(batch, encoding, method, particles, generator)
         count = round(self.object_fraction * particles)
         if not self.training or count == 0:
             return state

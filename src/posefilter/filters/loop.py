@@ -3,13 +3,13 @@
 The algorithm is the bootstrap filter of Gordon, Salmond and Smith (1993), in the general form of
 Doucet and Johansen (2009, section 4) and Chopin and Papaspiliopoulos (2020, chapter 10):
 
-    scene = encode(image)
+    encoding = encode(image)
     x[1], w[1] = initialize(N), 1 / N
     for t = 1 ... T:
         if t > 1:
             a = resample(w, N)                       ancestors
             x[t] = propagate(x[t - 1][a])
-        g = measure(scene, x[t])                     log-likelihood, displacement, pose, latent
+        g = measure(encoding, x[t])                     log-likelihood, displacement, pose, latent
         w[t] = normalize(reweight(w, g))
     belief = refine(estimate(x[T], w[T]))
 
@@ -31,7 +31,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.errors import UserError
-from posefilter.filters.auxiliary import bind_to_scene
+from posefilter.filters.auxiliary import bind_to_encoding
 from posefilter.protocols import (
     Estimate,
     Initialize,
@@ -121,12 +121,12 @@ class ParticleFilter(nn.Module):
         Raises:
             FloatingPointError: All weights of an image are zero, or not numbers.
         """
-        scene = method.encode(batch)
-        state = self.initialize(batch, scene, method, self.first_particles, generator)
+        encoding = method.encode(batch)
+        state = self.initialize(batch, encoding, method, self.first_particles, generator)
         particles = make_particles(state, method.latent_width)
         inherited = torch.zeros_like(particles.log_weights)
         steps = self.make_steps(state)
-        resample = bind_to_scene(self.resample, scene, batch)
+        resample = bind_to_encoding(self.resample, encoding, batch)
         history: list[Particles] = []
         outputs: list[ParticleOutput] = []
         evidence: list[Tensor] = []
@@ -139,7 +139,7 @@ class ParticleFilter(nn.Module):
                 latent = inherit(outputs[-1].latent, resampled)
                 inherited = inherit(outputs[-1].log_likelihood[..., None], resampled)[..., 0]
                 particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
-            output = method.measure(scene, particles, step, generator)
+            output = method.measure(encoding, particles, step, generator)
             log_weights = self.reweight(particles.log_weights, output.log_likelihood, inherited)
             increment = log_weights.logsumexp(1)
             particles = particles._replace(log_weights=log_weights - increment[:, None])
@@ -148,9 +148,9 @@ class ParticleFilter(nn.Module):
             evidence.append(increment)
         log_evidence = torch.stack(evidence, dim=1)
         check_finite(log_evidence)
-        belief = self.estimate(history[-1], outputs[-1], scene, method, generator)
-        belief = self.refine(belief, scene, method, generator)
-        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence, scene)
+        belief = self.estimate(history[-1], outputs[-1], encoding, method, generator)
+        belief = self.refine(belief, encoding, method, generator)
+        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence, encoding)
 
     def make_steps(self, like: Tensor) -> tuple[Step, ...]:
         """Return the steps with their noise levels, in the dtype and on the device of `like`."""

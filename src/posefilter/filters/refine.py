@@ -8,7 +8,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.protocols import Method, Refine, Scene, ScoresPoses
+from posefilter.protocols import Encoding, Method, Refine, ScoresPoses
 from posefilter.types import BeliefBatch
 
 _RESCORED = (
@@ -21,7 +21,7 @@ class NoRefine:
     """Leave the estimate unchanged."""
 
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief unchanged."""
         return belief
@@ -40,11 +40,11 @@ class Compose:
         return next(filter(None, reversed(said)), "")
 
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief after the last refinement."""
         for component in self.components:
-            belief = component(belief, scene, method, generator)
+            belief = component(belief, encoding, method, generator)
         return belief
 
 
@@ -89,12 +89,12 @@ class Rescore:
         self.top_k, self.pixels, self.sigma = top_k, pixels, sigma
 
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the pose of highest score as its estimate."""
         scorer, poses = require_scorer(method), top_poses(belief, self.top_k)
         with torch.no_grad():
-            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
         return select_best(belief, poses, scores)
 
 
@@ -140,7 +140,7 @@ class MeanShift:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate shifted; without gradient."""
         scorer, best = require_scorer(method), belief.best
@@ -154,9 +154,11 @@ class MeanShift:
             poses = method.space.move(
                 best[:, None].expand(-1, 2 * self.antithetic_pairs, -1, -1), moves
             )
-            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             best = method.space.move(best, (scores.softmax(1)[..., None] * moves).sum(1))
-        score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
+        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)[
+            :, 0
+        ]
         return belief._replace(best=best, score=score)
 
 
@@ -193,7 +195,7 @@ class Gradient:
         self.final_pixels, self.final_sigma = final_pixels, final_sigma
 
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with a refined estimate; without gradient.
 
@@ -206,16 +208,21 @@ class Gradient:
                 "refine: gradient ascent needs gradients; set trainer.inference_mode=false"
             )
         start = top_poses(belief, self.starts - 1).detach()
-        refined = self.climb(start, scene, method, scorer, generator)
+        refined = self.climb(start, encoding, method, scorer, generator)
         poses = torch.cat([start[:, :1], refined], dim=1)
         with torch.no_grad():
             scores = scorer.score_poses(
-                scene, poses, self.final_sigma, generator, self.final_pixels
+                encoding, poses, self.final_sigma, generator, self.final_pixels
             )
         return select_best(belief, poses, scores)
 
     def climb(
-        self, start: Tensor, scene: Scene, method: Method, scorer: ScoresPoses, generator: Generator
+        self,
+        start: Tensor,
+        encoding: Encoding,
+        method: Method,
+        scorer: ScoresPoses,
+        generator: Generator,
     ) -> Tensor:
         """Return the poses after gradient ascent.  (B, C, 4, 4) -> (B, C, 4, 4)."""
         # a turn counts as the shift at the radius
@@ -228,7 +235,7 @@ class Gradient:
             for step in range(self.steps):
                 adam.param_groups[0]["lr"] = self.lr * (1 - step / self.steps)
                 poses = method.space.move(start, x * unit)
-                score = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+                score = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
                 # of x alone: the network's own gradients stay untouched
                 (x.grad,) = torch.autograd.grad(-score.sum(), x)
                 adam.step()

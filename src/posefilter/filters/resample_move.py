@@ -27,7 +27,7 @@ from posefilter.filters.refine import require_scorer
 from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Method, Scene
+from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
 _NEAREST = 0.005  # least share of the pairs that a difference is drawn from
@@ -87,7 +87,7 @@ class ResampleMove:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with particles of equal weight; without gradient."""
         space, device = method.space, belief.poses.device
@@ -99,7 +99,7 @@ class ResampleMove:
             # the same image points each time: the target stays as it is
             fixed = torch.Generator(device).manual_seed(seed)
             found = require_scorer(method).score_poses(
-                scene, poses.to(belief.poses), self.sigma, fixed, self.pixels
+                encoding, poses.to(belief.poses), self.sigma, fixed, self.pixels
             )
             return found.double() / self.temperature
 

@@ -17,7 +17,7 @@ from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
 from posefilter.geometry.pose import origin_of, rotation_of, transform
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import HasColor, Method, Scene, ScoresPoses
+from posefilter.protocols import Encoding, HasColor, Method, ScoresPoses
 from posefilter.types import BeliefBatch, ObjectModel
 
 _DARK = 0.03  # added to colors before the logarithm, so that black does not decide
@@ -49,7 +49,7 @@ class Print(NamedTuple):
 
 
 def measure_texture(
-    poses: Tensor, scene: HasColor, model: ObjectModel, shift: float = _SHIFT
+    poses: Tensor, encoding: HasColor, model: ObjectModel, shift: float = _SHIFT
 ) -> Tensor:
     """Return how much better the object's print explains the image than plain shading does.
 
@@ -61,7 +61,7 @@ def measure_texture(
 
     Args:
         poses: (B, C, 4, 4) camera_from_object [m].
-        scene: B images with color and depth.
+        encoding: B images with color and depth.
         model: The object.
         shift: The best of nine shifts of the image counts, which lie so far apart [focal lengths],
             since fine print does not correlate where a pose is a millimeter off. 0: none.
@@ -73,7 +73,9 @@ def measure_texture(
         UserError: The object has no texture.
     """
     own = read_print(model, poses)
-    images = zip(poses, scene.measured_color, scene.measured_depth, scene.intrinsics, strict=True)
+    images = zip(
+        poses, encoding.measured_color, encoding.measured_depth, encoding.intrinsics, strict=True
+    )
     return torch.stack([_compare(*image, own, model, shift) for image in images])
 
 
@@ -182,7 +184,7 @@ class TextureTurns:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate and its particles turned; the score stays.
 
@@ -190,7 +192,7 @@ class TextureTurns:
             UserError: The method keeps no color, or its object has no texture.
         """
         model: ObjectModel | None = getattr(method, "model", None)
-        if not isinstance(scene, HasColor) or model is None:
+        if not isinstance(encoding, HasColor) or model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
                 "choose filter/refine=icp or none"
@@ -201,10 +203,10 @@ class TextureTurns:
             return belief
         turns = turns.to(first)
         log_posterior, tried = self._score(
-            first, turns, first_tried, scene, method, model, generator
+            first, turns, first_tried, encoding, method, model, generator
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
-        best = self._turn_finely(first, chosen, turns, scene, model)
+        best = self._turn_finely(first, chosen, turns, encoding, model)
         poses = _turn_particles(belief, turns[first_tried], log_posterior, model, generator)
         return belief._replace(best=best, poses=poses)
 
@@ -213,7 +215,7 @@ class TextureTurns:
         best: Tensor,
         turns: Tensor,
         first_tried: Tensor,
-        scene: HasColor,
+        encoding: HasColor,
         method: Method,
         model: ObjectModel,
         generator: Generator,
@@ -227,7 +229,7 @@ class TextureTurns:
             best: (B, 4, 4) the estimates.
             turns: (S, 4, 4).
             first_tried: (F,) indices of some of them.
-            scene: The images.
+            encoding: The images.
             method: Scores poses, or not.
             model: The object.
             generator: Draws the image points.
@@ -238,29 +240,29 @@ class TextureTurns:
         poses = best[:, None] @ turns[first_tried]
         learned = torch.zeros_like(poses[..., 0, 0])
         if isinstance(method, ScoresPoses) and self.learned_weight:
-            scores = method.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            scores = method.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             learned = self.learned_weight * scores
         chosen = first_tried.expand(learned.shape).clone()
         if len(first_tried) <= _MOST:
-            return measure_texture(poses, scene, model) + learned, chosen
-        evidence = measure_texture(poses, scene, model, shift=0)
+            return measure_texture(poses, encoding, model) + learned, chosen
+        evidence = measure_texture(poses, encoding, model, shift=0)
         top = (evidence + learned).topk(_MOST, dim=1).indices
         rows = torch.arange(len(best), device=best.device)[:, None]
         angles = _angles(turns[first_tried], turns)
         beside = angles.topk(_BESIDE, dim=1, largest=False).indices  # itself first
         near = beside[top]  # (B, M, _BESIDE)
         around = best[:, None, None] @ turns[near]
-        fine = measure_texture(around.flatten(1, 2), scene, model, shift=0).unflatten(
+        fine = measure_texture(around.flatten(1, 2), encoding, model, shift=0).unflatten(
             1, (_MOST, -1)
         )
         chosen[rows, top] = near.gather(2, fine.argmax(2, keepdim=True))[..., 0]
         evidence[rows, top] = measure_texture(
-            best[:, None] @ turns[chosen[rows, top]], scene, model
+            best[:, None] @ turns[chosen[rows, top]], encoding, model
         )
         return evidence + learned, chosen
 
     def _turn_finely(
-        self, best: Tensor, chosen: Tensor, turns: Tensor, scene: HasColor, model: ObjectModel
+        self, best: Tensor, chosen: Tensor, turns: Tensor, encoding: HasColor, model: ObjectModel
     ) -> Tensor:
         """Return the estimates turned by the best of all turns near those chosen.
 
@@ -268,7 +270,7 @@ class TextureTurns:
             best: (B, 4, 4).
             chosen: (B, 4, 4), one of `turns` each.
             turns: (S, 4, 4).
-            scene: The images.
+            encoding: The images.
             model: The object.
         """
         angles = _angles(chosen, turns)  # (B, S)
@@ -277,7 +279,7 @@ class TextureTurns:
             return best @ chosen
         near = turns[angles.topk(most, dim=1, largest=False).indices]  # the chosen one first
         poses = best[:, None] @ near
-        evidence = measure_texture(poses, scene, model)
+        evidence = measure_texture(poses, encoding, model)
         return poses[torch.arange(len(best), device=best.device), evidence.argmax(1)]
 
 

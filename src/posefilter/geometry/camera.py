@@ -63,14 +63,3 @@ def resize_intrinsics(K: Tensor, scale_x: float, scale_y: float) -> Tensor:
     out[..., 0, 2] += (scale_x - 1) / 2
     out[..., 1, 2] += (scale_y - 1) / 2
     return out
-
-
-def crop_intrinsics(K: Tensor, left: float, top: float) -> Tensor:
-    """Return the camera matrix of a crop whose first pixel is the image's pixel (left, top).
-
-    (*, 3, 3) [px].
-    """
-    out = K.clone()
-    out[..., 0, 2] -= left
-    out[..., 1, 2] -= top
-    return out

@@ -16,7 +16,7 @@ from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
 from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import Scene
+from posefilter.protocols import Encoding
 from posefilter.types import Batch, BeliefBatch, Trace
 
 _LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
@@ -162,13 +162,13 @@ def _search(
     start = time.perf_counter()
     job.searches += 1
     hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
-    image, scene = _encode(job, hidden)
+    image, encoding = _encode(job, hidden)
     one = None
-    if bool(image.depth.any()) and (job.searches == 1 or measure_worth(scene) >= settings.worth):
-        trace = job.filter(image, Encoded(job.method, scene), job.generator)
+    if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
+        trace = job.filter(image, Encoded(job.method, encoding), job.generator)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         seen = find_visible(trace.belief.best, job.method.model, depth, K)[0] & ~hidden
-        assessment = _assess(job.method, trace.belief, image, scene)
+        assessment = _assess(job.method, trace.belief, image, encoding)
         one = Detection(job.number, trace.belief, assessment, resize_mask(seen, grid))
         one = one if bool(seen.any()) and is_there(one, costs) else None
     job.exhausted = one is None
@@ -187,8 +187,8 @@ def _judge_again(
     if _judge(one, costs) != "unsure" or not others or not searched:
         return one
     start = time.perf_counter()
-    image, scene = _encode(job, _hide(job, others) & ~_hide(job, [one]))
-    again = one._replace(assessment=_assess(job.method, one.belief, image, scene))
+    image, encoding = _encode(job, _hide(job, others) & ~_hide(job, [one]))
+    again = one._replace(assessment=_assess(job.method, one.belief, image, encoding))
     job.seconds += time.perf_counter() - start
     return again
 
@@ -202,16 +202,16 @@ def _hide(job: _Job, taken: Sequence[Detection]) -> Tensor:
     return hidden
 
 
-def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Scene]:
+def _encode(job: _Job, hidden: Tensor) -> tuple[Batch, Encoding]:
     """Return the image without some pixels, and as the method encodes it."""
     image = blank(job.batch, hidden[None]) if bool(hidden.any()) else job.batch
     return image, job.method.encode(image)
 
 
 def _assess(
-    method: PoseEstimator, belief: BeliefBatch, image: Batch, scene: Scene
+    method: PoseEstimator, belief: BeliefBatch, image: Batch, encoding: Encoding
 ) -> Assessment | None:
-    return method.assess(Trace((), (), (), belief, scene=scene), image)
+    return method.assess(Trace((), (), (), belief, encoding=encoding), image)
 
 
 def _judge(one: Detection, costs: Costs) -> Verdict | None:

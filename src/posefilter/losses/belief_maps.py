@@ -46,13 +46,13 @@ class BeliefMaps:
         self.sigma = sigma
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,); the trace's scene is `HasBeliefMaps`."""
-        scene: HasBeliefMaps = trace.scene
+        """Return the loss of each image, (B,); the trace's encoding is `HasBeliefMaps`."""
+        encoding: HasBeliefMaps = trace.encoding
         pixels, ahead = project_keypoints(
-            batch.camera_from_object[:, None], scene.keypoints, batch.intrinsics
+            batch.camera_from_object[:, None], encoding.keypoints, batch.intrinsics
         )
-        h, w = scene.logits.shape[-2:]
-        target = draw_gaussians(pixels[:, 0], ahead[:, 0], h, w, scene.stride, self.sigma)
-        loss = F.binary_cross_entropy_with_logits(scene.logits, target, reduction="none")
+        h, w = encoding.logits.shape[-2:]
+        target = draw_gaussians(pixels[:, 0], ahead[:, 0], h, w, encoding.stride, self.sigma)
+        loss = F.binary_cross_entropy_with_logits(encoding.logits, target, reduction="none")
         entropy = torch.special.entr(target) + torch.special.entr(1 - target)
         return (loss - entropy).sum((2, 3)).mean(1)  # 0 where the maps are right

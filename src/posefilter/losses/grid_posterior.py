@@ -63,9 +63,11 @@ class GridPosterior:
         self.sigma = sigma
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,); the trace's scene is `HasGridScores`."""
-        scene: HasGridScores = trace.scene
-        far = squared_distances(scene.centers, scene.rotations, batch.camera_from_object, model)
+        """Return the loss of each image, (B,); the trace's encoding is `HasGridScores`."""
+        encoding: HasGridScores = trace.encoding
+        far = squared_distances(
+            encoding.centers, encoding.rotations, batch.camera_from_object, model
+        )
         wanted = (-0.5 * far / (self.sigma * model.radius) ** 2).flatten(1).log_softmax(1)
-        found = scene.scores.flatten(1).log_softmax(1)
+        found = encoding.scores.flatten(1).log_softmax(1)
         return (wanted.exp() * (wanted - found)).sum(1)

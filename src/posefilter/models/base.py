@@ -110,17 +110,17 @@ class PoseEstimator(Module):
             batch: B images. `mask` and `camera_from_object` must not be used.
 
         Returns:
-            What `measure` is given as `scene`.
+            What `measure` is given as `encoding`.
         """
         raise NotImplementedError(f"{type(self).__name__} must implement encode()")
 
     def measure(
-        self, scene: Any, particles: Particles, step: Step, generator: Generator
+        self, encoding: Any, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Compute likelihood, displacement, pose and latent of each particle.
 
         Args:
-            scene: Returned by `encode`.
+            encoding: Returned by `encode`.
             particles: N particles of each image.
             step: The step's number and noise level.
             generator: Source of randomness.

@@ -17,7 +17,7 @@ from posefilter.filters.propagate import HalfTurns
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Propagate, Scene
+from posefilter.protocols import Encoding, Propagate
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 
@@ -51,12 +51,12 @@ class ScoredMethod(Protocol):
         ...
 
     def measure(
-        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+        self, encoding: Encoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Score every particle."""
         ...
 
-    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: Encoding, particles: int, generator: Generator) -> Tensor:
         """Draw likely poses, (B, particles, 4, 4) camera_from_object [m]."""
         ...
 
@@ -65,13 +65,13 @@ class CandidateSampler(Protocol):
     """Draw and score the candidates of one batch."""
 
     def __call__(
-        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Return a trace of one step whose scores are differentiable.
 
         Args:
             method: Scores the candidates.
-            scene: Its encoded images.
+            encoding: Its encoded images.
             batch: B images with their truth.
             generator: Source of randomness.
         """
@@ -150,7 +150,7 @@ class CandidatePoses:
         )
 
     def __call__(
-        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Draw and score candidates, and advance the persistent particles by a step."""
         B, device = len(batch.rgb), batch.rgb.device
@@ -170,12 +170,12 @@ class CandidatePoses:
         ]
         proposes = "propose_poses" in method.capabilities
         if self.proposals and proposes:
-            groups.append(method.propose_poses(scene, self.proposals, generator))
+            groups.append(method.propose_poses(encoding, self.proposals, generator))
         own = torch.zeros(B, dtype=torch.bool, device=device)
         if self.persistent is not None:
             count, space = self.persistent.particles, method.space
             fresh = (
-                method.propose_poses(scene, count, generator)
+                method.propose_poses(encoding, count, generator)
                 if proposes
                 else sample_from_depth(batch, space, count, generator)
             )
@@ -189,7 +189,7 @@ class CandidatePoses:
             sigma = torch.where(own, level, sigma)
             groups.append(states)
         particles = make_uniform_particles(torch.cat(groups, dim=1))
-        output = method.measure(scene, particles, Step(0, 1, sigma), generator)
+        output = method.measure(encoding, particles, Step(0, 1, sigma), generator)
         if self.persistent is not None:
             scores = output.log_likelihood[:, -self.persistent.particles :].detach()
             self.persistent.advance(batch, groups[-1], scores, sigma, own, method.space, generator)
@@ -254,7 +254,7 @@ class LabeledRays:
         self.margin_behind, self.tolerance = margin_behind, tolerance
 
     def __call__(
-        self, method: ScoredMethod, scene: Scene, batch: Batch, generator: Generator
+        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Draw and score samples.
 
@@ -285,7 +285,7 @@ class LabeledRays:
         point = transform(
             invert(batch.camera_from_object), back_project(pixel, at.flatten(1), batch.intrinsics)
         )
-        observed = scene.image.values.gather(1, pick[..., None].expand(-1, -1, 3))
+        observed = encoding.image.values.gather(1, pick[..., None].expand(-1, -1, 3))
         observed = observed[:, :, None].expand(-1, -1, self.samples, -1).flatten(1, 2)
         random = torch.rand(observed.shape, generator=generator, device=device)
         valid = drawn[:, :, None].expand(-1, -1, self.samples).flatten(1)

@@ -27,7 +27,7 @@ from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, ObjectModel, Trace
 
 
-class DenseScene(NamedTuple):
+class DenseEncoding(NamedTuple):
     """Encoded images."""
 
     coordinates: Coordinates
@@ -77,7 +77,7 @@ class DenseCoordinates(Hypotheses):
         self.proposals = proposals
         self.cells, self.inlier, self.refits = cells, inlier, refits
 
-    def encode(self, batch: Batch) -> DenseScene:
+    def encode(self, batch: Batch) -> DenseEncoding:
         """Run the network, and pair the likeliest cells' object points with what was measured."""
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         cells = measure_cells(batch.depth, batch.intrinsics)
@@ -89,9 +89,11 @@ class DenseCoordinates(Hypotheses):
         target = cells.point.flatten(1, 2).gather(1, rows)
         depth = batch.depth[:, 0]
         paired = (self.proposals.reach, source, target, weights)
-        return DenseScene(coordinates, cells, *paired, depth, batch.intrinsics)
+        return DenseEncoding(coordinates, cells, *paired, depth, batch.intrinsics)
 
-    def propose_poses(self, scene: DenseScene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(
+        self, encoding: DenseEncoding, particles: int, generator: Generator
+    ) -> Tensor:
         """Fit poses to three correspondences each, and then to those that agree with them.
 
         Returns:
@@ -100,18 +102,18 @@ class DenseCoordinates(Hypotheses):
         Raises:
             UserError: An image has no depth.
         """
-        require_depth(scene.cells.valid)
-        pairs = (scene.source, scene.target, scene.weights)
+        require_depth(encoding.cells.valid)
+        pairs = (encoding.source, encoding.target, encoding.weights)
         poses = draw_minimal_fits(*pairs, particles, generator)
         return refit_to_inliers(poses, *pairs, self.tolerance, self.refits)
 
-    def score(self, scene: DenseScene, poses: Tensor) -> Tensor:
+    def score(self, encoding: DenseEncoding, poses: Tensor) -> Tensor:
         """Return each pose's share of inliers, cells weighted by their probability of the object.
 
         (B, N, 4, 4) [m] -> (B, N) in [0, 1).
         """
-        inside = agreement(poses, scene.source, scene.target, self.tolerance)
-        return weigh_inliers(inside, scene.weights)
+        inside = agreement(poses, encoding.source, encoding.target, self.tolerance)
+        return weigh_inliers(inside, encoding.weights)
 
     @property
     def tolerance(self) -> float:
@@ -120,14 +122,18 @@ class DenseCoordinates(Hypotheses):
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, with what the network sees of it."""
-        scene: DenseScene = self.encode(batch) if trace.scene is None else trace.scene
-        seen = measure_coordinates(trace.belief.best, scene.coordinates, scene.cells, self.model)
+        encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
+        seen = measure_coordinates(
+            trace.belief.best, encoding.coordinates, encoding.cells, self.model
+        )
         return super().collect_features(trace, batch) | seen
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize:
         """Return how large the object appears by the network's object points."""
-        scene: DenseScene = self.encode(batch) if trace.scene is None else trace.scene
-        return measure_apparent_size(trace.belief.best, scene.coordinates, scene.cells, self.model)
+        encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
+        return measure_apparent_size(
+            trace.belief.best, encoding.coordinates, encoding.cells, self.model
+        )
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the network too."""

@@ -26,7 +26,7 @@ from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 
 @dataclass(frozen=True)
-class ImageScene:
+class ImageEncoding:
     """B encoded images."""
 
     image: Tensor  # (B, 4, H, W): color in [-1, 1], depth [m]
@@ -46,7 +46,7 @@ class ImageScene:
 
 
 @dataclass(frozen=True)
-class ObjectnessScene(ImageScene):
+class ObjectnessEncoding(ImageEncoding):
     """Encoded images with an objectness map."""
 
     objectness: Tensor  # (B, 1, h, w), the probability that the cell shows the object
@@ -144,18 +144,18 @@ class ImageSpace(PoseEstimator):
         """Width L of a particle's latent."""
         return int(self.net.latent_width)
 
-    def encode(self, batch: Batch) -> ImageScene:
+    def encode(self, batch: Batch) -> ImageEncoding:
         """Encode the images."""
         context = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
         if context.objectness is None:
-            return ImageScene(image, depth, batch.intrinsics, context)
+            return ImageEncoding(image, depth, batch.intrinsics, context)
         objectness = torch.sigmoid(context.objectness)[:, None]
-        return ObjectnessScene(image, depth, batch.intrinsics, context, objectness)
+        return ObjectnessEncoding(image, depth, batch.intrinsics, context, objectness)
 
     def measure(
-        self, scene: ImageScene, particles: Particles, step: Step, generator: Generator
+        self, encoding: ImageEncoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Compute likelihood, displacement, pose and latent of each particle from what it sees."""
         state, latent = particles.state, particles.latent
@@ -163,58 +163,58 @@ class ImageSpace(PoseEstimator):
             state, latent = state.detach(), latent.detach()
         if self.detach_position:
             state = state.detach()
-        patch = self.image_patches(scene, state)
+        patch = self.image_patches(encoding, state)
         extra = torch.cat(
             [
-                self.encoder.sample_features(scene.context, state),
-                self.position_features(scene, state),
+                self.encoder.sample_features(encoding.context, state),
+                self.position_features(encoding, state),
             ],
             dim=-1,
         )
         predicted = self.net(patch, extra, latent)
-        height, width = scene.image.shape[-2:]
+        height, width = encoding.image.shape[-2:]
         displacement = self.displacement(
             predicted.displacement, predicted.logit, state, width, height
         )
-        pose, fragments = self.pose_head(predicted.pose, self.surface_points(scene, state)[0])
+        pose, fragments = self.pose_head(predicted.pose, self.surface_points(encoding, state)[0])
         return ParticleOutput(
             F.logsigmoid(predicted.logit), displacement, pose, predicted.latent, fragments
         )
 
-    def surface_points(self, scene: ImageScene, state: Tensor) -> tuple[Tensor, Tensor]:
+    def surface_points(self, encoding: ImageEncoding, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return the measured point at each particle.
 
         Depth is taken at the nearest pixel, not interpolated: between the pixels of two surfaces
         there is no surface. A particle off the frame gets the depth of the nearest pixel in it.
 
         Args:
-            scene: Encoded images.
+            encoding: Encoded images.
             state: (B, N, 2) particles [px].
 
         Returns:
             Points in the camera (B, N, 3) [m], and whether their depth was measured (B, N) bool.
         """
-        H, W = scene.depth.shape[-2:]
+        H, W = encoding.depth.shape[-2:]
         corner = torch.tensor([W - 1, H - 1], device=state.device)
         pixel = nearest_pixel(state)
         inside = torch.minimum(pixel.clamp_min(0), corner)
-        z, known = gather_pixels(scene.depth, inside).unbind(-1)
-        return back_project(state.detach(), z, scene.intrinsics), (known > 0) & (
+        z, known = gather_pixels(encoding.depth, inside).unbind(-1)
+        return back_project(state.detach(), z, encoding.intrinsics), (known > 0) & (
             inside == pixel
         ).all(-1)
 
-    def image_patches(self, scene: ImageScene, state: Tensor) -> Tensor:
+    def image_patches(self, encoding: ImageEncoding, state: Tensor) -> Tensor:
         """Crop the patch at each particle.  (B, N, 2) [px] -> (B, N, 4, k, k), channels as
         `image`.
         """
-        patches: Tensor = self.glimpse(scene.image, state)
+        patches: Tensor = self.glimpse(encoding.image, state)
         return patches
 
-    def position_features(self, scene: ImageScene, state: Tensor) -> Tensor:
+    def position_features(self, encoding: ImageEncoding, state: Tensor) -> Tensor:
         """Return a particle's own position as network input.
 
         Args:
-            scene: Encoded images.
+            encoding: Encoded images.
             state: (B, N, 2) particles [px].
 
         Returns:
@@ -223,7 +223,7 @@ class ImageSpace(PoseEstimator):
         if not self.position_width:
             # without gradient: the graph behind the positions would be traversed for nothing
             return state.detach()[..., :0]
-        height, width = scene.image.shape[-2:]
+        height, width = encoding.image.shape[-2:]
         half = state.new_tensor([(width - 1) / 2, (height - 1) / 2])
         return (state / half - 1)[..., : self.position_width]
 
@@ -235,14 +235,14 @@ class ImageSpace(PoseEstimator):
         """
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
-        scene = self.encode(batch)
-        trace: Trace = self.train_filter(batch, _EncodedMethod(self, scene), generator)
+        encoding = self.encode(batch)
+        trace: Trace = self.train_filter(batch, _EncodedMethod(self, encoding), generator)
         losses = {"loss": self.loss(trace, batch, self.model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.model)
-        if isinstance(scene, ObjectnessScene) and self.objectness_weight:
+        if isinstance(encoding, ObjectnessEncoding) and self.objectness_weight:
             losses["objectness"] = self.objectness_weight * objectness_loss(
-                scene.context, batch.mask
+                encoding.context, batch.mask
             )
         factors = factors_at(self.loss_schedule, self.progress())
         return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
@@ -281,8 +281,8 @@ class ImageSpace(PoseEstimator):
 class _EncodedMethod:
     """A method whose images are encoded: the roll-out and the objectness loss share them."""
 
-    def __init__(self, method: ImageSpace, scene: ImageScene) -> None:
-        self.method, self.scene = method, scene
+    def __init__(self, method: ImageSpace, encoding: ImageEncoding) -> None:
+        self.method, self.encoding = method, encoding
         self.space, self.latent_width, self.measure = (
             method.space,
             method.latent_width,
@@ -290,9 +290,9 @@ class _EncodedMethod:
         )
         self.surface_points, self.model = method.surface_points, method.model
 
-    def encode(self, batch: Batch) -> ImageScene:
-        """Return the scene that was encoded before."""
-        return self.scene
+    def encode(self, batch: Batch) -> ImageEncoding:
+        """Return the encoding that was encoded before."""
+        return self.encoding
 
 
 def check_latent_width(width: int, required: int | None) -> None:

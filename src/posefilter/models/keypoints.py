@@ -31,7 +31,7 @@ _LEAST = 0.01  # height of a peak
 _FALLBACK = 1.0  # [m] depth of the center where no pose is found
 
 
-class KeypointScene(NamedTuple):
+class KeypointEncoding(NamedTuple):
     """Encoded images."""
 
     logits: Tensor  # (B, 9, h, w)
@@ -80,13 +80,15 @@ class Keypoints(Hypotheses):
         super().__init__(**base)
         self.net, self.peaks, self.subset, self.inlier_px = net, peaks, subset, inlier_px
 
-    def encode(self, batch: Batch) -> KeypointScene:
+    def encode(self, batch: Batch) -> KeypointEncoding:
         """Run the network."""
         logits = self.net(batch.rgb, batch.depth, batch.intrinsics)
         keypoints = box_keypoints(self.model.hull).to(logits)
-        return KeypointScene(logits, keypoints, batch.intrinsics, batch.depth[:, 0])
+        return KeypointEncoding(logits, keypoints, batch.intrinsics, batch.depth[:, 0])
 
-    def propose_poses(self, scene: KeypointScene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(
+        self, encoding: KeypointEncoding, particles: int, generator: Generator
+    ) -> Tensor:
         """Solve for poses that put keypoints at peaks.
 
         Where none is found, the pose is that of an unturned object 1 m deep, behind the highest
@@ -95,12 +97,12 @@ class Keypoints(Hypotheses):
         Returns:
             camera_from_object (B, particles, 4, 4) [m].
         """
-        pixels, heights = find_peaks(scene.maps.detach(), self.peaks, scene.stride)
+        pixels, heights = find_peaks(encoding.maps.detach(), self.peaks, encoding.stride)
         drawn, rows = self.draw_subsets(heights, particles, generator)
-        lost = self.fall_back(scene, pixels[:, -1, 0])
-        points = scene.keypoints.double().cpu().numpy()
+        lost = self.fall_back(encoding, pixels[:, -1, 0])
+        points = encoding.keypoints.double().cpu().numpy()
         images = zip(
-            *(x.double().cpu().numpy() for x in (pixels, heights, scene.intrinsics, lost)),
+            *(x.double().cpu().numpy() for x in (pixels, heights, encoding.intrinsics, lost)),
             drawn.cpu().numpy(),
             rows.cpu().numpy(),
             strict=True,
@@ -109,7 +111,7 @@ class Keypoints(Hypotheses):
             self.solve(points, image, height, K, few, row, default)
             for image, height, K, default, few, row in images
         ]
-        return torch.from_numpy(np.stack(poses)).to(scene.logits)
+        return torch.from_numpy(np.stack(poses)).to(encoding.logits)
 
     def draw_subsets(
         self, heights: Tensor, count: int, generator: Generator
@@ -148,18 +150,18 @@ class Keypoints(Hypotheses):
             found.append(solve_pnp(points[few], pixels[few, row[few]], K))
         return np.stack([default if pose is None else pose for pose in found])
 
-    def fall_back(self, scene: KeypointScene, pixels: Tensor) -> Tensor:
+    def fall_back(self, encoding: KeypointEncoding, pixels: Tensor) -> Tensor:
         """Return unturned poses 1 m deep whose centers are at pixels.  (B, 2) -> (B, 4, 4)."""
-        place = rays(pixels[:, None], scene.intrinsics)[:, 0] * _FALLBACK
+        place = rays(pixels[:, None], encoding.intrinsics)[:, 0] * _FALLBACK
         turn = torch.eye(3, device=place.device).expand(len(place), 3, 3)
-        return pose_about(turn, place, scene.keypoints[-1])
+        return pose_about(turn, place, encoding.keypoints[-1])
 
-    def score(self, scene: KeypointScene, poses: Tensor) -> Tensor:
+    def score(self, encoding: KeypointEncoding, poses: Tensor) -> Tensor:
         """Return the mean belief at the places where a pose puts the keypoints.
 
         (B, N, 4, 4) [m] -> (B, N) in [0, 1]; a keypoint out of the frame counts as 0.
         """
-        pixels, ahead = project_keypoints(poses, scene.keypoints, scene.intrinsics)
-        maps, places = scene.maps.flatten(0, 1)[:, None], pixels.transpose(1, 2).flatten(0, 1)
-        seen = sample(maps, places, scene.stride)[..., 0].unflatten(0, (len(poses), KEYPOINTS))
+        pixels, ahead = project_keypoints(poses, encoding.keypoints, encoding.intrinsics)
+        maps, places = encoding.maps.flatten(0, 1)[:, None], pixels.transpose(1, 2).flatten(0, 1)
+        seen = sample(maps, places, encoding.stride)[..., 0].unflatten(0, (len(poses), KEYPOINTS))
         return (seen.transpose(1, 2) * ahead).mean(-1)

@@ -59,28 +59,28 @@ class Hypotheses(PoseParticles):
     test_only_settings: ClassVar[tuple[str, ...]] = ("filter", "train_filter")
 
     @abstractmethod
-    def propose_poses(self, scene: Any, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: Any, particles: int, generator: Generator) -> Tensor:
         """Return hypotheses (B, particles, 4, 4), camera_from_object [m]."""
 
     @abstractmethod
-    def score(self, scene: Any, poses: Tensor) -> Tensor:
+    def score(self, encoding: Any, poses: Tensor) -> Tensor:
         """Return how well the network's output agrees with poses, (B, N, 4, 4) -> (B, N) in [0,
         1].
         """
 
     def measure(
-        self, scene: Any, particles: Particles, step: Step, generator: Generator
+        self, encoding: Any, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Return the logarithms of the scores."""
-        score = self.score(scene, particles.state).clamp_min(_LEAST).log()
+        score = self.score(encoding, particles.state).clamp_min(_LEAST).log()
         no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, particles.state, particles.latent)
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the loss of the network's output, one value for each image."""
-        scene = self.encode(batch)
+        encoding = self.encode(batch)
         none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {"loss": self.loss(Trace((), (), (), none, scene=scene), batch, self.model)}
+        return {"loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.model)}
 
 
 def require_depth(valid: Tensor) -> None:

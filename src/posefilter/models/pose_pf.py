@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 _OUTSCORED = ("truth_outscored", "truth_outscored_by_wrong", "truth_outscored_by_misplaced")
 
 
-class PoseScene(NamedTuple):
+class PoseEncoding(NamedTuple):
     """Encoded images: their pixels, and the output of the proposal network (None without one)."""
 
     image: Pixels
@@ -63,13 +63,13 @@ class PoseScene(NamedTuple):
         """The camera matrices (B, 3, 3) [px]."""
         return self.image.intrinsics
 
-    def with_quasi_monte_carlo(self) -> "PoseScene":
+    def with_quasi_monte_carlo(self) -> "PoseEncoding":
         """Return the same images, whose poses are scored by points that are drawn evenly."""
         return self._replace(image=self.image._replace(even=True))
 
-    def first(self, count: int) -> "PoseScene":
+    def first(self, count: int) -> "PoseEncoding":
         """Return the first `count` images."""
-        return PoseScene(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
+        return PoseEncoding(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
 
 
 class PosePF(PoseParticles):
@@ -122,12 +122,12 @@ class PosePF(PoseParticles):
         self.likelihood_batch_size = likelihood_batch_size
         self.proposal_weight = proposal_weight
 
-    def encode(self, batch: Batch) -> PoseScene:
+    def encode(self, batch: Batch) -> PoseEncoding:
         """Flatten the images, and run the proposal network once."""
         even = self.quasi_monte_carlo and not self.training
         if self.proposals is None:
             image = flatten_images(batch.rgb, batch.depth, batch.intrinsics)
-            return PoseScene(image._replace(even=even), None, None)
+            return PoseEncoding(image._replace(even=even), None, None)
         coordinates = self.proposals(batch.rgb, batch.depth, batch.intrinsics)
         context = coordinates if coordinates.features.shape[-1] else None
         image = flatten_images(batch.rgb, batch.depth, batch.intrinsics, context)
@@ -135,24 +135,24 @@ class PosePF(PoseParticles):
         if context is not None and applies(batch.rgb.device):
             assert image.context is not None
             image = image._replace(tables=make_tables(image.context))
-        return PoseScene(image, coordinates, measure_cells(batch.depth, batch.intrinsics))
+        return PoseEncoding(image, coordinates, measure_cells(batch.depth, batch.intrinsics))
 
     def measure(
-        self, scene: PoseScene, particles: Particles, step: Step, generator: Generator
+        self, encoding: PoseEncoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
         count = self.train_pixels if self.training else self.pixels
-        score = self._score_fast(scene, particles.state, step.sigma, generator, count)
+        score = self._score_fast(encoding, particles.state, step.sigma, generator, count)
         no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, particles.state, particles.latent)
 
     def score_poses(
-        self, scene: PoseScene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: PoseEncoding, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         """Score any poses at a noise level.
 
         Args:
-            scene: Encoded images.
+            encoding: Encoded images.
             poses: (B, N, 4, 4) camera_from_object [m].
             sigma: Noise level [m].
             generator: Draws the image points.
@@ -164,9 +164,9 @@ class PosePF(PoseParticles):
         at = poses.new_tensor(sigma)
         # a gradient would be that of a rounded score
         how = self._score if torch.is_grad_enabled() else self._score_fast
-        return how(scene, poses, at, generator, pixels)
+        return how(encoding, poses, at, generator, pixels)
 
-    def propose_poses(self, scene: PoseScene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: PoseEncoding, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the votes of the proposal network.
 
         Returns:
@@ -175,16 +175,16 @@ class PosePF(PoseParticles):
         Raises:
             UserError: There is no proposal network, or an image without any depth.
         """
-        if scene.coordinates is None or scene.cells is None:
+        if encoding.coordinates is None or encoding.cells is None:
             raise UserError(
                 "filter/initialize=from_proposals needs the proposal network; "
                 "choose model/proposals=dense"
             )
         if not self.training:
-            require_depth(scene.cells.valid)
+            require_depth(encoding.cells.valid)
         return draw_poses(
-            scene.coordinates.detach(),
-            scene.cells,
+            encoding.coordinates.detach(),
+            encoding.cells,
             self._center(),
             self.model.radius,
             particles,
@@ -193,16 +193,16 @@ class PosePF(PoseParticles):
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the losses of likelihood and proposal network, one value for each image."""
-        scene = self.encode(batch)
+        encoding = self.encode(batch)
         count = self.likelihood_batch_size or len(batch.rgb)
         part = Batch(*(x[:count] for x in batch))
-        candidates = self.candidate_sampler(self, scene.first(count), part, generator)
+        candidates = self.candidate_sampler(self, encoding.first(count), part, generator)
         losses = {"likelihood": self.loss(candidates, part, self.model)}
-        if scene.coordinates is not None and scene.cells is not None:
+        if encoding.coordinates is not None and encoding.cells is not None:
             assert self.proposals is not None
             size = (self._center(), self.model.radius, float(self.proposals.reach))
             fit, error = coordinate_loss(
-                scene.coordinates, scene.cells, batch.mask, batch.camera_from_object, *size
+                encoding.coordinates, encoding.cells, batch.mask, batch.camera_from_object, *size
             )
             losses["proposals"] = self.proposal_weight * fit
             self.log_scalar("coordinate_error_mm", 1000 * error.mean())
@@ -226,10 +226,10 @@ class PosePF(PoseParticles):
 
     def _predict_coordinates(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
         """Return what the proposal network sees of the images of a finished run."""
-        scene: PoseScene = self.encode(batch) if trace.scene is None else trace.scene
-        assert scene.coordinates is not None
-        assert scene.cells is not None
-        return scene.coordinates, scene.cells
+        encoding: PoseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
+        assert encoding.coordinates is not None
+        assert encoding.cells is not None
+        return encoding.coordinates, encoding.cells
 
     def set_object(self, model: ObjectModel) -> None:
         """Set the object of the networks too."""
@@ -257,11 +257,11 @@ class PosePF(PoseParticles):
         from posefilter.metrics.errors import add, add_s  # trees of scipy: prediction needs none
 
         super().update_metrics(trace, batch)
-        scene = self.encode(batch)
+        encoding = self.encode(batch)
         pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
         sigma = pair.new_tensor(self.comparison_sigma)
-        scores = self._score(scene, pair, sigma, generator, self.comparison_pixels)
+        scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = scores[:, 0] > scores[:, 1]
         errors = (
             error(trace.belief.best, batch.camera_from_object, self.model.points)
@@ -297,17 +297,27 @@ class PosePF(PoseParticles):
         return self.model.center.to(self.device)
 
     def _score(
-        self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int
+        self,
+        encoding: PoseEncoding,
+        poses: Tensor,
+        sigma: Tensor,
+        generator: Generator,
+        pixels: int,
     ) -> Tensor:
         score: Tensor = self.likelihood(
-            scene.image, poses, sigma, self._center(), self.model.radius, pixels, generator
+            encoding.image, poses, sigma, self._center(), self.model.radius, pixels, generator
         )
         return score
 
     def _score_fast(
-        self, scene: PoseScene, poses: Tensor, sigma: Tensor, generator: Generator, pixels: int
+        self,
+        encoding: PoseEncoding,
+        poses: Tensor,
+        sigma: Tensor,
+        generator: Generator,
+        pixels: int,
     ) -> Tensor:
         """Score in bfloat16 where that is fast; its error is far below the noise of few pixels."""
         fast = fast_bfloat16(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=fast):
-            return self._score(scene, poses, sigma, generator, pixels).float()
+            return self._score(encoding, poses, sigma, generator, pixels).float()

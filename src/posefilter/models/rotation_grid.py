@@ -33,7 +33,7 @@ _CHUNK = 512  # crops that are encoded at once
 _NEIGHBORS = 6  # cells that the score between cells is made of
 
 
-class CropScene(NamedTuple):
+class CropEncoding(NamedTuple):
     """Images to crop; nothing of them is encoded as a whole."""
 
     rgb: Tensor  # (B, 3, H, W) in [0, 1]
@@ -41,7 +41,7 @@ class CropScene(NamedTuple):
     intrinsics: Tensor  # (B, 3, 3) [px]
 
 
-class TrainingScene(NamedTuple):
+class TrainingEncoding(NamedTuple):
     """Scored pairs of crops and rotations."""
 
     scores: Tensor  # (B, C, M)
@@ -143,29 +143,29 @@ class RotationGrid(PoseParticles):
 
     # -- the filter -------------------------------------------------------------------------------
 
-    def encode(self, batch: Batch) -> CropScene:
+    def encode(self, batch: Batch) -> CropEncoding:
         """Return the images."""
-        return CropScene(batch.rgb, batch.depth, batch.intrinsics)
+        return CropEncoding(batch.rgb, batch.depth, batch.intrinsics)
 
-    def encode_crops(self, scene: CropScene, centers: Tensor) -> Tensor:
+    def encode_crops(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the codes of the crops about points.  (B, N, 3) [m] -> (B, N, width)."""
         parts = [
-            self.net(self.crop(scene, part).flatten(0, 1)).unflatten(0, part.shape[:2])
+            self.net(self.crop(encoding, part).flatten(0, 1)).unflatten(0, part.shape[:2])
             for part in centers.split(max(1, _CHUNK // len(centers)), dim=1)
         ]
         return torch.cat(parts, dim=1)
 
-    def crop(self, scene: CropScene, centers: Tensor) -> Tensor:
+    def crop(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the crops about points.  (B, N, 3) [m] -> (B, N, 5, side, side)."""
-        return crop_views(*scene, centers, self.reach * self.model.radius, self.net.side)
+        return crop_views(*encoding, centers, self.reach * self.model.radius, self.net.side)
 
     def measure(
-        self, scene: CropScene, particles: Particles, step: Step, generator: Generator
+        self, encoding: CropEncoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Score each translation by its mean likelihood over the grid, and draw a rotation."""
         center = self.model.center.to(particles.state)
         places = origin_of(particles.state, center)
-        scores = self.net.scale * self.encode_crops(scene, places) @ self.codes.T
+        scores = self.net.scale * self.encode_crops(encoding, places) @ self.codes.T
         mean = scores.logsumexp(-1)
         share = (scores - mean[..., None]).exp().cumsum(-1)
         chance = torch.rand(*mean.shape, 1, generator=generator, device=mean.device)
@@ -176,7 +176,7 @@ class RotationGrid(PoseParticles):
         return ParticleOutput(mean - math.log(len(self.grid)), no_move, pose, particles.latent)
 
     def score_poses(
-        self, scene: CropScene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: CropEncoding, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         """Score any poses, between cells by the mean of the nearest ones.
 
@@ -185,7 +185,7 @@ class RotationGrid(PoseParticles):
         (B, N, 4, 4) camera_from_object [m] -> log-likelihoods (B, N).
         """
         places = origin_of(poses, self.model.center.to(poses))
-        codes = self.encode_crops(scene, places)
+        codes = self.encode_crops(encoding, places)
         seen = look_at(places).mT @ rotation_of(poses)
         index, share = self.find_cells(seen)
         near = self.codes[index]  # (B, N, k, width)
@@ -215,9 +215,9 @@ class RotationGrid(PoseParticles):
         codes = self.net(torch.cat([crops, self.views[cells.cpu()].to(crops)]))
         seen, known = codes.split([len(crops), len(cells)])
         scores = self.net.scale * (seen @ known.T).unflatten(0, centers.shape[:2])
-        scene = TrainingScene(scores, centers, self.grid[cells])
+        encoding = TrainingEncoding(scores, centers, self.grid[cells])
         none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {"loss": self.loss(Trace((), (), (), none, scene=scene), batch, self.model)}
+        return {"loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.model)}
 
     def draw_centers(self, batch: Batch, generator: Generator) -> Tensor:
         """Return points to crop about, (B, crops, 3) [m]: near the truth, from close to far, and

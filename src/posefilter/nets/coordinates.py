@@ -155,11 +155,11 @@ class CoordinateLoss:
     requires: ClassVar[Capabilities] = ("correspondences",)
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,); the trace's scene is `HasCoordinates`."""
-        scene: HasCoordinates = trace.scene
-        size = (model.center.to(batch.depth), model.radius, float(scene.reach))
+        """Return the loss of each image, (B,); the trace's encoding is `HasCoordinates`."""
+        encoding: HasCoordinates = trace.encoding
+        size = (model.center.to(batch.depth), model.radius, float(encoding.reach))
         pose = batch.camera_from_object
-        return coordinate_loss(scene.coordinates, scene.cells, batch.mask, pose, *size)[0]
+        return coordinate_loss(encoding.coordinates, encoding.cells, batch.mask, pose, *size)[0]
 
 
 class Context(NamedTuple):

@@ -5,7 +5,7 @@ from torch import Generator, Tensor
 
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Method, Scene
+from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 
@@ -27,7 +27,7 @@ class ModeMean:
         self,
         particles: Particles,
         output: ParticleOutput,
-        scene: Scene,
+        encoding: Encoding,
         method: Method,
         generator: Generator,
     ) -> BeliefBatch:

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.filters.refine import require_scorer
-from posefilter.protocols import Method, Scene
+from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
 _LONGEST = 1.5  # standard deviations of the perturbations, by which an iteration moves at most
@@ -50,7 +50,7 @@ class QuadraticFit:
 
     @torch.no_grad()
     def __call__(
-        self, belief: BeliefBatch, scene: Scene, method: Method, generator: Generator
+        self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate moved."""
         scorer, best, space = require_scorer(method), belief.best, method.space
@@ -59,10 +59,12 @@ class QuadraticFit:
             noise = draw_orthogonal(best, self.pairs, space.dimensions, generator)
             moves = torch.cat([noise, -noise], dim=1) * scale
             poses = space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
-            scores = scorer.score_poses(scene, poses, self.sigma, generator, self.pixels)
+            scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             up, down = scores.chunk(2, dim=1)
             best = space.move(best, find_maximum(noise, up, down, self.reach) * scale)
-        score = scorer.score_poses(scene, best[:, None], self.sigma, generator, self.pixels)[:, 0]
+        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)[
+            :, 0
+        ]
         return belief._replace(best=best, score=score)
 
 

@@ -6,7 +6,7 @@ from torch import Generator, Tensor
 from posefilter.filters.loop import inherit
 from posefilter.filters.resample import Multinomial
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Method, Scene
+from posefilter.protocols import Encoding, Method
 from posefilter.tracking.kld import bin_poses, count_needed
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.types import Batch, Particles
@@ -80,10 +80,10 @@ class FromBelief:
         self.poses, self.proposals = poses, proposals
 
     def __call__(
-        self, batch: Batch, scene: Scene, method: Method, particles: int, generator: Generator
+        self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (1, N + proposals, 4, 4) [m]."""
         if not self.proposals:
             return self.poses
-        proposed = method.propose_poses(scene, self.proposals, generator)  # type: ignore[attr-defined]
+        proposed = method.propose_poses(encoding, self.proposals, generator)  # type: ignore[attr-defined]
         return torch.cat([self.poses, proposed], dim=1)

@@ -9,7 +9,7 @@ from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.nets.layers import fast_bfloat16
-from posefilter.protocols import Scene
+from posefilter.protocols import Encoding
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step
 
 _NEEDED = ("pose_space", "score_poses", "propose_poses", "objectness")
@@ -29,7 +29,7 @@ def check_method(method: PoseEstimator) -> None:
 class SupportsQuasiMonteCarlo(Protocol):
     """An encoded frame that can have its poses scored by points that are drawn evenly."""
 
-    def with_quasi_monte_carlo(self) -> Scene:
+    def with_quasi_monte_carlo(self) -> Encoding:
         """Return the frame, so set."""
         ...
 
@@ -39,7 +39,7 @@ class FrameScorer:
 
     Args:
         method: Scores and proposes poses.
-        scene: The frame, as the method has encoded it.
+        encoding: The frame, as the method has encoded it.
         points: Image points that a pose is scored from.
         jumps: Number of particles, the last ones at the first step, that no motion led to.
         against: Log odds against such a jump, taken off their scores at the first step [nat].
@@ -50,15 +50,17 @@ class FrameScorer:
     def __init__(
         self,
         method: PoseEstimator,
-        scene: Scene,
+        encoding: Encoding,
         points: int,
         jumps: int = 0,
         against: float = 0.0,
     ) -> None:
         self.method, self.points = method, points
         # few points tell more of a pose where they are spread evenly
-        self.scene = (
-            scene.with_quasi_monte_carlo() if isinstance(scene, SupportsQuasiMonteCarlo) else scene
+        self.encoding = (
+            encoding.with_quasi_monte_carlo()
+            if isinstance(encoding, SupportsQuasiMonteCarlo)
+            else encoding
         )
         self.jumps, self.against = jumps, against
 
@@ -74,31 +76,31 @@ class FrameScorer:
         """The object."""
         return self.method.model
 
-    def encode(self, batch: Batch) -> Scene:
+    def encode(self, batch: Batch) -> Encoding:
         """Return the frame, which is encoded already."""
-        return self.scene
+        return self.encoding
 
     def measure(
-        self, scene: Scene, particles: Particles, step: Step, generator: Generator
+        self, encoding: Encoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
         state = particles.state
-        score = self.score_poses(scene, state, float(step.sigma), generator, self.points)
+        score = self.score_poses(encoding, state, float(step.sigma), generator, self.points)
         if step.number == 0 and self.jumps:
             score[:, -self.jumps :] -= self.against
         no_move = state.new_zeros(*state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, state, particles.latent)
 
     def score_poses(
-        self, scene: Scene, poses: Tensor, sigma: float, generator: Generator, pixels: int
+        self, encoding: Encoding, poses: Tensor, sigma: float, generator: Generator, pixels: int
     ) -> Tensor:
         """Score any poses at a noise level; see `ScoresPoses`."""
         device = self.method.device
         with torch.autocast(device.type, torch.bfloat16, enabled=fast_bfloat16(device)):
-            score: Tensor = self.method.score_poses(scene, poses, sigma, generator, pixels)  # type: ignore[operator]
+            score: Tensor = self.method.score_poses(encoding, poses, sigma, generator, pixels)  # type: ignore[operator]
         return score.float()
 
-    def propose_poses(self, scene: Scene, particles: int, generator: Generator) -> Tensor:
+    def propose_poses(self, encoding: Encoding, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the method's proposals; see `ProposesPoses`."""
-        poses: Tensor = self.method.propose_poses(scene, particles, generator)  # type: ignore[operator]
+        poses: Tensor = self.method.propose_poses(encoding, particles, generator)  # type: ignore[operator]
         return poses

@@ -233,28 +233,28 @@ class Track:
             against = max(0.0, against - 6 * math.log(scale))
         elif window is not None:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
-        scene, start = self.method.encode(batch), predicted.belief.state
-        return self._filter(batch, scene, start, follow, settings.quadratic_fits, against)
+        encoding, start = self.method.encode(batch), predicted.belief.state
+        return self._filter(batch, encoding, start, follow, settings.quadratic_fits, against)
 
     def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
         """Probe the whole image for a lost object, and search where that is worth it."""
         batch = self._take(frame.see_whole(self.size))
         if frame.blank or not bool(batch.depth.any()):
             return FrameEstimate(batch, None, 0.0, 0.0, None)
-        settings, scene = self.settings, self.method.encode(batch)
-        probed = self._filter(batch, scene, predicted.belief.state, settings.probe, 0)
+        settings, encoding = self.settings, self.method.encode(batch)
+        probed = self._filter(batch, encoding, predicted.belief.state, settings.probe, 0)
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
         begun, search = begin(probed.belief).belief, settings.search
         drawn = Multinomial()(begun, search.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
-        return self._filter(batch, scene, start, search, settings.quadratic_fits)
+        return self._filter(batch, encoding, start, search, settings.quadratic_fits)
 
     def _filter(
         self,
         batch: Batch,
-        scene: Any,
+        encoding: Any,
         start: Tensor,
         filter_settings: FilterSettings,
         quadratic_fits: int,
@@ -274,7 +274,7 @@ class Track:
             refine=self._refine(quadratic_fits),
         )
         pixels, proposals = filter_settings.pixels, filter_settings.proposals
-        scorer = FrameScorer(self.method, scene, pixels, proposals, against)
+        scorer = FrameScorer(self.method, encoding, pixels, proposals, against)
         return self._weigh(batch, filter(batch, scorer, self.generator))
 
     def _refine(self, quadratic_fits: int) -> Refine:
@@ -361,7 +361,7 @@ class Track:
     def _weigh(self, batch: Batch, trace: Trace) -> FrameEstimate:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
         belief, points = trace.belief, self.method.model.points
-        objectness = measure_objectness(trace.scene.objectness, batch, belief.best[0], points)
+        objectness = measure_objectness(trace.encoding.objectness, batch, belief.best[0], points)
         presence, found = measure_presence(self.method, trace, batch, objectness)
         return FrameEstimate(batch, belief, objectness, presence, found)
 
