@@ -18,8 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from photograph_runs import TARGETS
-from photographs import link_meshes
+import photographs
 
 HOME = Path(__file__).parents[1]
 FIRST_SEED = 301  # trainings and tests have seeds below
@@ -27,12 +26,8 @@ FIRST_SEED = 301  # trainings and tests have seeds below
 
 def render_commands(root: Path, each: int) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object."""
-    common = [f"frames={each}", "frames_per_scene=2", "size=[320,240]", "distractors=[4,10]"]
-    common += [f"meshes={root / 'meshes'}", "progress=false", "lookalike_texture=other"]
-    return [
-        ["generate.py", f"out={root / 'data' / name}", f"object={name}", f"seed={seed}", *common]
-        for seed, name in enumerate(TARGETS, start=FIRST_SEED)
-    ]
+    sets = photographs.render_commands(root, each, "data", FIRST_SEED, "other")
+    return [[*words, "progress=false"] for words in sets]
 
 
 def calibrate_command(file: Path, root: Path, frames: int) -> list[str]:
@@ -66,7 +61,7 @@ def main() -> int:
         parser.error(f"{missing[0]}: there is no such file")
     root, worst = options.root.resolve(), 0
     if not options.list:
-        link_meshes(root, options.meshes)
+        photographs.link_meshes(root, options.meshes)
     for words in list_commands(files, root, options.frames, options.each):
         print(f"$ python {shlex.join(words)}", flush=True)
         if options.list:

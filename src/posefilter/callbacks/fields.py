@@ -226,11 +226,8 @@ def predict_proposals(
         encoding.cells, batch.mask, batch.camera_from_object, center, model.radius
     )
     true, on = truth[0], usable[0]
-    off = (encoding.coordinates.coordinate[0] - true).norm(dim=-1)[on]
+    chance, coordinate = encoding.coordinates.logit[0].sigmoid(), encoding.coordinates.coordinate[0]
+    off = (coordinate - true).norm(dim=-1)[on]
     error = model.radius * float(off.mean()) if len(off) else math.nan
-    chance, coordinate = (
-        torch.sigmoid(encoding.coordinates.logit[0]),
-        encoding.coordinates.coordinate[0],
-    )
     arrays = [x.detach().cpu().numpy() for x in (chance, coordinate, true, on)]
     return Proposals(arrays[0], arrays[1], arrays[2], arrays[3], axes, error)

@@ -156,10 +156,8 @@ class MeanShift:
             )
             scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             best = method.space.move(best, (scores.softmax(1)[..., None] * moves).sum(1))
-        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)[
-            :, 0
-        ]
-        return belief._replace(best=best, score=score)
+        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)
+        return belief._replace(best=best, score=score[:, 0])
 
 
 class Gradient:

@@ -291,7 +291,7 @@ class _EncodedMethod:
         self.surface_points, self.model = method.surface_points, method.model
 
     def encode(self, batch: Batch) -> ImageEncoding:
-        """Return the encoding that was encoded before."""
+        """Return what was encoded before."""
         return self.encoding
 
 

@@ -36,8 +36,14 @@ VERSION = 4  # of the scenes that a seed gives: raise it when they change
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
 # settings as they are typed, by how a dataset records them
-_TYPED = {"width": "size", "height": "size", "K": "camera", "moves": "moving"}
-_TYPED |= {"translation_mm": "moving_mm", "rotation_deg": "moving_deg"}
+_TYPED = {
+    "width": "size",
+    "height": "size",
+    "K": "camera",
+    "moves": "moving",
+    "translation_mm": "moving_mm",
+    "rotation_deg": "moving_deg",
+}
 
 
 @dataclass(frozen=True)

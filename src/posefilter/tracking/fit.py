@@ -62,10 +62,8 @@ class QuadraticFit:
             scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             up, down = scores.chunk(2, dim=1)
             best = space.move(best, find_maximum(noise, up, down, self.reach) * scale)
-        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)[
-            :, 0
-        ]
-        return belief._replace(best=best, score=score)
+        score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)
+        return belief._replace(best=best, score=score[:, 0])
 
 
 def draw_orthogonal(like: Tensor, pairs: int, dimensions: int, generator: Generator) -> Tensor:
