@@ -5,6 +5,7 @@ that pixel is: so a bright red square that is not green is a doubtful answer.
 """
 
 from dataclasses import replace
+from inspect import getattr_static
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Calibration, Logistic
-from posefilter.confidence.second_look import look_again, measure_worth
+from posefilter.confidence.second_look import look_again, measure_worth, with_encoding
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Particles, Trace
@@ -183,3 +184,12 @@ def test_where_the_network_sees_nothing_there_is_nothing_to_find() -> None:
 def test_an_answer_that_is_hardly_better_does_not_replace_the_first() -> None:
     _, last = run(Toy(), draw([[(5, 5, 1.0, 0.2), (40, 30, 0.8, 0.23)]]))
     assert places(last) == [(5, 5)]
+
+
+def test_a_method_whose_images_are_encoded_is_of_its_class() -> None:
+    toy = Toy()
+    known, batch = with_encoding(toy, "kept"), draw([[(9, 9, 1.0, 1.0)]])
+    assert known.encode(batch) == "kept"
+    assert toy.encode(batch) is batch.rgb
+    # protocols are checked so from Python 3.12 on
+    assert getattr_static(known, "collect_features") is Toy.collect_features

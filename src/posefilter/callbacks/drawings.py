@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from posefilter.callbacks.fields import (
-    HasPointLikelihood,
+    ScoresPoints,
     choose_levels,
     choose_pixels,
     evaluate_point_field,
@@ -135,12 +135,13 @@ def points(o: Occasion) -> Drawn:
     """Draw slices of the likelihood of single points through the object's frame (the paper, figure
     5).
     """
-    if not isinstance(o.method, HasPointLikelihood):
+    likelihood = getattr(o.method, "likelihood", None)
+    if not isinstance(likelihood, ScoresPoints):
         return None
     model, truth = o.method.model, o.batch.camera_from_object[0]
     slices = [
         evaluate_point_field(
-            o.method.likelihood,
+            likelihood,
             o.encoding.image,
             truth,
             model,

@@ -36,19 +36,13 @@ from posefilter.types import Batch, ObjectModel, Step
 _FINE = (2.0, 4.0, 8.0)  # [degrees] beside every fifteenth degree: sharp peaks are narrow
 
 
+@runtime_checkable
 class ScoresPoints(Protocol):
     """A likelihood that scores single image points."""
 
     def score_points(self, points: Points, sigma: float, center: Tensor, radius: float) -> Tensor:
         """Score points at a noise level [m].  Points (B, N, P) -> (B, N, P)."""
         ...
-
-
-@runtime_checkable
-class HasPointLikelihood(Protocol):
-    """A method whose likelihood judges the points of images that it keeps as `encoding.image`."""
-
-    likelihood: ScoresPoints
 
 
 def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:

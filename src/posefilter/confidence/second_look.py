@@ -8,6 +8,7 @@ answer: agreement of the particles, measured depth, print, and the network of ob
 """
 
 import math
+from copy import copy
 from typing import Any, Protocol
 
 import torch
@@ -47,18 +48,15 @@ class Searcher(Protocol):
         ...
 
 
-class Encoded:
-    """A method whose images are encoded already."""
+def with_encoding(method: Any, encoding: Any) -> Any:
+    """Return a method whose images are encoded already.
 
-    def __init__(self, method: Any, encoding: Any) -> None:
-        self._method, self._encoding = method, encoding
-
-    def encode(self, batch: Batch) -> Any:
-        """Return the encoding."""
-        return self._encoding
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._method, name)
+    It is a copy, whose class has all that protocols ask for: from Python 3.12 on `isinstance` does
+    not see what `__getattr__` would find.
+    """
+    out = copy(method)
+    out.encode = lambda batch: encoding
+    return out
 
 
 def measure_worth(encoding: Any) -> float:
@@ -120,7 +118,7 @@ def _search(
         encoding = whole if part is image else method.encode(part)
         if measure_worth(encoding) < _WORTH:
             continue
-        found = method.filter(part, Encoded(method, encoding), generator)
+        found = method.filter(part, with_encoding(method, encoding), generator)
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(encoding=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])

@@ -10,7 +10,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
-from posefilter.confidence.second_look import Encoded, measure_worth
+from posefilter.confidence.second_look import measure_worth, with_encoding
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
@@ -165,7 +165,7 @@ def _search(
     image, encoding = _encode(job, hidden)
     one = None
     if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
-        trace = job.filter(image, Encoded(job.method, encoding), job.generator)
+        trace = job.filter(image, with_encoding(job.method, encoding), job.generator)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         seen = find_visible(trace.belief.best, job.method.model, depth, K)[0] & ~hidden
         assessment = _assess(job.method, trace.belief, image, encoding)
