@@ -1,7 +1,8 @@
 """A second look replaces a doubtful answer by a better one, and nothing else.
 
 A toy class is a color. Its filter finds the brightest pixel of a channel, its rank is how green
-that pixel is: so a bright red square that is not green is a doubtful answer.
+that pixel is: so a bright red square that is not green is a doubtful answer. A blue one appears too
+large.
 """
 
 from dataclasses import replace
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.confidence.second_look import look_again, measure_worth, with_encoding
 from posefilter.geometry.camera import back_project
@@ -45,9 +47,16 @@ class Toy:
         return batch.rgb
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+        return {"green": self._read(trace, batch, 1)}
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+        scale = 1 + self._read(trace, batch, 2)
+        return ApparentSize(scale, torch.full_like(scale, 99), torch.ones_like(scale))
+
+    def _read(self, trace: Trace, batch: Batch, channel: int) -> Tensor:
         at = trace.belief.poses[:, 0, :2, 3].long()
         rows = zip(batch.rgb, at, strict=True)
-        return {"green": torch.stack([rgb[1, int(v), int(u)] for rgb, (u, v) in rows])}
+        return torch.stack([rgb[channel, int(v), int(u)] for rgb, (u, v) in rows])
 
 
 class ToyFilter:
@@ -76,14 +85,16 @@ class ToyFilter:
         return Trace((particles,), (), (), belief, zeros, None)
 
 
-def draw(images: list[list[tuple[int, int, float, float]]], wall: float = 2.0) -> Batch:
-    """Return images of squares (u, v, red, green) at 1 m, before a wall."""
+def draw(images: list[list[tuple[int | float, ...]]], wall: float = 2.0) -> Batch:
+    """Return images of squares (u, v, red, green, blue if any) at 1 m, before a wall."""
     n = len(images)
     rgb, depth = torch.zeros(n, 3, H, W), torch.full((n, 1, H, W), wall)
     for i, squares in enumerate(images):
-        for u, v, red, green in squares:
-            at = (slice(v, v + SIDE), slice(u, u + SIDE))
-            rgb[i, 0][at], rgb[i, 1][at], depth[i, 0][at] = red, green, 1.0
+        for u, v, *color in squares:
+            at = (slice(int(v), int(v) + SIDE), slice(int(u), int(u) + SIDE))
+            for channel, value in enumerate(color):
+                rgb[i, channel][at] = value
+            depth[i, 0][at] = 1.0
     index = torch.zeros(n, dtype=torch.int64)
     nan = torch.full((n,), torch.nan)
     eye, many = torch.eye(4).repeat(n, 1, 1), K.repeat(n, 1, 1)
@@ -184,6 +195,29 @@ def test_where_the_network_sees_nothing_there_is_nothing_to_find() -> None:
 def test_an_answer_that_is_hardly_better_does_not_replace_the_first() -> None:
     _, last = run(Toy(), draw([[(5, 5, 1.0, 0.2), (40, 30, 0.8, 0.23)]]))
     assert places(last) == [(5, 5)]
+
+
+def test_an_answer_of_another_size_is_doubtful_however_sure() -> None:
+    """The next best takes its place, though its rank be lower, if it is more often right."""
+    larger = (5, 5, 1.0, 1.0, 0.5)
+    first, last = run(Toy(), draw([[larger, (40, 30, 0.8, 0.7)]]))
+    assert places(first) == [(5, 5)]
+    assert places(last) == [(40, 30)]
+    _, last = run(Toy(), draw([[larger, (40, 30, 0.8, -0.1)]]))  # itself doubtful
+    assert places(last) == [(5, 5)]
+
+
+def test_an_answer_of_another_size_replaces_none() -> None:
+    """Where depth or intrinsics are wrong all appear so, and the first answer stays."""
+    larger = (40, 30, 0.8, 1.0, 0.5)
+    toy = Toy()
+    _, last = run(toy, draw([[(5, 5, 1.0, 1.0, 0.5), larger]]))
+    assert places(last) == [(5, 5)]
+    _, last = run(Toy(), draw([[WRONG, larger]]))
+    assert places(last) == [(5, 5)]
+    # a size that the network's own errors reach is none
+    _, last = run(Toy(), draw([[WRONG, (40, 30, 0.8, 1.0, 0.1)]]))
+    assert places(last) == [(40, 30)]
 
 
 def test_a_method_whose_images_are_encoded_is_of_its_class() -> None:

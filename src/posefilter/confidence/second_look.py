@@ -5,6 +5,9 @@ and its likelihood prefers it. Two other searches may find the right one: of the
 the first answer took for the object, and by other random draws. Which answer is right is then not
 asked of the likelihood, which has erred, but of a logistic regression on all that speaks for an
 answer: agreement of the particles, measured depth, print, and the network of object coordinates.
+
+An answer is doubtful, too, where the object appears larger or smaller there than it is: the same
+print in another size, as of a package of the same brand. No answer of that kind replaces another.
 """
 
 import math
@@ -14,6 +17,7 @@ from typing import Any, Protocol
 import torch
 from torch import Generator, Tensor
 
+from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
@@ -45,6 +49,10 @@ class Searcher(Protocol):
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name."""
+        ...
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+        """Return how large the object appears; None where the method cannot tell."""
         ...
 
 
@@ -85,13 +93,31 @@ def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generato
     if calibration is None or calibration.choice is None or searches < 2:
         return first
     ranks = calibration.rank(method.collect_features(first, batch))
+    contradicted = _contradicts(method, first, batch).to(ranks.device)
     trace = first
-    for row in (ranks < DOUBTFUL).nonzero()[:, 0].tolist():
+    for row in ((ranks < DOUBTFUL) | contradicted).nonzero()[:, 0].tolist():
         own = Batch(*(x[row : row + 1] for x in batch))
-        found = _search(method, calibration, trace, row, float(ranks[row]), own, generator)
+        least = _improve(float(ranks[row]))
+        if contradicted[row]:
+            least = min(least, DOUBTFUL)
+        found = _search(method, calibration, trace, row, least, own, generator)
         if found is not None:
             trace = _put(trace, row, found)
     return trace
+
+
+def _contradicts(method: Searcher, trace: Trace, batch: Batch) -> Tensor:
+    """Return of which images the object appears in another size than it has, (B,) bool."""
+    size = method.measure_apparent_size(trace, batch)
+    if size is None:
+        return torch.zeros(len(batch.rgb), dtype=torch.bool, device=batch.rgb.device)
+    return size.contradicts()
+
+
+def _improve(rank: float) -> float:
+    """Return the rank that another answer must exceed."""
+    odds = rank / max(1 - rank, 1e-9) * math.exp(MARGIN)
+    return odds / (1 + odds)
 
 
 def _search(
@@ -99,16 +125,14 @@ def _search(
     calibration: Calibration,
     first: Trace,
     row: int,
-    rank: float,
+    least: float,
     image: Batch,
     generator: Generator,
 ) -> Trace | None:
-    """Return the best of the other searches of one image, None where the first is better."""
+    """Return the best of the other searches of one image; None where no rank is above `least`."""
     model, pose = method.model, first.belief.best[row : row + 1]
     hidden = find_visible(pose, model, image.depth[0, 0], image.intrinsics[0])
     best: Trace | None = None
-    odds = rank / max(1 - rank, 1e-9) * math.exp(MARGIN)
-    least = odds / (1 + odds)  # rank that another answer must exceed
     # of a single image, its first search has encoded it
     known = first.encoding is not None and len(first.belief.best) == 1
     whole = first.encoding if known else method.encode(image)
@@ -122,10 +146,10 @@ def _search(
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(encoding=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])
-        if value > least:
+        if value > least and not _contradicts(method, found, image).any():
             least, best = value, found
-        if value >= max(DOUBTFUL, least):
-            break
+            if value >= DOUBTFUL:
+                break
     return best
 
 
