@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posefilter.meshes.mesh import LOOKALIKE
+from posefilter.meshes.mesh import LOOKALIKE, Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
 from posefilter.synthetic.copies import place_copies
-from posefilter.synthetic.lookalikes import make_lookalike
+from posefilter.synthetic.lookalikes import make_lookalike, make_same_color
 from posefilter.synthetic.placing import (
     Placed,
     Table,
@@ -47,6 +47,7 @@ class SceneSettings:
     lookalike_share: float = 0.25  # chance that a distractor is a look-alike
     lookalikes: int = 4  # different ones a scene set
     lookalike_texture: str = "other"  # than the target's; or own: some have the target's
+    same_color_share: float = 0.0  # of the look-alikes: another object's shape in its color
     classes: int = 14  # distractor classes a scene set
     distance: tuple[float, float] = (0.45, 1.4)  # [m] camera to target
     elevation_deg: tuple[float, float] = (10.0, 85.0)
@@ -123,10 +124,16 @@ def draw_scene_set(
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
     names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
-    own = settings.lookalike_texture == "own"
-    lookalikes = tuple(
-        make_solid(make_lookalike(goal.mesh, name, photos, rng, own)) for name in names
-    )
+    own, share = settings.lookalike_texture == "own", settings.same_color_share
+
+    def draw_lookalike(name: str) -> Mesh:
+        # without a share nothing is drawn for it, and scenes stay what they were
+        if share and distractors and rng.random() < share:
+            shape = distractors[int(rng.integers(len(distractors)))].mesh
+            return make_same_color(goal.mesh, shape, name, rng)
+        return make_lookalike(goal.mesh, name, photos, rng, own)
+
+    lookalikes = tuple(make_solid(draw_lookalike(name)) for name in names)
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
     tiles = (
         float(rng.uniform(0.2, 1.2)),
