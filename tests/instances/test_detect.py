@@ -63,6 +63,22 @@ class SimpleFilter:
         return SimpleNamespace(belief=belief)
 
 
+class Beside(SimpleFilter):
+    """Finds the same place, a pixel further to the right at each call, and less surely."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
+        method.encode(batch)
+        pixel = torch.tensor([[20.0 + self.calls, 20.0]]) + (SIDE - 1) / 2
+        self.calls += 1
+        center = back_project(pixel, torch.tensor([1.0]), K)[0] + torch.tensor([0, 0, 0.03])
+        pose = make_pose(torch.eye(3), center)[None]
+        score = torch.tensor([0.9 / self.calls])
+        return SimpleNamespace(belief=BeliefBatch(pose[:, None], torch.zeros(1, 1), pose, score))
+
+
 def draw(squares: Sequence[tuple[int, int, int, float]]) -> Batch:
     """Return an image of squares (u, v, channel, brightness) at 1 m, before a wall at 2 m."""
     rgb, depth = torch.zeros(1, 3, H, W), torch.full((1, 1, H, W), 2.0)
@@ -106,6 +122,20 @@ def test_no_more_are_found_than_asked_for_or_than_there_are() -> None:
     assert len(run([Toy(0)], [2], draw(THREE))) == 2
     assert len(run([Toy(0)], [9], draw(THREE))) == 3
     assert run([Toy(1)], [3], draw(THREE)) == []
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_what_is_left_of_a_found_object_is_no_other(calibrated: bool) -> None:
+    """An object longer than the model: the second answer, a pixel beside the first, has few pixels
+    of its own.
+    """
+    long = draw([(20, 20, 0, 0.95)])
+    long.rgb[0, 0, 20:26, 26:30], long.depth[0, 0, 20:26, 26:30] = 0.9, 1.0
+    toy = Toy(0, calibrated=calibrated)
+    toy.filter = Beside()  # type: ignore[assignment]
+    found = run([toy], [3], long)
+    assert corners(found) == [(20, 20)]
+    assert toy.encoded > 1
 
 
 def test_the_first_search_is_on_the_whole_image_and_ends_where_all_are_sure() -> None:

@@ -167,10 +167,12 @@ def _search(
     if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
         trace = job.filter(image, with_encoding(job.method, encoding), job.generator)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
-        seen = find_visible(trace.belief.best, job.method.model, depth, K)[0] & ~hidden
+        visible = find_visible(trace.belief.best, job.method.model, depth, K)[0]
         assessment = _assess(job.method, trace.belief, image, encoding)
-        one = Detection(job.number, trace.belief, assessment, resize_mask(seen, grid))
-        one = one if bool(seen.any()) and is_there(one, costs) else None
+        # with the pixels of others, so that an answer beside what is found, of the same object, is
+        # seen to have too few of its own
+        one = Detection(job.number, trace.belief, assessment, resize_mask(visible, grid))
+        one = one if bool((visible & ~hidden).any()) and is_there(one, costs) else None
     job.exhausted = one is None
     job.seconds += time.perf_counter() - start
     return one
