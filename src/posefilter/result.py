@@ -136,11 +136,7 @@ class Result:
             UserError: The checkpoint was not calibrated for sets.
         """
         if self.conformal is None:
-            why = self.calibration_note or (
-                "it was calibrated by an earlier version, without sets"
-                if self.mask is None
-                else "their guarantee is of one search of the whole image, not of instances"
-            )
+            why = self.calibration_note or self._why_no_sets
             raise UserError(f"{self.object}: has no conformal sets ({why})")
         check_probability("level", level)
         by_depth = self.conformal.by == "surface"
@@ -149,6 +145,12 @@ class Result:
         limit = self.conformal.find_limit(level, value)
         threshold = -self.belief.differential_entropy - limit
         return self.belief.highest_density_region(level, threshold)
+
+    @property
+    def _why_no_sets(self) -> str:
+        if self.mask is None:
+            return "it was calibrated by an earlier version, without sets"
+        return "their guarantee is of one search of the whole image, not of instances"
 
     def draw_overlay(self, rgb: Any, intrinsics: Any, shape: "Shape | None" = None) -> np.ndarray:
         """Draw the object's outline and axes on the image that it was found in: full where it is

@@ -9,6 +9,7 @@ from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
 from posefilter.confidence.calibration import Calibration, Logistic
+from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
@@ -134,6 +135,23 @@ def test_a_loss_is_noticed_where_the_network_takes_other_pixels_for_the_object()
     assert any(one.is_tracked for one in results[12:15])
     assert results[-1].presence > 0.9
     assert off(results[-1], pose) < 0.008
+
+
+def test_a_track_has_no_conformal_sets() -> None:
+    """Their guarantee is of the filter that was calibrated, and a track's is another."""
+    toy, estimator = make_toy()
+    sets = Conformal((), ((1.0,) * 30,), "probability")
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 0, "absent": 20}, "toy", {}, conformal=sets,
+    )  # fmt: skip
+    toy.truth = walk_pose(1)[0]
+    assert estimator.predict(RGB, DEPTH, K).conformal is sets
+    tracker = posefilter.Tracker(estimator)
+    for _ in range(2):
+        result = tracker.update(RGB, DEPTH, K)
+        with pytest.raises(UserError, match=r"no conformal sets .* not of a track"):
+            result.conformal_set(0.9)
 
 
 def test_in_doubt_the_network_sees_the_whole_image() -> None:

@@ -61,6 +61,10 @@ class TrackResult(Result):
         """Whether the pose is one to go by: the object is not lost."""
         return self.status != LOST
 
+    @property
+    def _why_no_sets(self) -> str:
+        return "their guarantee is of one search of the whole image, not of a track"
+
 
 class State(NamedTuple):
     """What is carried from one frame to the next."""
@@ -170,7 +174,8 @@ class Track:
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
         result = make_result(self._describe(sight, frame.blank), 0)
-        content = {**vars(result), "seconds": time.perf_counter() - start}
+        # the guarantee of conformal sets is of the filter that was calibrated, no track's
+        content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
         return TrackResult(**content, status=status, objectness=sight.objectness)
 
     # -- the steps of a frame ---------------------------------------------------------------------

@@ -55,7 +55,8 @@ def place_window(
     half = reach * model.radius * float(K[0, 0]) / z
     scale = min(scale, side / (2 * half))
     # a whole number of the network's cells, so that no pixel is padding
-    seen = max(2, -(-round(2 * half * scale) // _CELL)) * _CELL
+    cells = min(-(-round(2 * half * scale) // _CELL), side // _CELL)
+    seen = max(2, cells) * _CELL
     half = seen / scale / 2
     u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
     height, width = size
@@ -87,5 +88,6 @@ def _cut(low: float, high: float, size: int, scale: float) -> tuple[int, int]:
     """Return the first pixel, an even one so that halving averages the pixels that it averages in
     the whole photograph, and the number of seen pixels within the photograph.
     """
-    first = max(0, 2 * round(low / 2))
-    return first, int((min(size, high) - first) * scale + 1e-6)
+    even = 2 * round(low / 2)
+    first, last = max(0, even), min(size, even + high - low)
+    return first, int((last - first) * scale + 1e-6)
