@@ -185,3 +185,14 @@ def test_what_is_no_belief_is_refused_in_one_line(tmp_path: Path) -> None:
         Belief(good, np.ones(3), CENTER, RADIUS, DIAMETER)
     with pytest.raises(UserError, match=r"\(N, 4, 4\)"):
         Belief(good, np.ones(2) / 2, CENTER, RADIUS, DIAMETER)
+
+
+def test_a_particle_without_weight_is_no_mode() -> None:
+    """As a saved belief has it: weights below the smallest of single precision are 0."""
+    far = some_pose().clone()
+    far[0, 3] += 1
+    samples = np.concatenate([spread_about(some_pose(), known_covariance(), 50), far[None].numpy()])
+    belief = belief_of(samples, np.append(np.ones(50), 0.0))
+    assert sum(mode.mass for mode in belief.modes) == pytest.approx(1)
+    assert all(mode.mass > 0 for mode in belief.modes)
+    assert np.isfinite(belief.covariance).all()

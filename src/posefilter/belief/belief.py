@@ -121,6 +121,8 @@ class Belief:
         center, found = torch.from_numpy(self.center), self._found
         modes: list[Mode] = []
         for number, (pose, mass) in enumerate(zip(found.states, found.weights, strict=True)):
+            if mass == 0:  # particles without weight; so are all that follow
+                break
             own = found.member == number
             poses, share = samples[own], weights[own] / weights[own].sum()
             spread = covariance_about(self._mean(poses, share), poses, share, center)
