@@ -215,5 +215,8 @@ def test_turns_are_compared_where_their_print_fits_best(
     beside = int((angles - abs(degrees)).abs().argmin())
     assert beside not in first.tolist()
     monkeypatch.setattr(TextureTurns, "_turn_finely", lambda self, best, chosen, *_: best @ chosen)
-    best = turn(believe(pose @ turns[beside]), look("soup_can", pose), model).best[0]
-    assert torch.rad2deg(angle_between(best[:3, :3], pose[:3, :3])) < 2.6
+    out = turn(believe(pose @ turns[beside], 50), look("soup_can", pose), model)
+    assert torch.rad2deg(angle_between(out.best[0, :3, :3], pose[:3, :3])) < 2.6
+    # and particles are where the turns were compared, not at those of the first ten degrees
+    off = torch.rad2deg(angle_between(out.poses[0, :, :3, :3], pose[None, :3, :3]))
+    assert off.median() < 2.6

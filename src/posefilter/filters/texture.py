@@ -207,7 +207,9 @@ class TextureTurns:
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
         best = self._turn_finely(first, chosen, turns, encoding, model)
-        poses = _turn_particles(belief, turns[first_tried], log_posterior, model, generator)
+        poses = _turn_particles(
+            belief, turns[first_tried], turns[tried], log_posterior, model, generator
+        )
         return belief._replace(best=best, poses=poses)
 
     def _score(
@@ -317,6 +319,7 @@ def _angles(a: Tensor, b: Tensor) -> Tensor:
 def _turn_particles(
     belief: BeliefBatch,
     turns: Tensor,
+    to: Tensor,
     log_posterior: Tensor,
     model: ObjectModel,
     generator: Generator,
@@ -326,7 +329,8 @@ def _turn_particles(
     Args:
         belief: Its poses (B, N, 4, 4), and the estimates before they were turned.
         turns: (S, 4, 4).
-        log_posterior: (B, S) of the turns.
+        to: (B, S, 4, 4), the turn that stands for each: the one that was scored.
+        log_posterior: (B, S) of those.
         model: The object.
         generator: Draws the turns, systematically: their shares are those of the posterior.
     """
@@ -340,5 +344,5 @@ def _turn_particles(
     shift = torch.rand(B, 1, generator=generator, device=at.device)
     order = torch.rand(B, N, generator=generator, device=at.device).argsort(1)
     drawn = inverse_cdf(log_posterior.log_softmax(1), (order + shift) / N)
-    moved = poses @ back @ turns[drawn]
+    moved = poses @ back @ to[torch.arange(B, device=at.device)[:, None], drawn]
     return torch.where((nearest < _OWN * model.diameter)[..., None, None], moved, poses)
