@@ -4,7 +4,8 @@
 
 The gelatin box beside the pudding box, of the same brand and larger; the sugar box beside copies of
 itself, 1.35 and 0.75 times as large. DIR holds YCB's <class>/google_16k. The scenes are rendered
-once, with few kinds of clutter, so that another size is in about half of the images. Tested with one search and with all (`filter.max_searches`); one thread.
+once, with few kinds of clutter, so that another size is in about half of the images. Tested with
+one search and with all (`filter.max_searches`); one thread.
 """
 
 import argparse
