@@ -12,6 +12,7 @@ from posefilter.cli import onboarded_mesh
 from posefilter.cli.onboarded_mesh import find_and_draw, name_of, read_onboarded, write_meshes
 from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
+from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.write import write_obj
 
@@ -78,3 +79,23 @@ def test_a_mesh_too_small_for_a_hull_is_refused(tmp_path: Path) -> None:
     file.write_text("v 0 0 0\nv 1e-9 0 0\nv 0 1e-9 0\nf 1 2 3\n")
     with pytest.raises(UserError, match=r"has no convex hull; 1e-09 m across"):
         read_onboarded(settings(file))
+
+
+def test_builtin_clutter_like_the_object_is_left_out(tmp_path: Path) -> None:
+    """A brick by any name and a little smaller; of another color or size it stays."""
+    brick = catalog.build("brick")
+
+    def left_out(mesh: Mesh, **more: object) -> list[str]:
+        facts, like = write_meshes(mesh, settings("own", **more), tmp_path / "meshes")
+        assert facts.faces == len(mesh.faces)
+        assert not set(like) & set(MeshStore(tmp_path / "meshes").names())
+        return like
+
+    own = replace(brick, name="own", vertices=0.95 * brick.vertices)
+    assert left_out(own) == ["brick"]
+    blue = replace(own, texture=np.ascontiguousarray(own.texture[..., ::-1]))
+    assert left_out(blue) == []
+    assert left_out(replace(own, vertices=1.4 * own.vertices)) == []
+    # what is given stays: it stands beside the object
+    write_obj(brick, tmp_path / "given" / "brick")
+    assert left_out(own, clutter=tmp_path / "given") == []

@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors
+from posefilter.meshes.similarity import are_alike, are_shaped_alike
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.synthetic.generate import camera_matrix, generate
-from posefilter.synthetic.lookalikes import box, make_lookalike, make_same_color
+from posefilter.synthetic.lookalikes import box, make_lookalike, make_same_color, stretch
 from posefilter.synthetic.placing import View
 from posefilter.synthetic.scenes import (
     Layout,
@@ -187,7 +188,8 @@ def test_shapes_of_the_targets_color_have_its_color_and_another_objects_shape(
     plain = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        other = make_same_color(target, shape, "lookalike_00", rng)
+        other = make_same_color(target, [shape], "lookalike_00", rng)
+        assert other is not None
         assert other.faces is shape.faces
         assert other.name == "lookalike_00"
         ratio = (other.bounds[1] - other.bounds[0]) / (shape.bounds[1] - shape.bounds[0])
@@ -201,6 +203,16 @@ def test_shapes_of_the_targets_color_have_its_color_and_another_objects_shape(
             hue, hues = _direction(colors[:1]), _direction(known[known.max(1) > 0.2])
             assert (hues @ hue.T).max() > np.cos(np.deg2rad(12))
     assert 4 < plain < 16  # a half
+
+
+def test_no_shape_like_the_targets_has_its_color(library: SolidStore) -> None:
+    """It would be the target itself, labeled as something else."""
+    brick, rng = library.store.load("brick"), np.random.default_rng(0)
+    assert are_shaped_alike(brick, stretch(brick, "other", np.full(3, 1.1), brick.texture))
+    assert not are_shaped_alike(brick, stretch(brick, "other", np.full(3, 1.3), brick.texture))
+    for _ in range(20):
+        other = make_same_color(brick, [brick, library.store.load("soup_can")], "other", rng)
+        assert other is None or not are_shaped_alike(brick, other)
 
 
 def _direction(colors: np.ndarray) -> np.ndarray:
@@ -219,6 +231,20 @@ def test_a_share_of_the_lookalikes_are_other_shapes(library: SolidStore) -> None
 
     assert count(0.0) == 0
     assert 1 < count(0.5) < 9
+
+
+def test_no_lookalike_is_so_alike_that_an_image_cannot_tell(library: SolidStore) -> None:
+    """Printed boxes of a brick's color and size, as they were drawn before, are not drawn."""
+    brick, alike = library.store.load("brick"), []
+    for share in (0.0, 0.01):
+        settings = SceneSettings(classes=4, lookalikes=8, same_color_share=share)
+        scenes = [
+            draw_scene_set(library, "brick", settings, np.random.default_rng(seed))
+            for seed in range(8)
+        ]
+        alike.append(sum(are_alike(one.mesh, brick) for s in scenes for one in s.lookalikes))
+    assert alike[0] > 0
+    assert alike[1] == 0
 
 
 def _has_texture(mesh: Mesh, target: Mesh) -> bool:

@@ -223,8 +223,10 @@ def onboard(job: Job) -> None:
 
 def store_meshes(work: Onboarding) -> None:
     """Write the object and what stands beside it; say what may be wrong with the object."""
-    facts = write_meshes(work.mesh, work.cfg, work.out / "meshes")
+    facts, like = write_meshes(work.mesh, work.cfg, work.out / "meshes")
     concerns = list_concerns(facts)
+    if like:
+        concerns.append(f"left out of the clutter, since like the object: {', '.join(like)}")
     work.stages.keep(facts=facts._asdict(), concerns=concerns)
     size = " x ".join(f"{x:.0f}" for x in facts.size_mm)
     sentence = f"{work.mesh.name}: {size} mm, {facts.faces} triangles"

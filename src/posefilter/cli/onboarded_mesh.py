@@ -18,6 +18,7 @@ from posefilter.meshes.files import read_mesh
 from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
 from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.similarity import are_alike
 from posefilter.meshes.store import BUILTIN, MeshStore
 from posefilter.meshes.symmetries import read_symmetries
 from posefilter.meshes.turns import describe_symmetries, make_group, select
@@ -60,11 +61,14 @@ def name_of(path: Path) -> str:
     return re.sub(r"[^\w\-]+", "_", name).strip("_") or "object"
 
 
-def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> MeshFacts:
+def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> tuple[MeshFacts, list[str]]:
     """Write the object, and what stands beside it, into a folder of meshes in meters.
 
+    A builtin mesh that is like the object in size, shape and color is left out: the network would
+    learn to reject the object. What a user gives as clutter stays.
+
     Returns:
-        What is known of the object's mesh.
+        What is known of the object's mesh, and the names of the builtin ones that are left out.
     """
     if folder.is_dir():
         shutil.rmtree(folder)
@@ -73,10 +77,12 @@ def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> MeshFacts:
     scale = 1.0 if cfg.mesh_scale is None or clutter == BUILTIN else float(cfg.mesh_scale)
     store = MeshStore(clutter, scale=scale)
     names = [name for name in store.names() if name != mesh.name]
+    like = [name for name in names if clutter == BUILTIN and are_alike(store.load(name), mesh)]
+    names = [name for name in names if name not in like]
     order = np.random.default_rng(cfg.seed).permutation(len(names))[:_MOST_CLUTTER]
     for index in sorted(order.tolist()):
         write_obj(store.load(names[index]), folder / names[index])
-    return inspect_mesh(mesh)
+    return inspect_mesh(mesh), like
 
 
 def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> str:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from posefilter.meshes.mesh import Mesh, creased_normals, sample_surface, surface_colors
+from posefilter.meshes.similarity import are_shaped_alike
 from posefilter.synthetic.textures import (
     find_dominant_color,
     label,
@@ -15,6 +16,8 @@ from posefilter.synthetic.textures import (
     recolor,
     to_uint8,
 )
+
+_TRIES = 5  # shapes that are drawn until one differs from the target's
 
 
 def make_lookalike(
@@ -50,7 +53,9 @@ def make_lookalike(
     return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])
 
 
-def make_same_color(target: Mesh, shape: Mesh, name: str, rng: np.random.Generator) -> Mesh:
+def make_same_color(
+    target: Mesh, shapes: Sequence[Mesh], name: str, rng: np.random.Generator
+) -> Mesh | None:
     """Draw another object's shape in a color of the target: plain, or as light and dark as that
     object's own texture.
 
@@ -59,10 +64,24 @@ def make_same_color(target: Mesh, shape: Mesh, name: str, rng: np.random.Generat
 
     Args:
         target: The target's mesh.
-        shape: The other object's mesh.
+        shapes: The other objects' meshes.
         name: Of the new mesh.
         rng: Source of randomness.
+
+    Returns:
+        The mesh; None where every one that was drawn is alike in shape to the target: of its color
+        it would be the target itself, labeled as something else.
     """
+    for _ in range(_TRIES):
+        shape = shapes[int(rng.integers(len(shapes)))]
+        other = _paint(target, shape, name, rng)
+        if not are_shaped_alike(other, target):
+            return other
+    return None
+
+
+def _paint(target: Mesh, shape: Mesh, name: str, rng: np.random.Generator) -> Mesh:
+    """Return another object's shape, stretched a little, in a color of the target."""
     # as bright as augmentation makes the target: brightness must not be what tells them apart
     color = _draw_color(target, rng) * rng.uniform(0.75, 2.2) * np.exp(rng.normal(0, 0.1, 3))
     gray = shape.texture.mean(-1, keepdims=True) / max(float(shape.texture.mean()), 1.0)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from posefilter.meshes.mesh import LOOKALIKE, Mesh
+from posefilter.meshes.similarity import are_alike
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
 from posefilter.synthetic.copies import place_copies
@@ -28,6 +29,7 @@ from posefilter.synthetic.settle import settle
 from posefilter.synthetic.solids import Solid, make_solid
 from posefilter.synthetic.textures import random_color, random_texture
 
+_TRIES = 5  # look-alikes that are drawn until an image can tell one from the target
 # [degrees] highest camera over a table where something has to stand in front
 _OCCLUDED_ELEVATION = 45.0
 # plain, checker, marble, wood, carpet, stripes, label
@@ -127,11 +129,15 @@ def draw_scene_set(
     own, share = settings.lookalike_texture == "own", settings.same_color_share
 
     def draw_lookalike(name: str) -> Mesh:
-        # without a share nothing is drawn for it, and scenes stay what they were
-        if share and distractors and rng.random() < share:
-            shape = distractors[int(rng.integers(len(distractors)))].mesh
-            return make_same_color(goal.mesh, shape, name, rng)
-        return make_lookalike(goal.mesh, name, photos, rng, own)
+        if not share:  # scenes stay what they were before there was one
+            return make_lookalike(goal.mesh, name, photos, rng, own)
+        other = None
+        if distractors and rng.random() < share:
+            other = make_same_color(goal.mesh, [one.mesh for one in distractors], name, rng)
+        tries = 0
+        while other is None or (are_alike(other, goal.mesh) and tries < _TRIES):
+            other, tries = make_lookalike(goal.mesh, name, photos, rng, own), tries + 1
+        return other
 
     lookalikes = tuple(make_solid(draw_lookalike(name)) for name in names)
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
