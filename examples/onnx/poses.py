@@ -153,7 +153,7 @@ class PoseFilter:
         apart = distance(poses[:, None], best @ some, self.center, self.radius)
         at, share = apart.argmin(1), (rng.permutation(len(poses)) + rng.random()) / len(poses)
         drawn = np.searchsorted(np.cumsum(softmax(total)), share).clip(0, len(some) - 1)
-        moved = poses @ np.linalg.inv(some)[at] @ some[drawn]
+        moved = poses @ np.linalg.inv(some)[at] @ turns[tried[drawn]]
         return found, np.where((apart.min(1) < 0.2 * size)[:, None, None], moved, poses)
 
 
