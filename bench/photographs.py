@@ -64,7 +64,6 @@ def render_commands(
         "size=[320,240]",
         "distractors=[4,10]",
         f"lookalike_texture={lookalike_texture}",
-        "same_color_share=0",
         f"meshes={root / 'meshes'}",
     ]
     return [

@@ -114,7 +114,6 @@ RANGES: dict[str, Range] = {
     "generate.distractors": _whole(0, 1000, many=True),
     "generate.tabletop_share": SHARE,
     "generate.absent_share": SHARE,
-    "generate.same_color_share": SHARE,
     "generate.instances": _whole(1, 100),
     "generate.frames_per_scene": COUNT,
     "generate.moving_mm": Range(0, 1000),

@@ -11,12 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from posefilter.errors import UserError
-from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors
-from posefilter.meshes.similarity import are_alike, are_shaped_alike
+from posefilter.meshes.mesh import Mesh
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.synthetic.generate import camera_matrix, generate
-from posefilter.synthetic.lookalikes import box, make_lookalike, make_same_color, stretch
+from posefilter.synthetic.lookalikes import box, make_lookalike
 from posefilter.synthetic.placing import View
 from posefilter.synthetic.scenes import (
     Layout,
@@ -179,74 +178,6 @@ def test_lookalikes_have_the_targets_texture_only_if_wanted(
     assert (alike > 8) if own_texture else (alike == 0)
 
 
-def test_shapes_of_the_targets_color_have_its_color_and_another_objects_shape(
-    library: SolidStore,
-) -> None:
-    """A carton of three colors: a surface in one of them, plain or shaded, in other proportions."""
-    target, shape = library.store.load("carton"), library.store.load("mug")
-    known = surface_colors(target, *sample_surface(target, 2000))
-    plain = 0
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        other = make_same_color(target, [shape], "lookalike_00", rng)
-        assert other is not None
-        assert other.faces is shape.faces
-        assert other.name == "lookalike_00"
-        ratio = (other.bounds[1] - other.bounds[0]) / (shape.bounds[1] - shape.bounds[0])
-        assert ratio.min() > 0.79
-        assert ratio.max() < 1.26
-        assert np.ptp(ratio) > 0.01
-        colors = surface_colors(other, *sample_surface(other, 200))
-        flat = np.ptp(colors, axis=0).max() < 0.01
-        plain += flat
-        if flat:
-            hue, hues = _direction(colors[:1]), _direction(known[known.max(1) > 0.2])
-            assert (hues @ hue.T).max() > np.cos(np.deg2rad(12))
-    assert 4 < plain < 16  # a half
-
-
-def test_no_shape_like_the_targets_has_its_color(library: SolidStore) -> None:
-    """It would be the target itself, labeled as something else."""
-    brick, rng = library.store.load("brick"), np.random.default_rng(0)
-    assert are_shaped_alike(brick, stretch(brick, "other", np.full(3, 1.1), brick.texture))
-    assert not are_shaped_alike(brick, stretch(brick, "other", np.full(3, 1.3), brick.texture))
-    for _ in range(20):
-        other = make_same_color(brick, [brick, library.store.load("soup_can")], "other", rng)
-        assert other is None or not are_shaped_alike(brick, other)
-
-
-def _direction(colors: np.ndarray) -> np.ndarray:
-    """Return colors (n, 3) without their brightness."""
-    return np.asarray(colors / np.linalg.norm(colors, axis=1, keepdims=True))
-
-
-def test_a_share_of_the_lookalikes_are_other_shapes(library: SolidStore) -> None:
-    target = library.store.load("carton")
-
-    def count(share: float) -> int:
-        settings = SceneSettings(classes=4, lookalikes=10, same_color_share=share)
-        scene = draw_scene_set(library, "carton", settings, np.random.default_rng(0))
-        own = {len(target.faces), 12}  # a carton and a box
-        return sum(len(one.mesh.faces) not in own for one in scene.lookalikes)
-
-    assert count(0.0) == 0
-    assert 1 < count(0.5) < 9
-
-
-def test_no_lookalike_is_so_alike_that_an_image_cannot_tell(library: SolidStore) -> None:
-    """Printed boxes of a brick's color and size, as they were drawn before, are not drawn."""
-    brick, alike = library.store.load("brick"), []
-    for share in (0.0, 0.01):
-        settings = SceneSettings(classes=4, lookalikes=8, same_color_share=share)
-        scenes = [
-            draw_scene_set(library, "brick", settings, np.random.default_rng(seed))
-            for seed in range(8)
-        ]
-        alike.append(sum(are_alike(one.mesh, brick) for s in scenes for one in s.lookalikes))
-    assert alike[0] > 0
-    assert alike[1] == 0
-
-
 def _has_texture(mesh: Mesh, target: Mesh) -> bool:
     """Return whether a mesh has the target's texture, be its channels swapped or inverted."""
     if mesh.texture.shape != target.texture.shape:
@@ -268,37 +199,18 @@ def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
         generate, tmp_path / "b", 1, object="carton", size=(96, 72), workers=1, progress=False
     )
     render()
-    with pytest.raises(UserError, match=r"other settings \(lookalike_texture, same_color_share\)"):
+    with pytest.raises(UserError, match=r"begun with other settings \(lookalike_texture\)"):
         render(lookalike_texture="own")
     with pytest.raises(UserError, match=r"other settings \(frames_per_scene, moving, moving_mm\)"):
         render(moving="camera", moving_mm=3.0)
     with pytest.raises(UserError, match=r"other settings \(size\)"):
         render(size=(160, 120))
-    # what was rendered before the choices existed had the target's texture, and no other shape of
-    # its color
+    # what was rendered before the choice existed had the target's texture
     record = tmp_path / "b" / "_generator.json"
     plain = json.loads(record.read_text())
-    for key in ("lookalike_texture", "same_color_share"):
-        del plain["settings"]["scenes"][key]
+    del plain["settings"]["scenes"]["lookalike_texture"]
     record.write_text(json.dumps(plain))
     assert render(lookalike_texture="own").rendered == 0
-
-
-def test_the_share_of_the_targets_color_follows_the_texture_unless_given(tmp_path: Path) -> None:
-    render = partial(generate, frames=1, object="carton", size=(96, 72), workers=1, progress=False)
-    for given, share in (
-        ({}, 0.4),
-        ({"lookalike_texture": "own"}, 0.0),
-        ({"same_color_share": 0.1, "lookalike_texture": "own"}, 0.1),
-    ):
-        out = tmp_path / str(share)
-        render(out, **given)
-        record = json.loads((out / "_generator.json").read_text())
-        assert record["settings"]["scenes"]["same_color_share"] == share
-    with pytest.raises(UserError, match=r"other settings \(same_color_share\)"):
-        render(tmp_path / "0.4", same_color_share=0.0)
-    with pytest.raises(UserError, match="same_color_share"):
-        render(tmp_path / "none", same_color_share=1.5)
 
 
 def test_the_second_camera_stands_to_the_right(scene: SceneSet) -> None:

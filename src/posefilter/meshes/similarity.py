@@ -18,19 +18,10 @@ def are_alike(one: Mesh, other: Mesh) -> bool:
     A network that learns to tell its object from such another one, as clutter in its training,
     learns to reject the object itself in images that show too little of it.
     """
-    if not are_shaped_alike(one, other):
+    sides, others = (np.log(np.sort(m.bounds[1] - m.bounds[0]) + 1e-9) for m in (one, other))
+    if np.abs(sides - others).max() > _SIDES or abs(_fill(one) - _fill(other)) > _FILL:
         return False
     return float(np.linalg.norm(_mean_color(one) - _mean_color(other))) <= _COLOR
-
-
-def are_shaped_alike(one: Mesh, other: Mesh) -> bool:
-    """Tell whether two objects are alike in shape and size: the sides of their bounding boxes, in
-    order of length, and how much of the box the convex hull fills.
-    """
-    sides, others = (np.log(np.sort(m.bounds[1] - m.bounds[0]) + 1e-9) for m in (one, other))
-    if np.abs(sides - others).max() > _SIDES:
-        return False
-    return abs(_fill(one) - _fill(other)) <= _FILL
 
 
 def _fill(mesh: Mesh) -> float:

@@ -32,7 +32,6 @@ from posefilter.synthetic.workers import render_frames
 log = logging.getLogger(__name__)
 
 GENERATOR = "_generator.json"
-_SAME_COLOR = 0.4  # share of look-alikes
 VERSION = 4  # of the scenes that a seed gives: raise it when they change
 _YCB_VIDEO = (1066.778, 1067.487, 312.9869, 241.3109, 640, 480)
 _FAT = (768.16058349609375, 768.16058349609375, 480.0, 270.0, 960, 540)
@@ -90,7 +89,6 @@ def generate(
     moving_deg: float = 1.0,
     covered_frames: int = 0,
     lookalike_texture: str = "other",
-    same_color_share: float | None = None,
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or resume one that was begun.
 
@@ -128,9 +126,6 @@ def generate(
         covered_frames: Frames in a row of each scene in which something hides the object wholly.
         lookalike_texture: "other": distractors of the object's shape have another texture than it;
             "own": some have its own, stretched or recolored.
-        same_color_share: The share of the look-alikes that are another object's shape in a color
-            of the object, which an object of one color has to be distinguished from.  None: 0.4;
-            0 with the object's own texture, as such scenes were rendered before.
 
     Returns:
         What was done.
@@ -148,7 +143,6 @@ def generate(
         absent_share=float(absent_share),
         instances=int(instances),
         lookalike_texture=str(lookalike_texture),
-        same_color_share=_same_color_share(same_color_share, str(lookalike_texture)),
     )
     width, height = (int(n) for n in size)
     K = camera_matrix(camera, width, height)
@@ -186,13 +180,6 @@ def generate(
             release(out)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
-
-
-def _same_color_share(typed: float | None, lookalike_texture: str) -> float:
-    """Return the share of look-alikes of the object's color: as typed, or what suits the others."""
-    if typed is not None:
-        return float(typed)
-    return 0.0 if lookalike_texture == "own" else _SAME_COLOR
 
 
 def _frames_per_scene(typed: int | None, moving: str) -> int:
@@ -251,7 +238,6 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "occluded_share": job.scenes.occluded_share,
         "tabletop_share": job.scenes.tabletop_share,
         "absent_share": job.scenes.absent_share,
-        "same_color_share": job.scenes.same_color_share,
         "instances": job.scenes.instances,
         "mesh_scale": job.mesh_scale,
         "moving_mm": job.motion.translation_mm,
@@ -360,7 +346,6 @@ def _as_typed(names: list[str]) -> list[str]:
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Return recorded settings with defaults of later ones, and the renderer's current name."""
     defaults = {"absent_share": 0.0, "instances": 1, "lookalike_texture": "own"}
-    defaults |= {"same_color_share": 0.0}
     scenes = {**defaults, **settings.get("scenes", {})}
     out = {"mesh_scale": 1.0, "motion": asdict(MotionSettings()), **settings, "scenes": scenes}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out

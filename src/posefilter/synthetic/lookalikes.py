@@ -1,5 +1,5 @@
-"""Distractors that look like the target: its shape with another texture, boxes and other shapes of
-its color, and if wanted its texture on another shape.
+"""Distractors that look like the target: its shape with another texture, boxes of its color, and
+if wanted its texture on another shape.
 """
 
 from collections.abc import Sequence
@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from posefilter.meshes.mesh import Mesh, creased_normals, sample_surface, surface_colors
-from posefilter.meshes.similarity import are_shaped_alike
+from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.synthetic.textures import (
     find_dominant_color,
     label,
@@ -16,8 +15,6 @@ from posefilter.synthetic.textures import (
     recolor,
     to_uint8,
 )
-
-_TRIES = 5  # shapes that are drawn until one differs from the target's
 
 
 def make_lookalike(
@@ -51,53 +48,6 @@ def make_lookalike(
     sides = (target.bounds[1] - target.bounds[0]) * rng.uniform(0.45, 1.25, 3)
     base = find_dominant_color(target.texture) if kind < 0.85 else None
     return box(name, np.maximum(sides, 0.02), [to_uint8(label(rng, 96, base)) for _ in range(6)])
-
-
-def make_same_color(
-    target: Mesh, shapes: Sequence[Mesh], name: str, rng: np.random.Generator
-) -> Mesh | None:
-    """Draw another object's shape in a color of the target: plain, or as light and dark as that
-    object's own texture.
-
-    An object of one color differs from others of that color by its shape alone. A network learns
-    that only where it sees others of that color.
-
-    Args:
-        target: The target's mesh.
-        shapes: The other objects' meshes.
-        name: Of the new mesh.
-        rng: Source of randomness.
-
-    Returns:
-        The mesh; None where every one that was drawn is alike in shape to the target: of its color
-        it would be the target itself, labeled as something else.
-    """
-    for _ in range(_TRIES):
-        shape = shapes[int(rng.integers(len(shapes)))]
-        other = _paint(target, shape, name, rng)
-        if not are_shaped_alike(other, target):
-            return other
-    return None
-
-
-def _paint(target: Mesh, shape: Mesh, name: str, rng: np.random.Generator) -> Mesh:
-    """Return another object's shape, stretched a little, in a color of the target."""
-    # as bright as augmentation makes the target: brightness must not be what tells them apart
-    color = _draw_color(target, rng) * rng.uniform(0.75, 2.2) * np.exp(rng.normal(0, 0.1, 3))
-    gray = shape.texture.mean(-1, keepdims=True) / max(float(shape.texture.mean()), 1.0)
-    texture = to_uint8(color * (gray if rng.random() < 0.5 else np.ones((1, 1, 1))))
-    other = stretch(shape, name, rng.uniform(0.8, 1.25, 3), texture)
-    return replace(other, corner_colors=None, parts={})
-
-
-def _draw_color(mesh: Mesh, rng: np.random.Generator) -> np.ndarray:
-    """Draw a color (3,) of a surface, each as often as its share: the mean of a random point's
-    color and of those near it.
-    """
-    colors = surface_colors(mesh, *sample_surface(mesh, 500))
-    one = colors[int(rng.integers(len(colors)))]
-    near: np.ndarray = colors[np.linalg.norm(colors - one, axis=1) < 0.15]
-    return near.mean(0)
 
 
 def stretch(mesh: Mesh, name: str, factors: np.ndarray, texture: np.ndarray) -> Mesh:

@@ -9,12 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posefilter.meshes.mesh import LOOKALIKE, Mesh
-from posefilter.meshes.similarity import are_alike
+from posefilter.meshes.mesh import LOOKALIKE
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.surfaces import Instance, Lights, Plane
 from posefilter.synthetic.copies import place_copies
-from posefilter.synthetic.lookalikes import make_lookalike, make_same_color
+from posefilter.synthetic.lookalikes import make_lookalike
 from posefilter.synthetic.placing import (
     Placed,
     Table,
@@ -29,7 +28,6 @@ from posefilter.synthetic.settle import settle
 from posefilter.synthetic.solids import Solid, make_solid
 from posefilter.synthetic.textures import random_color, random_texture
 
-_TRIES = 5  # look-alikes that are drawn until an image can tell one from the target
 # [degrees] highest camera over a table where something has to stand in front
 _OCCLUDED_ELEVATION = 45.0
 # plain, checker, marble, wood, carpet, stripes, label
@@ -49,7 +47,6 @@ class SceneSettings:
     lookalike_share: float = 0.25  # chance that a distractor is a look-alike
     lookalikes: int = 4  # different ones a scene set
     lookalike_texture: str = "other"  # than the target's; or own: some have the target's
-    same_color_share: float = 0.0  # of the look-alikes: another object's shape in its color
     classes: int = 14  # distractor classes a scene set
     distance: tuple[float, float] = (0.45, 1.4)  # [m] camera to target
     elevation_deg: tuple[float, float] = (10.0, 85.0)
@@ -126,20 +123,10 @@ def draw_scene_set(
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
     names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
-    own, share = settings.lookalike_texture == "own", settings.same_color_share
-
-    def draw_lookalike(name: str) -> Mesh:
-        if not share:  # scenes stay what they were before there was one
-            return make_lookalike(goal.mesh, name, photos, rng, own)
-        other = None
-        if distractors and rng.random() < share:
-            other = make_same_color(goal.mesh, [one.mesh for one in distractors], name, rng)
-        tries = 0
-        while other is None or (are_alike(other, goal.mesh) and tries < _TRIES):
-            other, tries = make_lookalike(goal.mesh, name, photos, rng, own), tries + 1
-        return other
-
-    lookalikes = tuple(make_solid(draw_lookalike(name)) for name in names)
+    own = settings.lookalike_texture == "own"
+    lookalikes = tuple(
+        make_solid(make_lookalike(goal.mesh, name, photos, rng, own)) for name in names
+    )
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
     tiles = (
         float(rng.uniform(0.2, 1.2)),
