@@ -18,6 +18,8 @@ from posefilter.geometry.camera import resize_intrinsics
 from posefilter.limits import MOST_SIDE
 from posefilter.types import Batch
 
+_BEYOND = 100.0  # [m] no depth camera measures
+_FEWEST = 0.02  # share of the pixels with depth
 _NEAREST, _FARTHEST = 0.05, 30.0  # [m] between which the median depth of an image lies
 
 
@@ -174,10 +176,22 @@ def check_depth_unit(depth: np.ndarray) -> None:
     Raises:
         UserError: The median is no distance that a depth camera measures.
     """
-    some = depth[::16, ::16]
-    some = some[np.isfinite(some) & (some > 0)]
+    some = drop_unknown(depth[::16, ::16])
+    some = some[some > 0]
     if len(some) and not _NEAREST < (median := float(np.median(some))) < _FARTHEST:
         raise UserError(f"depth: the median would be {median:.3g} m; is it in meters?")
+
+
+def drop_unknown(depth: np.ndarray) -> np.ndarray:
+    """Return depth as float32, 0 where it is unknown: not finite, not positive, or beyond 100 m, as
+    simulators and renderers write where there is nothing.  (..., H, W) [m].
+
+    Where nearly all of it is so far it stays: it is in another unit then.
+    """
+    known = np.isfinite(depth) & (depth > 0)
+    near = known & (depth < _BEYOND)
+    known = near if near.sum() >= _FEWEST * known.sum() else known
+    return np.where(known, depth, 0).clip(0, np.finfo(np.float32).max).astype(np.float32)
 
 
 def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
@@ -186,7 +200,7 @@ def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:
             f"depth: is {depth.dtype}; expected meters as float: divide by the depth image's units "
             f"in a meter (1000 where it is in millimeters)"
         )
-    z = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+    z = drop_unknown(depth)
     for number, one in enumerate(z):
         which = f" of image {number}" if len(z) > 1 else ""
         if not one.any():

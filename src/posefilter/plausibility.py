@@ -8,7 +8,7 @@ _SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be t
 _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
 _BEYOND = 1.5  # times the depths of training
-_OFF = 0.3  # of the image's size: principal points farther from its middle are those of a part
+_OFF = 0.24  # of the image's size: principal points farther from its middle are those of a part
 
 
 def find_warnings(

@@ -70,6 +70,9 @@ def test_given_symmetries_beat_those_that_are_found(
     )
     find_and_draw(mesh, "none", None, tmp_path)
     assert len(MeshStore(store).load("brick").symmetries) == 1
+    file.write_text(json.dumps({"another": {"symmetries_discrete": [half]}}))
+    with pytest.raises(UserError, match=r"given\.json: declares none of brick"):
+        find_and_draw(mesh, str(file), 0.001, tmp_path)
     with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose found"):
         find_and_draw(mesh, "nowhere", None, tmp_path)
 
@@ -99,3 +102,9 @@ def test_builtin_clutter_like_the_object_is_left_out(tmp_path: Path) -> None:
     # what is given stays: it stands beside the object
     write_obj(brick, tmp_path / "given" / "brick")
     assert left_out(own, clutter=tmp_path / "given") == []
+
+
+def test_a_unit_that_makes_an_object_too_small_is_named(tmp_path: Path) -> None:
+    file = write_obj(catalog.build("brick"), tmp_path / "brick")
+    with pytest.raises(UserError, match=r"mesh_scale=0\.001: .* would be 0\.107 mm across"):
+        read_onboarded(settings(file, mesh_scale=0.001))

@@ -77,3 +77,16 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
         (tmp_path / "record.json").write_text(content)
         with pytest.raises(UserError, match=r"record\.json: is no record"):
             Stages(tmp_path / "record.json")
+
+
+def test_other_settings_are_refused_before_anything_is_done(tmp_path: Path) -> None:
+    file = tmp_path / "record.json"
+    Stages(file).run("look", {"mesh": "a"}, lambda: None)
+    Stages(file).run("train", {"mesh": "a"}, lambda: None, costly=True)
+    before = file.read_text()
+    stages = Stages(file)
+    stages.check("train", {"mesh": "a"})
+    stages.check("never", {"mesh": "b"})
+    with pytest.raises(UserError, match=r"'train' was begun with other settings \(mesh\)"):
+        stages.check("train", {"mesh": "b"})
+    assert file.read_text() == before

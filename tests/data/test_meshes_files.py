@@ -1,5 +1,7 @@
 """Mesh files: what is read is what was written, and what is broken is named."""
 
+import json
+import struct
 from pathlib import Path
 
 import cv2
@@ -221,3 +223,50 @@ def test_corrupt_meshes_are_named(tmp_path: Path) -> None:
         _rejects(broken, broken.name)
         broken.write_bytes(b"")
         _rejects(broken, broken.name)
+
+
+def test_obj_of_other_exporters_keeps_its_texture(pyramid: Path) -> None:
+    """A byte-order mark, tabs, lower case, and lines that go on."""
+    mesh = read_mesh(pyramid, "a")
+    text = OBJ.replace("v 0.1 0 0\n", "\tv\t0.1 0 \\\n0\n")
+    pyramid.write_bytes(b"\xef\xbb\xbf" + text.encode())
+    (pyramid.parent / "a.mtl").write_bytes(b"\xef\xbb\xbfnewmtl m\n  map_kd\tpic ture.png\n")
+    other = read_mesh(pyramid, "a")
+    np.testing.assert_array_equal(other.vertices, mesh.vertices)
+    np.testing.assert_array_equal(other.texture, mesh.texture)
+
+
+def test_a_texture_that_would_be_lost_is_named(pyramid: Path, tmp_path: Path) -> None:
+    bare = OBJ.replace("f 3/1/2 4/2/2 5/5/2", "f 3//2 4//2 5//2")
+    pyramid.write_text(bare)
+    _rejects(pyramid, "a.obj", "without texture coordinates")
+    # of a material in one color they need none, and the others keep theirs
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd pic ture.png\nnewmtl plain\nKd 1 0 0\n")
+    face = "f 3//2 4//2 5//2\n"
+    pyramid.write_text(bare.replace(face, f"usemtl plain\n{face}usemtl m\n"))
+    colors = surface_colors(read_mesh(pyramid, "a"), np.array([0, 4]), np.full((2, 3), 1 / 3))
+    np.testing.assert_allclose(colors[1], [1, 0, 0], atol=0.01)
+    assert colors[0].std() > 0.001
+    pyramid.write_text(OBJ.replace("usemtl m", "usemtl other"))
+    _rejects(pyramid, "a.obj", "material 'other' is in no material file")
+    pyramid.write_text(OBJ.replace("mtllib a.mtl\n", ""))
+    _rejects(pyramid, "a.obj", "material 'm' is in no material file")
+    pyramid.write_text(OBJ.replace("f -5/2/-1", "f -5/-9/-1"))
+    _rejects(pyramid, "a.obj", "a face names vt -9")
+
+
+def test_vertex_colors_of_255_are_scaled(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} {z} 255 0 51" for x, y, z in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    (tmp_path / "a.obj").write_text("\n".join([*lines, "f 1 2 3", "f 1 2 4", "f 2 3 4"]))
+    mesh = read_mesh(tmp_path / "a.obj", "a")
+    assert mesh.corner_colors is not None
+    np.testing.assert_allclose(mesh.corner_colors[0, 0], [1, 0, 0.2], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "KHR_texture_transform"])
+def test_extensions_that_would_be_left_out_are_named(tmp_path: Path, name: str) -> None:
+    content = json.dumps({"extensionsRequired": [name], "extensionsUsed": [name]}).encode()
+    content += b" " * (-len(content) % 4)
+    chunk = struct.pack("<II", len(content), 0x4E4F534A) + content
+    (tmp_path / "a.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunk)) + chunk)
+    _rejects(tmp_path / "a.glb", "a.glb", name, "export it without")

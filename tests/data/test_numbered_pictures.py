@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from posefilter.data.sequences import FolderVideo
+from posefilter.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -35,3 +36,14 @@ def test_frames_are_in_the_order_of_their_numbers(
     assert [(frame.name, frame.im_id) for frame in video] == [*zip(order, numbers, strict=True)]
     every_second = FolderVideo(tmp_path, np.eye(3), 1000.0, stride=2)
     assert [frame.im_id for frame in every_second] == numbers[::2]
+
+
+def test_pictures_of_which_some_have_no_partner_are_named(tmp_path: Path) -> None:
+    """Of names that agree in part, the place in the folder pairs the wrong ones."""
+    for folder, numbers in (("rgb", (1, 2, 3)), ("depth", (2, 3, 4))):
+        (tmp_path / folder).mkdir()
+        for number in numbers:
+            picture = np.ones((4, 4), np.uint16 if folder == "depth" else np.uint8)
+            cv2.imwrite(str(tmp_path / folder / f"{number:06d}.png"), picture)
+    with pytest.raises(UserError, match=r"rgb/000001\.png has no picture of its name in depth/"):
+        FolderVideo(tmp_path, np.eye(3), 1000.0)

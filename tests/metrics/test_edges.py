@@ -372,3 +372,15 @@ def test_the_last_bin_is_a_bin_of_its_own() -> None:
     """One that is right at 0.2 and one that is wrong at 0.9: both are off, and do not cancel."""
     probability, right = torch.tensor([0.2, 0.9]), torch.tensor([True, False])
     assert calibration_error(probability, right, 2) == pytest.approx((0.8 + 0.9) / 2)
+
+
+def test_poses_in_meters_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "poses.csv"
+    rows = ["1,1,1,0.5,1 0 0 0 1 0 0 0 1,0.1 0.0 0.7,-1"] * 3
+    file.write_text("\n".join([",".join(HEADER), *rows]) + "\n")
+    with pytest.raises(UserError, match=r"poses\.csv: t puts objects 0\.71 mm .* in meters\?"):
+        read_poses_csv(file)
+    file.write_text(
+        "\n".join([rows[0], *(row.replace("0.1 0.0 0.7", "100 0 700") for row in rows)])
+    )
+    assert len(read_poses_csv(file)) == 4  # one of them may be wrong

@@ -73,6 +73,8 @@ def train(method: RotationGrid, steps: int) -> RotationGrid:
         losses = method.training_losses(scenes(16, seed=step), generator)
         optimizer.zero_grad()
         losses["loss"].mean().backward()
+        # as in trainings; without it the processor's rounding decides whether 60 steps are enough
+        torch.nn.utils.clip_grad_norm_(method.parameters(), 1.0)
         optimizer.step()
         scheduler.step()
     method.eval()

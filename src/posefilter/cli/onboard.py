@@ -208,6 +208,9 @@ def onboard(job: Job) -> None:
     out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
     hold_folder(out)
     work = Onboarding(cfg, mesh, out, Stages(out / RECORD, FOUND))
+    for stage in STAGES:  # before anything of an earlier run is overwritten
+        if stage.costly:
+            work.stages.check(stage.name, work.settings_of(stage))
     for number, stage in enumerate(STAGES, 1):
         head = f"[{number}/{len(STAGES)}] {stage.doing}"
         if work.is_done(stage):

@@ -16,7 +16,13 @@ from posefilter.files import write_whole
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.find_symmetries import find_symmetries
-from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
+from posefilter.meshes.inspect_mesh import (
+    LARGEST,
+    SMALLEST,
+    MeshFacts,
+    check_size,
+    inspect_mesh,
+)
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.similarity import are_alike
 from posefilter.meshes.store import BUILTIN, MeshStore
@@ -42,6 +48,11 @@ def read_onboarded(cfg: DictConfig) -> Mesh:
         mesh = read_mesh(Path(source), name, scale)
         if cfg.mesh_scale is None:
             check_size(inspect_mesh(mesh), source)
+        elif not SMALLEST <= (across := diameter(mesh.vertices)) <= LARGEST:
+            raise UserError(
+                f"mesh_scale={scale:g}: {source} would be {1000 * across:.3g} mm across; leave it "
+                f"out where the file is in meters"
+            )
     elif source in catalog.names():
         mesh = replace(catalog.build(source), name=str(cfg.name or source))
     else:
@@ -112,6 +123,11 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         if not Path(wanted).is_file():
             raise UserError(f"symmetries={wanted}: no such file; or choose found, geometry or none")
         group = read_symmetries(Path(wanted), mesh.name, scale or 1.0, _STEPS)
+        if len(group) == 1:
+            raise UserError(
+                f"symmetries={wanted}: declares none of {mesh.name}; is the object named otherwise "
+                f"there, or a key mistyped? (symmetries=none for an object without)"
+            )
         entry = {"symmetries_discrete": [matrix.reshape(-1).tolist() for matrix in group[1:]]}
         found = f"{len(group)} symmetries of {wanted}"
     file = out / "meshes" / mesh.name / "symmetries.json"

@@ -125,14 +125,17 @@ def predict_several(job: Job) -> list[Result]:
     beliefs = folder / "beliefs"
     beliefs.mkdir(parents=True, exist_ok=True)
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
-    own = dict(zip(estimator.objects, expand_weights(cfg.checkpoint), strict=True))
+    checkpoints = expand_weights(cfg.checkpoint)
+    own = dict(zip(estimator.objects, checkpoints, strict=True))
     scores = {one.model.name: one.filter.score_is for one in estimator.methods}
     answers = []
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
         result.belief.save(file)
         name = result.object
-        answers.append(describe(result, scores[name], own[name], file, job))
+        # one answer each; of several instances, an object's only checkpoint
+        checkpoint = checkpoints[number] if cfg.instances is None else own[name]
+        answers.append(describe(result, scores[name], checkpoint, file, job))
         if cfg.console != JSON:
             print_result(result)
     missing = [name for name in absent if name not in {one.object for one in results}]
@@ -321,7 +324,7 @@ def read_intrinsics(numbers: Any) -> np.ndarray:
     parts = list(numbers) if isinstance(numbers, ListConfig | list) else str(numbers).split(",")
     try:
         fx, fy, cx, cy = (float(part) for part in parts)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise UserError(f"intrinsics={numbers}: expected four numbers, fx,fy,cx,cy [px]") from error
     if not np.isfinite([fx, fy, cx, cy]).all():
         raise UserError(f"intrinsics={numbers}: hold NaN or infinity")

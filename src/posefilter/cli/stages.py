@@ -60,6 +60,21 @@ class Stages:
         one = self.content["stages"].get(name)
         return bool(one and one.get("done") and one["settings"] == _plain(settings))
 
+    def check(self, name: str, settings: Mapping[str, Any]) -> None:
+        """Refuse settings that differ from those that a costly stage was begun with.
+
+        Raises:
+            UserError: They do.
+        """
+        before = self.content["stages"].get(name)
+        if before is None or before["settings"] == _plain(settings):
+            return
+        other = ", ".join(_differing(before["settings"], _plain(settings)))
+        raise UserError(
+            f"out={self.file.parent}: its stage '{name}' was begun with other settings "
+            f"({other}); choose another out="
+        )
+
     def run(
         self, name: str, settings: Mapping[str, Any], work: Callable[[], None], costly: bool = False
     ) -> None:
@@ -74,15 +89,11 @@ class Stages:
         Raises:
             UserError: It was begun with other settings, and is costly.
         """
+        if costly:
+            self.check(name, settings)
         stages = self.content["stages"]
         before = stages.get(name)
         same = before is not None and before["settings"] == _plain(settings)
-        if before is not None and costly and not same:
-            other = ", ".join(_differing(before["settings"], _plain(settings)))
-            raise UserError(
-                f"out={self.file.parent}: its stage '{name}' was begun with other settings "
-                f"({other}); choose another out="
-            )
         names = list(stages)
         for later in names[names.index(name) + 1 :] if before is not None else ():
             stages[later]["done"] = False

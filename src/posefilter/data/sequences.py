@@ -85,6 +85,12 @@ class FolderVideo(Video):
         by_stem = {path.stem: path for path in depth}
         if all(path.stem in by_stem for path in color):
             depth = [by_stem[path.stem] for path in color]
+        elif any(path.stem in by_stem for path in color):
+            alone = [path.name for path in color if path.stem not in by_stem]
+            raise UserError(
+                f"frames={folder}: rgb/{alone[0]} has no picture of its name in depth/, as "
+                f"{len(alone)} of {len(color)}, and the others have"
+            )
         elif len(color) != len(depth):
             raise UserError(
                 f"frames={folder}: {len(color)} pictures in rgb/ and {len(depth)} in depth/, of "

@@ -18,6 +18,8 @@ from posefilter.meshes.obj import MOST_TEXELS
 MOST_ELEMENTS = 1 << 24  # of an accessor, and of all that the nodes show
 _MOST_NODES = 10_000
 _MOST_JSON = 1 << 24  # [bytes]
+# extensions that change neither the shape nor the picture on it
+_HARMLESS = {"KHR_materials_unlit", "KHR_materials_specular", "KHR_materials_ior"}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942  # kinds of chunks
 
 
@@ -34,6 +36,7 @@ def check_glb(path: Path) -> None:
         raise UserError(f"{path}: no GLB file, or one with too long a header")
     try:
         content = json.loads(chunks[_JSON])
+        _check_extensions(content, path)
         _check_counts(content, path)
         _check_nodes(content, path)
         _check_images(content, chunks.get(_BINARY, b""), path)
@@ -50,6 +53,14 @@ def _chunks(data: bytes) -> Iterator[tuple[int, bytes]]:
         length, kind = struct.unpack_from("<II", data, at)
         yield kind, data[at + 8 : at + 8 + length]
         at += 8 + length
+
+
+def _check_extensions(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse what the reader would leave out without a word."""
+    needed = set(content.get("extensionsRequired", ())) - _HARMLESS
+    moved = {"KHR_texture_transform"} & set(content.get("extensionsUsed", ()))
+    for name in sorted(needed | moved):
+        raise UserError(f"{path}: uses {name}, which is not read; export it without")
 
 
 def _check_counts(content: Mapping[str, Any], path: Path) -> None:

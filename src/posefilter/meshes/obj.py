@@ -1,5 +1,6 @@
 """Read Wavefront OBJ and its materials, with seams in the texture and normals of each corner."""
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,17 +68,16 @@ def _read_mtl(path: Path, source: Path, images: dict[Path, np.ndarray]) -> dict[
         raise UserError(f"{path}: missing material file, named by {source.name}")
     materials: dict[str, Material] = {}
     name = ""
-    for line in read_bytes(path).decode(errors="replace").splitlines():
-        key, _, rest = line.strip().partition(" ")
-        rest = rest.strip()
+    for key, rest in _read_lines(path):
+        key = key.lower()  # exporters write map_kd, too
         if key == "newmtl":
             name = rest
             materials[name] = PLAIN
-        elif key == "Kd" and name:
+        elif key == "kd" and name:
             materials[name] = materials[name]._replace(
                 color=np.array([float(x) for x in rest.split()[:3]])
             )
-        elif key == "map_Kd" and name:
+        elif key == "map_kd" and name:
             # options such as -s come before the file
             file = rest.split()[-1] if rest.startswith("-") else rest
             image = path.parent / file
@@ -102,8 +102,7 @@ def read_obj(path: Path) -> RawMesh:
     images: dict[Path, np.ndarray] = {}
     materials: dict[str, int] = {}
     current = 0
-    for line in read_bytes(path).decode(errors="replace").splitlines():
-        key, _, rest = line.partition(" ")
+    for key, rest in _read_lines(path):
         if key in numbers:
             numbers[key].append([float(x) for x in rest.split()])
         elif key == "f":
@@ -112,14 +111,22 @@ def read_obj(path: Path) -> RawMesh:
                 corners += [polygon[0], polygon[i], polygon[i + 1]]
                 face_material.append(current)
         elif key == "mtllib":
-            library |= _read_mtl(path.parent / rest.strip(), path, images)
+            library |= _read_mtl(path.parent / rest, path, images)
         elif key == "usemtl":
-            current = materials.setdefault(rest.strip(), len(materials))
+            current = materials.setdefault(rest, len(materials))
     index = np.array(corners, dtype=np.int64).reshape(-1, 3, 3)  # face, corner, (v, vt, vn)
     vertices = _rectangle(numbers["v"], 3)
     colors = (
         _rectangle(numbers["v"], 6)[:, 3:] if numbers["v"] and len(numbers["v"][0]) >= 6 else None
     )
+    if colors is not None and colors.max(initial=0.0) > 1:
+        colors = colors / 255
+    unknown = [name for name in materials if name not in library]
+    if unknown and len(numbers["vt"]) and colors is None:
+        raise UserError(
+            f"{path}: its material '{unknown[0]}' is in no material file (mtllib), so that its "
+            f"texture is not known"
+        )
     known = (
         [library.get(name, PLAIN) for name in materials] or list(library.values())[:1] or [PLAIN]
     )
@@ -129,12 +136,40 @@ def read_obj(path: Path) -> RawMesh:
     return RawMesh(
         vertices,
         faces,
-        _gather(_rectangle(numbers["vt"], 2), index[..., 1]),
+        _gather_uv(_rectangle(numbers["vt"], 2), index[..., 1], face_material, known, path),
         _gather(_rectangle(numbers["vn"], 3), index[..., 2]),
         None if colors is None else colors[faces].clip(0, 1),
         np.array(face_material, dtype=np.int64),
         known,
     )
+
+
+def _read_lines(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield keyword and rest of each line; a line that ends with a backslash goes on."""
+    text = read_bytes(path).decode("utf-8-sig", errors="replace").replace("\\\n", " ")
+    for line in text.splitlines():
+        key, *rest = line.split(None, 1) or [""]
+        yield key, "".join(rest).strip()
+
+
+def _gather_uv(
+    values: np.ndarray,
+    index: np.ndarray,
+    face_material: Sequence[int],
+    materials: Sequence[Material],
+    path: Path,
+) -> np.ndarray | None:
+    """Return texture coordinates (F, 3, 2), 0 on faces without, whose material has one color.
+
+    Raises UserError where it has a picture.
+    """
+    without = np.asarray((index < 0).any(axis=1))
+    if len(values) == 0 or len(index) == 0 or without.all():
+        return None
+    for which in np.unique(np.asarray(face_material)[without]).tolist():
+        if materials[min(which, len(materials) - 1)].image is not None:
+            raise UserError(f"{path}: faces without texture coordinates (vt) have a picture")
+    return np.where(without[:, None, None], 0.0, values[np.where(without[:, None], 0, index)])
 
 
 def _corner(word: str, numbers: dict[str, list[list[float]]]) -> tuple[int, int, int]:
@@ -143,6 +178,8 @@ def _corner(word: str, numbers: dict[str, list[list[float]]]) -> tuple[int, int,
     found = []
     for part, key in zip(parts, ("v", "vt", "vn"), strict=True):
         value = int(part) if part else 0
+        if key != "v" and value < -len(numbers[key]):  # of a vertex the whole file tells
+            raise ValueError(f"a face names {key} {value}, and there are {len(numbers[key])}")
         found.append(value - 1 if value >= 0 else len(numbers[key]) + value)
     return found[0], found[1], found[2]
 

@@ -14,6 +14,7 @@ import numpy as np
 from posefilter.errors import UserError
 from posefilter.files import open_whole_text
 
+_NEAREST = 0.02  # [m] median distance of objects
 HEADER = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 
 
@@ -86,6 +87,12 @@ def read_poses_csv(path: Path) -> list[PoseRow]:
             if not cells or (number == 1 and cells[0].strip().lstrip("\ufeff") == HEADER[0]):
                 continue
             rows.append(_parse(cells, f"{path}, line {number}"))
+    away = [float(np.linalg.norm(row.camera_from_native[:3, 3])) for row in rows]
+    if away and 0 < (median := float(np.median(away))) < _NEAREST:
+        raise UserError(
+            f"estimates={path}: t puts objects {1000 * median:.2g} mm from the camera, in the "
+            f"median; BOP's unit is millimeters: is this in meters?"
+        )
     return rows
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from posefilter.images import Images
+from posefilter.images import Images, drop_unknown
 from posefilter.types import ObjectModel
 
 _CELL = 32  # [px] the network's coarsest cell
@@ -79,9 +79,7 @@ def cut_window(images: Images, window: Window) -> Images:
 
 def clean_depth(images: Images) -> Images:
     """Return photographs whose depth is float32 [m], and 0 where it is unknown."""
-    depth = images.depth
-    known = np.isfinite(depth) & (depth > 0)
-    return images._replace(depth=np.where(known, depth, 0).astype(np.float32))
+    return images._replace(depth=drop_unknown(images.depth))
 
 
 def _cut(low: float, high: float, size: int, scale: float) -> tuple[int, int]:

@@ -12,7 +12,7 @@ FARTHEST = 100.0  # [m] of an object, and of the median of what a depth image ho
 _NEAREST = 0.01  # [m] of that median
 _FOCAL = (0.1, 100.0)  # focal lengths, in widths of the image: 157 to 0.6 degrees of view
 _SQUARE = 2.0  # the focal lengths of one camera differ by this factor at most
-_SKEW = 0.1  # in focal lengths
+_SKEW = 0.003  # in focal lengths: it is not used, and moves points by less than a pixel then
 _UNITS = (1e-2, 1e7)  # depth image units a meter
 
 
