@@ -95,8 +95,8 @@ class Estimator:
         Args:
             rgb: Color, RGB, as a numpy array or tensor: (H, W, 3) or (3, H, W), uint8 or float in
                 [0, 1]; or a batch of B such images.
-            depth: z-depth (H, W) in meters, as float, aligned with the color; 0 or NaN where
-                unknown; or (B, H, W).
+            depth: z-depth (H, W) in meters, as float, aligned with the color; 0, NaN or more than
+                100 m where unknown; or (B, H, W).
             intrinsics: Camera matrix (3, 3) [px] of these images; or one each, (B, 3, 3).
             instances: How many of each object an image shows at most: a number, or one for each
                 name, 1 for those left out.  None: one answer an object, whatever it covers.

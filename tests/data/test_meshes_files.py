@@ -240,6 +240,8 @@ def test_a_texture_that_would_be_lost_is_named(pyramid: Path, tmp_path: Path) ->
     bare = OBJ.replace("f 3/1/2 4/2/2 5/5/2", "f 3//2 4//2 5//2")
     pyramid.write_text(bare)
     _rejects(pyramid, "a.obj", "without texture coordinates")
+    pyramid.write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    _rejects(pyramid, "a.obj", "without texture coordinates")
     # of a material in one color they need none, and the others keep theirs
     (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd pic ture.png\nnewmtl plain\nKd 1 0 0\n")
     face = "f 3//2 4//2 5//2\n"

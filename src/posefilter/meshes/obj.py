@@ -163,12 +163,12 @@ def _gather_uv(
 
     Raises UserError where it has a picture.
     """
-    without = np.asarray((index < 0).any(axis=1))
-    if len(values) == 0 or len(index) == 0 or without.all():
-        return None
+    without = np.asarray((index < 0).any(axis=1) | (len(values) == 0))
     for which in np.unique(np.asarray(face_material)[without]).tolist():
         if materials[min(which, len(materials) - 1)].image is not None:
             raise UserError(f"{path}: faces without texture coordinates (vt) have a picture")
+    if without.all():
+        return None
     return np.where(without[:, None, None], 0.0, values[np.where(without[:, None], 0, index)])
 
 
