@@ -161,11 +161,12 @@ def _gather_uv(
 ) -> np.ndarray | None:
     """Return texture coordinates (F, 3, 2), 0 on faces without, whose material has one color.
 
-    Raises UserError where it has a picture.
+    Raises UserError where it has a picture of more.
     """
     without = np.asarray((index < 0).any(axis=1) | (len(values) == 0))
     for which in np.unique(np.asarray(face_material)[without]).tolist():
-        if materials[min(which, len(materials) - 1)].image is not None:
+        image = materials[min(which, len(materials) - 1)].image
+        if image is not None and (image != image[:1, :1]).any():
             raise UserError(f"{path}: faces without texture coordinates (vt) have a picture")
     if without.all():
         return None
