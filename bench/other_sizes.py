@@ -15,6 +15,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from photographs import link_meshes
+
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.write import write_obj
 
@@ -29,17 +31,14 @@ SEEDS = {"009_gelatin_box": 4242, "004_sugar_box": 4343}
 SEARCHES = (1, 3)
 
 
-def gather_meshes(folder: Path, meshes: Path, name: str) -> None:
+def gather_meshes(root: Path, meshes: Path, name: str) -> None:
     """Make a folder of an object, what stands beside it, and its copies in other sizes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for one in (name, *BESIDE[name], *CLUTTER):
-        if not (folder / one).is_symlink():
-            (folder / one).symlink_to((meshes / one).resolve())
+    link_meshes(root, meshes, (name, *BESIDE[name], *CLUTTER))
     mesh = MeshStore(meshes).load(name)
     middle = mesh.vertices.mean(0)
     for other, factor in COPIES.get(name, {}).items():
         scaled = middle + factor * (mesh.vertices - middle)
-        write_obj(replace(mesh, name=other, vertices=scaled), folder / other)
+        write_obj(replace(mesh, name=other, vertices=scaled), root / "meshes" / other)
 
 
 def render_command(root: Path, name: str, frames: int) -> list[str]:
@@ -72,7 +71,7 @@ def main() -> int:
     root = options.root.resolve()
     print("| object | searches | images | ADD AUC | ADD-S AUC | ADD < 0.1 d % |")
     for name in options.only:
-        gather_meshes(root / name / "meshes", options.meshes, name)
+        gather_meshes(root / name, options.meshes, name)
         commands = [render_command(root, name, options.frames)]
         done = {n: root / name / f"searches_{n}" / "metrics.json" for n in SEARCHES}
         commands += [test_command(root, name, n) for n in SEARCHES if not done[n].is_file()]

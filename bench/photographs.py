@@ -120,13 +120,13 @@ def evaluate_commands(run: Run, root: Path, meshes: str, frames: str) -> list[li
     ]
 
 
-def link_meshes(root: Path, meshes: Path) -> None:
+def link_meshes(root: Path, meshes: Path, names: Sequence[str] = (*TARGETS, *CLUTTER)) -> None:
     """Make a folder that holds links to the meshes in use: with fewer kinds of clutter, each kind
     is seen more often.
     """
     folder = root / "meshes"
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (*TARGETS, *CLUTTER):
+    for name in names:
         link = folder / name
         if not link.is_symlink():
             link.symlink_to((meshes / name).resolve())

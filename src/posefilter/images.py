@@ -188,10 +188,12 @@ def drop_unknown(depth: np.ndarray) -> np.ndarray:
 
     Where nearly all of it is so far it stays: it is in another unit then.
     """
-    known = np.isfinite(depth) & (depth > 0)
-    near = known & (depth < _BEYOND)
-    known = near if near.sum() >= _FEWEST * known.sum() else known
-    return np.where(known, depth, 0).clip(0, np.finfo(np.float32).max).astype(np.float32)
+    near = (depth > 0) & (depth < _BEYOND)
+    if np.count_nonzero(near) < _FEWEST * depth.size:  # else a share of those with depth, too
+        known = np.isfinite(depth) & (depth > 0)
+        if np.count_nonzero(near) < _FEWEST * np.count_nonzero(known):
+            depth, near = np.minimum(depth, np.finfo(np.float32).max), known
+    return np.where(near, depth, 0).astype(np.float32)
 
 
 def _check_depth(depth: np.ndarray, empty: bool) -> np.ndarray:

@@ -12,7 +12,7 @@ from posefilter.cli import onboarded_mesh
 from posefilter.cli.onboarded_mesh import find_and_draw, name_of, read_onboarded, write_meshes
 from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
-from posefilter.meshes.mesh import Mesh
+from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.write import write_obj
 
@@ -108,3 +108,5 @@ def test_a_unit_that_makes_an_object_too_small_is_named(tmp_path: Path) -> None:
     file = write_obj(catalog.build("brick"), tmp_path / "brick")
     with pytest.raises(UserError, match=r"mesh_scale=0\.001: .* would be 0\.107 mm across"):
         read_onboarded(settings(file, mesh_scale=0.001))
+    # what is large and meant to be is let through by a unit, as the refusal without one advises
+    assert diameter(read_onboarded(settings(file, mesh_scale=30)).vertices) > 3

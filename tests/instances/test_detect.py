@@ -132,7 +132,7 @@ def test_what_is_left_of_a_found_object_is_no_other(calibrated: bool) -> None:
     long = draw([(20, 20, 0, 0.95)])
     long.rgb[0, 0, 20:26, 26:30], long.depth[0, 0, 20:26, 26:30] = 0.9, 1.0
     toy = Toy(0, calibrated=calibrated)
-    toy.filter = Beside()  # type: ignore[assignment]
+    toy.filter = Beside()
     found = run([toy], [3], long)
     assert corners(found) == [(20, 20)]
     assert toy.encoded > 1

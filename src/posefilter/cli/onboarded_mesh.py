@@ -16,16 +16,10 @@ from posefilter.files import write_whole
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.files import read_mesh
 from posefilter.meshes.find_symmetries import find_symmetries
-from posefilter.meshes.inspect_mesh import (
-    LARGEST,
-    SMALLEST,
-    MeshFacts,
-    check_size,
-    inspect_mesh,
-)
+from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.similarity import are_alike
-from posefilter.meshes.store import BUILTIN, MeshStore
+from posefilter.meshes.store import BUILTIN, LARGEST, SMALLEST, MeshStore
 from posefilter.meshes.symmetries import read_symmetries
 from posefilter.meshes.turns import describe_symmetries, make_group, select
 from posefilter.meshes.write import write_obj

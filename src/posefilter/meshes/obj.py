@@ -165,7 +165,7 @@ def _gather_uv(
     """
     without = np.asarray((index < 0).any(axis=1) | (len(values) == 0))
     for which in np.unique(np.asarray(face_material)[without]).tolist():
-        image = materials[min(which, len(materials) - 1)].image
+        image = materials[which].image
         if image is not None and (image != image[:1, :1]).any():
             raise UserError(f"{path}: faces without texture coordinates (vt) have a picture")
     if without.all():
@@ -179,7 +179,7 @@ def _corner(word: str, numbers: dict[str, list[list[float]]]) -> tuple[int, int,
     found = []
     for part, key in zip(parts, ("v", "vt", "vn"), strict=True):
         value = int(part) if part else 0
-        if key != "v" and value < -len(numbers[key]):  # of a vertex the whole file tells
+        if key != "v" and value < -len(numbers[key]):  # vertices are checked together
             raise ValueError(f"a face names {key} {value}, and there are {len(numbers[key])}")
         found.append(value - 1 if value >= 0 else len(numbers[key]) + value)
     return found[0], found[1], found[2]

@@ -19,7 +19,7 @@ from posefilter.meshes.symmetries import identity_first, read_symmetries, symmet
 __all__ = ["Mesh", "MeshStore", "object_model", "symmetry_group"]
 
 # [m] the unit of an object that is larger or smaller must be wrong
-_LARGEST, _SMALLEST = 10.0, 1e-3
+LARGEST, SMALLEST = 10.0, 1e-3
 BUILTIN = "builtin"
 
 
@@ -191,9 +191,9 @@ def _mesh_in(folder: Path) -> Path | str | None:
 def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     """Raise UserError, naming the setting to change, where an object has an impossible size."""
     across = diameter(mesh.vertices)
-    if across > _LARGEST:
+    if across > LARGEST:
         factor, unit = 0.001, "millimeters"
-    elif across < _SMALLEST:
+    elif across < SMALLEST:
         factor, unit = 1000.0, "kilometers, or scaled twice"
     else:
         return

@@ -4,8 +4,8 @@ from functools import cached_property
 from threading import Lock
 
 from posefilter.confidence.blank import find_blank
-from posefilter.images import Images, make_batch
-from posefilter.tracking.window import Window, clean_depth, cut_window
+from posefilter.images import Images, drop_unknown, make_batch
+from posefilter.tracking.window import Window, cut_window
 from posefilter.types import Batch
 
 
@@ -19,7 +19,7 @@ class Frame:
     """
 
     def __init__(self, images: Images) -> None:
-        self.images = clean_depth(images)
+        self.images = images._replace(depth=drop_unknown(images.depth))
         self._whole: dict[tuple[int | None, int | None], Batch] = {}
         self._lock = Lock()
 

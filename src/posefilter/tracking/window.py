@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from posefilter.images import Images, drop_unknown
+from posefilter.images import Images
 from posefilter.types import ObjectModel
 
 _CELL = 32  # [px] the network's coarsest cell
@@ -75,11 +75,6 @@ def cut_window(images: Images, window: Window) -> Images:
     K[:, 0, 2] -= window.left
     K[:, 1, 2] -= window.top
     return Images(images.rgb[:, rows, columns], images.depth[:, rows, columns], K)
-
-
-def clean_depth(images: Images) -> Images:
-    """Return photographs whose depth is float32 [m], and 0 where it is unknown."""
-    return images._replace(depth=drop_unknown(images.depth))
 
 
 def _cut(low: float, high: float, size: int, scale: float) -> tuple[int, int]:
