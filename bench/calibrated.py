@@ -4,11 +4,13 @@
         [--without 100] [--minutes 5] FILE.ckpt ...
     python bench/calibrated.py --table FILE.jsonl      # only prints the tables
     python bench/calibrated.py --cross FILE.jsonl [--most 80] [--leave-out score]
-        # the same, of calibrations on these frames
+        [--tolerance add_s=0.1 translation_mm=5]  # the same, of calibrations on these frames
 
 With --cross the checkpoints' own calibrations do not count: the frames of each object are divided
 into five parts by scene, and each part is judged by a calibration on the other four.  --most takes
 so many of their frames with the object and as many without, --leave-out leaves out witnesses.
+With --tolerance a pose is right that keeps it (`posefilter.PoseTolerance`), and the probability is
+that of it.
 
 Every frame below --root is taken, in a fixed shuffle: --frames with a visibility above 0.1, and
 --without that lack the object.  A row an image is added to the file; started again, it goes on, and
@@ -22,6 +24,7 @@ hull, that lie in the 95 % band of the belief (`Result.draw_band`).
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -33,9 +36,9 @@ import numpy as np
 import torch
 from checkpoint_frames import open_frames
 
-from posefilter.cli.calibrate import is_right
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.confidence.fit import Frames, fit_calibration
+from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance, measure_pose_errors
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.figures.band import find_band, measure_cover
@@ -94,11 +97,14 @@ def look(
         trace = method.predict_step(seen, number)
         values = method.collect_features(trace, seen)
     found = calibration.assess(values)
-    right = is_right(method, trace.belief.best, batch.camera_from_object)
-    truths = score_truth(trace.belief, batch.camera_from_object, model) if there else None
+    truth_poses = batch.camera_from_object
+    errors = measure_pose_errors(trace.belief.best, truth_poses, model) if there else None
+    truths = score_truth(trace.belief, truth_poses, model) if there else None
     shown = measure_shown(batch, model.points[:: max(1, len(model.points) // 500)])
     for i in range(len(batch.rgb)):
-        row: Row = {"object": model.name, "there": there, "right": there and bool(right[i])}
+        off = [math.nan] * 4 if errors is None else [float(part[i]) for part in errors]
+        row: Row = {"object": model.name, "there": there, "errors": off}
+        row["right"] = bool(RIGHT.accepts(PoseErrors(*np.array(off))))
         row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
         row |= {"scene": scenes[i], "features": {k: float(v[i]) for k, v in values.items()}}
         if truths is not None:
@@ -155,6 +161,7 @@ def judge_across(
     rows: Sequence[Row],
     most: int | None = None,
     leave_out: Sequence[str] = (),
+    tolerance: PoseTolerance = RIGHT,
     folds: int = 5,
     seed: int = 0,
 ) -> list[Row]:
@@ -164,6 +171,7 @@ def judge_across(
         rows: Of `look`.
         most: Frames with the object, and without, that a calibration takes; None: all.
         leave_out: Witnesses that it does without.
+        tolerance: What a right pose is.
         folds: Parts of the scenes.
         seed: Of their shuffle.
     """
@@ -181,10 +189,14 @@ def judge_across(
             both = [learned[frames.there[learned] == there][:most] for there in (True, False)]
             made = fit_calibration(frames.select(np.concatenate(both)), "fat")
             held = np.flatnonzero(part == k)
-            found = made.assess_features(torch.from_numpy(frames.values[held]))
+            values = torch.from_numpy(frames.values[held])
+            found, usual = made.assess_features(values, tolerance), made.assess_features(values)
             assert made.conformal is not None
-            for i, presence, probability in zip(held, *(x.tolist() for x in found), strict=True):
-                row = own[i] | {"presence": presence, "probability": probability}
+            each = zip(held, found.presence, found.probability, usual.probability, strict=True)
+            for i, *parts in each:
+                presence, said, probability = (float(part) for part in parts)
+                row = own[i] | {"presence": presence, "probability": said}
+                row["right"] = bool(tolerance.accepts(PoseErrors(*np.array(row["errors"]))))
                 if row["there"]:
                     limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
                     row["held"] = [row["nonconformity"] <= limit for limit in limits]
@@ -198,7 +210,8 @@ def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     values = np.array([[row["features"][name] for name in names] for row in rows])
     there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
     nonconformity = np.array([row.get("nonconformity", np.nan) for row in rows])
-    return Frames(names, values, there, right, nonconformity)
+    errors = PoseErrors(*np.array([row["errors"] for row in rows]).T)
+    return Frames(names, values, there, right, nonconformity, errors)
 
 
 def draw_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -290,8 +303,11 @@ def main() -> int:
     parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
     parser.add_argument("--most", type=int, help="frames with the object, and without, of these")
     parser.add_argument("--leave-out", nargs="+", default=[], help="witnesses")
+    parser.add_argument("--tolerance", nargs="+", default=["add=0.1"], help="such as add_s=0.1")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    pairs = (one.split("=") for one in options.tolerance)
+    tolerance = PoseTolerance(**{name: float(value) for name, value in pairs})
     whole = True
     if options.table is None and options.cross is None:
         if not (options.files and options.root and options.meshes and options.rows):
@@ -301,7 +317,7 @@ def main() -> int:
         whole = not left
     rows = read_rows(options.table or options.cross or options.rows)
     if options.cross is not None:
-        rows = judge_across(rows, options.most, options.leave_out)
+        rows = judge_across(rows, options.most, options.leave_out, tolerance)
     print(tabulate_coverage(rows), tabulate_confidence(rows), sep="\n\n")
     return 0 if whole else 3
 

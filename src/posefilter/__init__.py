@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from posefilter.api import build, build_data, compose, load
     from posefilter.belief import Belief, Mode, PoseSet
     from posefilter.cli.trust import trust
+    from posefilter.confidence.tolerance import PoseTolerance
     from posefilter.confidence.verdicts import Costs
     from posefilter.errors import UserError
     from posefilter.estimator import Estimator
@@ -37,6 +38,7 @@ __all__ = [
     "Estimator",
     "Mode",
     "PoseSet",
+    "PoseTolerance",
     "Result",
     "TrackResult",
     "Tracker",
@@ -57,6 +59,7 @@ _HOMES = {
     "Estimator": "estimator",
     "Mode": "belief",
     "PoseSet": "belief",
+    "PoseTolerance": "confidence.tolerance",
     "Result": "result",
     "TrackResult": "tracking.track",
     "Tracker": "tracking.tracker",

@@ -1,6 +1,7 @@
 """The library's verbs: load what is trained, compose a configuration, build what it describes."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ from omegaconf import DictConfig
 from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
 from posefilter.cli.components import SECTIONS, changes
 from posefilter.cli.job import Job
+from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
@@ -25,6 +27,10 @@ _INSTEAD = {  # of settings of `predict.py`
     "plugins": "call posefilter.trust",
     "threads": "call torch.set_num_threads",
     **dict.fromkeys(("cost_false_alarm", "cost_miss", "cost_unsure"), _COSTS),
+    **dict.fromkeys(
+        (f"pose_tolerance.{field.name}" for field in fields(PoseTolerance)),
+        "give load pose_tolerance=posefilter.PoseTolerance(...)",
+    ),
 }
 
 
@@ -34,6 +40,7 @@ def load(
     overrides: Sequence[str] = (),
     device: str | None = None,
     costs: Costs | None = None,
+    pose_tolerance: PoseTolerance | None = None,
 ) -> Estimator:
     """Load one trained filter, or several that run in one call.
 
@@ -49,6 +56,9 @@ def load(
             one, is an argument of `Estimator.predict`.
         device: Where to compute, such as `cpu` or `cuda:0`; None: on the GPU where there is one.
         costs: What errors cost, which `Result.verdict` goes by; None: the default.
+        pose_tolerance: What a right pose is, which `Result.verdict` goes by, such as
+            `posefilter.PoseTolerance(translation_mm=5, rotation_deg=10)`; None: an ADD below 0.1
+            diameters.
 
     Returns:
         The estimator; see `Estimator.predict`.
@@ -61,7 +71,7 @@ def load(
     methods = [
         method_of(read_checkpoint(one), wanted, lightning=False) for one in expand_weights(weights)
     ]
-    return Estimator(methods, device, costs)
+    return Estimator(methods, device, costs, pose_tolerance)
 
 
 def check_overrides(overrides: Sequence[str]) -> None:

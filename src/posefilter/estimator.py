@@ -11,6 +11,7 @@ import torch
 from omegaconf import OmegaConf
 
 from posefilter.confidence.blank import find_blank
+from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.images import Images, check_images, make_batch
@@ -33,6 +34,8 @@ class Estimator:
         methods: A method an object, with its weights, its recipe and its object.
         device: Where to compute; None: on the GPU where there is one.
         costs: What errors cost, which verdicts go by.
+        pose_tolerance: What a right pose is, which verdicts go by; None: an ADD below 0.1
+            diameters.
 
     Raises:
         UserError: There is no method, or one that detects and estimates no pose.
@@ -43,6 +46,7 @@ class Estimator:
         methods: Sequence[PoseEstimator],
         device: str | torch.device | None = None,
         costs: Costs | None = None,
+        pose_tolerance: PoseTolerance | None = None,
     ) -> None:
         if not methods:
             raise UserError("an estimator needs the weights of one object at least")
@@ -57,7 +61,14 @@ class Estimator:
             raise UserError(f"device={device}: cannot be used ({why})") from error
         if not isinstance(costs, Costs | None):
             raise UserError(f"costs={costs!r}: expected posefilter.Costs(...)")
-        self.costs = costs or Costs()
+        if not isinstance(pose_tolerance, PoseTolerance | None):
+            raise UserError(
+                f"pose_tolerance={pose_tolerance!r}: expected posefilter.PoseTolerance(...)"
+            )
+        self.costs, self.pose_tolerance = costs or Costs(), pose_tolerance
+        for method in self.methods if pose_tolerance is not None else ():
+            if method.calibration is not None:
+                method.calibration.fit_success(pose_tolerance)  # refused now, or ready
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
 
     def __repr__(self) -> str:
@@ -117,7 +128,7 @@ class Estimator:
         if instances is not None:
             several = self._detect(images, count_instances(instances, self.objects), seed)
             return several if batched else several[0]
-        found = collect_results(self.run(images, seed), self.costs)
+        found = collect_results(self.run(images, seed), self.costs, self.pose_tolerance)
         answers = [own if len(self.methods) > 1 else own[0] for own in found]
         return answers if batched else answers[0]
 
@@ -130,7 +141,7 @@ class Estimator:
             A list an image, of a `Result` an object.
         """
         images, _ = check_images(rgb, depth, intrinsics)
-        return collect_results(self.run(images, seed), self.costs)
+        return collect_results(self.run(images, seed), self.costs, self.pose_tolerance)
 
     def _detect(self, images: Images, counts: Sequence[int], seed: int) -> list[list[Result]]:
         """Find several instances: a list of results an image, the most probable first."""
@@ -153,7 +164,7 @@ class Estimator:
                 spent = seconds[number] / many[number]
                 method, batch = self.methods[number], batches[number]
                 run = Run(method, batch, trace, spent, each.assessment, blank=blank[i : i + 1])
-                result = make_result(run, 0, self.costs)
+                result = make_result(run, 0, self.costs, self.pose_tolerance)
                 mask = resize_mask(each.mask, size).cpu().numpy()
                 # a conformal set holds for the filter that was calibrated, this one is smaller
                 which = before[number]
@@ -169,16 +180,14 @@ class Estimator:
         for method, size in zip(self.methods, self._sizes, strict=True):
             batch = Batch(*(x.to(method.device) for x in make_batch(images, *size)))
             method.seed = seed
-            start, found, inliers = time.perf_counter(), None, None
+            start = time.perf_counter()
             with torch.no_grad():
                 trace = method.predict_step(batch, 0)
-                if method.calibration is not None:
-                    features = method.collect_features(trace, batch)
-                    found, inliers = method.calibration.assess(features), features["surface"]
+                found = method.assess(trace, batch)
                 apparent = method.measure_apparent_size(trace, batch)
             trace.belief.best.cpu()  # waits for a GPU
             seconds = (time.perf_counter() - start) / len(images.depth)
-            runs.append(Run(method, batch, trace, seconds, found, inliers, apparent, blank))
+            runs.append(Run(method, batch, trace, seconds, found, apparent, blank))
         return runs
 
 

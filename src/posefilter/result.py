@@ -1,7 +1,7 @@
 """What an estimate amounts to: `posefilter.Result`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,8 +11,9 @@ import torch
 from posefilter.belief import Belief, Mode, PoseSet
 from posefilter.belief.summaries import check_probability
 from posefilter.confidence.apparent_size import ApparentSize
-from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
+from posefilter.confidence.tolerance import RIGHT, PoseTolerance
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
@@ -40,6 +41,8 @@ class Result:
             object's symmetries), as calibrated on validation scenes.  None where the checkpoint is
             not calibrated; `calibration_note` says why.
         presence: That the object is there, whatever the pose: at least `probability`, or None.
+        pose_tolerance: What a right pose is, which the verdict goes by; None: what `probability` is
+            of.  See `probability_within`.
         belief: Every particle and its weight.
         warnings: What makes the estimate implausible, in words; empty where nothing does.
         apparent_size: How large the object appears, relative to its mesh: 1 where the depth and the
@@ -51,6 +54,8 @@ class Result:
         seconds: The filter's time for this image, its share of a batch.
         object_model: The object's center, size, surface points and hull.
         costs: What errors cost, which the verdict goes by.
+        calibration: What made the probabilities; None where there are none.
+        features: What it made them of, by name.
         calibration_note: In words, why there is no probability; empty where there is one.
         conformal: What `conformal_set` goes by; None where the calibration has none.
         depth_inlier_fraction: The fraction of the object's surface points, those that face away
@@ -71,6 +76,9 @@ class Result:
     seconds: float
     object_model: ObjectModel
     costs: Costs = field(default_factory=Costs, kw_only=True)
+    pose_tolerance: PoseTolerance | None = field(default=None, kw_only=True)
+    calibration: Calibration | None = field(default=None, kw_only=True)
+    features: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     calibration_note: str = field(default="", kw_only=True)
     conformal: Conformal | None = field(default=None, kw_only=True)
     depth_inlier_fraction: float = field(default=math.nan, kw_only=True)
@@ -89,18 +97,51 @@ class Result:
         """What to go by: "found", "unsure" or "absent", whichever costs least on average.
 
         None where there is no probability.  Of an image that cannot be judged (`blank`) always
-        "unsure".  `decide` takes other costs.
+        "unsure".  `decide` takes other costs, and another tolerance.
         """
-        return self.decide(self.costs)
+        return self.decide(self.costs, self.pose_tolerance)
 
-    def decide(self, costs: Costs) -> Verdict | None:
-        """Return the verdict at other costs of errors; None where there is no probability."""
+    def decide(self, costs: Costs, pose_tolerance: PoseTolerance | None = None) -> Verdict | None:
+        """Return the verdict at other costs of errors; None where there is no probability.
+
+        Args:
+            costs: What errors cost.
+            pose_tolerance: What a right pose is; None: an ADD below 0.1 diameters.
+
+        Raises:
+            UserError: As of `probability_within`.
+        """
         if self.blank:
             return "unsure"
-        if self.probability is None or self.presence is None:
+        if self.presence is None:
             return None
-        verdict = decide(self.presence, self.probability, costs)
+        probability = self.probability_within(pose_tolerance or RIGHT)
+        verdict = decide(self.presence, probability, costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
+
+    def probability_within(self, pose_tolerance: PoseTolerance) -> float:
+        """Return the probability that the object is there and the pose within a tolerance.
+
+        It is learned from the same calibration frames as `probability`, from how far their
+        estimates are off.  Few frames tell little of a tolerance that nearly all of them keep, or
+        nearly none.
+
+        Args:
+            pose_tolerance: What a right pose is, such as `PoseTolerance(translation_mm=5,
+                rotation_deg=10)`, or `PoseTolerance(add_s=0.1)` where it does not matter how a can
+                is turned about its axis.
+
+        Raises:
+            UserError: There is no probability, or the checkpoint was calibrated by an earlier
+                version, which knows of no other tolerance than an ADD below 0.1 diameters.
+        """
+        if pose_tolerance == RIGHT and self.probability is not None:
+            return self.probability
+        if self.calibration is None or not self.features:
+            why = self.calibration_note or "the image cannot be judged"
+            raise UserError(f"{self.object}: has no probability ({why})")
+        row = {name: torch.tensor([value]) for name, value in self.features.items()}
+        return float(self.calibration.assess(row, pose_tolerance).probability)
 
     @property
     def model(self) -> ObjectModel:
@@ -184,10 +225,12 @@ class Result:
             return f"{self.object}: absent, probability {self.presence:.2f} that it is there"
         if self.verdict == "unsure" and self.wrong_size:
             return f"{self.object}: unsure, appears {self.apparent_size:.2f} times its size"
+        said, tolerance = f"probability {self.probability:.2f}", self.pose_tolerance
+        if tolerance is not None:
+            said = f"probability {self.probability_within(tolerance):.2f} {tolerance.describe()}"
         if self.verdict == "unsure":
-            there = f"{self.presence:.2f} that it is there"
-            return f"{self.object}: unsure, probability {self.probability:.2f}, {there}"
-        return f"{self.object}: {self.verdict}, probability {self.probability:.2f}"
+            return f"{self.object}: unsure, {said}, {self.presence:.2f} that it is there"
+        return f"{self.object}: found, {said}"
 
     def draw_belief(self, rgb: Any, intrinsics: Any) -> np.ndarray:
         """Draw the belief: rotations on a map, centers on the image, marginals.
@@ -247,27 +290,32 @@ class Run(NamedTuple):
     trace: Trace
     seconds: float  # an image
     found: Assessment | None = None  # None where there is no probability
-    # (B,) the feature `surface`; None where there is no probability
-    depth_inlier_fraction: torch.Tensor | None = None
     size: ApparentSize | None = None  # None where the method cannot tell
     blank: Sequence[str] = ()  # of each image, as `find_blank` says it; none: all can be judged
 
 
-def collect_results(runs: Sequence[Run], costs: Costs | None = None) -> list[list[Result]]:
+def collect_results(
+    runs: Sequence[Run], costs: Costs | None = None, pose_tolerance: PoseTolerance | None = None
+) -> list[list[Result]]:
     """Return the results of runs on the same images: a list an image, of a result an object.
 
     Args:
         runs: A run an object.
         costs: What errors cost; None: the default.
+        pose_tolerance: What a right pose is; None: an ADD below 0.1 diameters.
     """
     count = len(runs[0].batch.rgb)
-    return [[make_result(run, i, costs) for run in runs] for i in range(count)]
+    return [[make_result(run, i, costs, pose_tolerance) for run in runs] for i in range(count)]
 
 
-def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
+def make_result(
+    run: Run, image: int, costs: Costs | None = None, pose_tolerance: PoseTolerance | None = None
+) -> Result:
     """Return what a run amounts to for one image of its batch."""
     model, belief, found = run.method.model, run.trace.belief, run.found
-    calibration, inliers = run.method.calibration, run.depth_inlier_fraction
+    calibration = None if found is None else run.method.calibration
+    features = {} if found is None or found.features is None else found.features
+    values = {name: float(value[image]) for name, value in features.items()}
     weights = belief.log_weights[image].double().cpu().exp().numpy()
     center = model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
@@ -300,9 +348,12 @@ def make_result(run: Run, image: int, costs: Costs | None = None) -> Result:
         seconds=run.seconds,
         object_model=model,
         costs=costs or Costs(),
+        pose_tolerance=pose_tolerance,
+        calibration=calibration,
+        features=values,
         calibration_note="" if found is not None else explain_missing(run.method),
-        conformal=None if found is None or calibration is None else calibration.conformal,
-        depth_inlier_fraction=math.nan if inliers is None else float(inliers[image]),
+        conformal=None if calibration is None else calibration.conformal,
+        depth_inlier_fraction=values.get("surface", math.nan),
         apparent_size=size,
         wrong_size=wrong_size,
         blank=blank,

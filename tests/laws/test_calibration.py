@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from posefilter.confidence.calibration import LIMIT, Calibration, Logistic, read_calibration
+from posefilter.confidence.calibration import LIMIT, Calibration, read_calibration
 from posefilter.confidence.fit import (
     Frames,
     cross_validate,
     fit_calibration,
     fit_choice,
-    fit_logistic,
 )
+from posefilter.confidence.logistic import Logistic, fit_logistic
 from posefilter.confidence.verdicts import Costs, decide, score_verdicts
 from posefilter.errors import UserError
 from posefilter.metrics.confidence import calibration_error

@@ -23,9 +23,12 @@ def test_an_unsure_answer_says_both_whether_it_is_there_and_whether_it_is_right(
     assert Result.describe(one) == words  # type: ignore[arg-type]
 
 
+NOTHING = {"wrong_size": False, "blank": "", "pose_tolerance": None}
+
+
 def answer(verdict: str | None, **more: object) -> SimpleNamespace:
     own = {"object": "box", "probability": 0.9, "presence": 0.95, "score": 1.5}
-    return SimpleNamespace(verdict=verdict, **{"wrong_size": False, "blank": "", **own, **more})
+    return SimpleNamespace(verdict=verdict, **{**NOTHING, **own, **more})
 
 
 def test_an_image_that_cannot_be_judged_is_told_also_without_a_probability() -> None:

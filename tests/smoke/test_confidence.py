@@ -11,7 +11,7 @@ import pytest
 import torch
 from tests.smoke.conftest import SMALL_POSE_PF
 
-from posefilter import Costs, load
+from posefilter import Costs, PoseTolerance, load
 from posefilter.cli import run_command
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import build_method, recipe
@@ -150,6 +150,73 @@ def test_verdicts_go_by_what_errors_cost(
     assert "cost_miss=-1" in capfd.readouterr().err
 
 
+def plant_errors(path: Path, out: Path) -> Path:
+    """Write a copy whose calibration frames were all turned: wrong by ADD, right by ADD-S."""
+    content = torch.load(path, weights_only=True)
+    rows, none = content["calibration"]["errors"], len(content["calibration"]["features"])
+    count = len(rows["add"])
+    assert count == 12
+    assert rows["features"] != [[0.0] * none] * count
+    turned = {"translation": [0.001] * count, "rotation": [3.0] * count}
+    turned |= {"add": [0.5] * count, "add_s": [0.02] * count, "features": [[0.0] * none] * count}
+    content["calibration"]["errors"] = turned
+    torch.save(content, out)
+    return out
+
+
+def test_verdicts_go_by_a_tolerance_of_ones_own(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    turned = plant_errors(
+        plant(calibrated, tmp_path / "a.ckpt", 5.0, -3.0), tmp_path / "turned.ckpt"
+    )
+    photo = photograph(tiny_scenes)
+    typed = [f"checkpoint={turned}", *photo]
+    told = []
+    for number, words in enumerate(
+        ([], ["pose_tolerance.add_s=0.1"], ["pose_tolerance.add_s=0.1", "pose_tolerance.add=0.2"])
+    ):
+        out = f"out={tmp_path / str(number)}"
+        assert run_command("predict", HOME, [*typed, *words, out]) == 0
+        told.append(json.loads((tmp_path / str(number) / "pose.json").read_text()))
+    assert [one["verdict"] for one in told] == ["unsure", "found", "unsure"]
+    assert len({one["probability"] for one in told}) == 1  # always that of ADD
+    assert told[0]["probability_within"] is told[0]["pose_tolerance"] is None
+    assert told[1]["probability_within"] > 0.9 > 0.1 > told[2]["probability_within"]
+    assert told[1]["pose_tolerance"]["add_s"] == 0.1
+    several = [f"checkpoint=[{turned},{calibrated}]", *photo, "pose_tolerance.add_s=0.1"]
+    assert run_command("predict", HOME, [*several, f"out={tmp_path / 'both'}"]) < 2
+    rows = json.loads((tmp_path / "both" / "poses.json").read_text())
+    assert rows[0]["verdict"] == "found"
+    capfd.readouterr()
+    plain = [*typed[:-2], "threads=1", f"out={tmp_path / 'plain'}"]
+    assert run_command("predict", HOME, plain) == 0
+    assert "within ADD-S 0.1 d: its place is surer" in capfd.readouterr().out
+    for wrong, said in (
+        ("pose_tolerance.add=-1", "pose_tolerance.add=-1"),
+        ("pose_tolerance.mm=5", "pose_tolerance.mm"),
+    ):
+        assert run_command("predict", HOME, [*typed, wrong, f"out={tmp_path / 'wrong'}"]) == 2
+        assert said in capfd.readouterr().err
+    assert not (tmp_path / "wrong").exists()
+
+
+def test_a_calibration_of_an_earlier_version_knows_no_tolerance_and_says_so(
+    calibrated: Path, tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    content = torch.load(calibrated, weights_only=True)
+    del content["calibration"]["errors"]
+    torch.save(content, tmp_path / "old.ckpt")
+    typed = [f"checkpoint={tmp_path / 'old.ckpt'}", *photograph(tiny_scenes)]
+    for command, words in (
+        ("predict", [*typed, f"out={tmp_path / 'a'}"]),
+        ("evaluate", [typed[0], f"data.root={tiny_scenes}", *QUIET, f"out={tmp_path / 'b'}"]),
+    ):
+        assert run_command(command, HOME, [*words, "pose_tolerance.translation_mm=5"]) == 2
+        assert "calibrate it again" in capfd.readouterr().err
+    assert run_command("predict", HOME, [*typed, f"out={tmp_path / 'c'}"]) < 2
+
+
 def test_the_library_gives_what_the_command_gives(
     calibrated: Path, weights: Path, tiny_scenes: Path
 ) -> None:
@@ -160,7 +227,24 @@ def test_the_library_gives_what_the_command_gives(
     assert 0 <= result.probability <= result.presence <= 1
     assert result.verdict in ("found", "unsure", "absent")
     assert result.decide(Costs(miss=1e6)) != "absent"
+    within = PoseTolerance(translation_mm=20, rotation_deg=30)
+    assert 0 < result.probability_within(within) <= result.presence
+    assert result.probability_within(PoseTolerance(add=0.1)) == result.probability
+    again = load(calibrated, device="cpu", pose_tolerance=within).predict(rgb, depth, K)
+    assert again.verdict == result.decide(Costs(), within)
+    assert again.probability_within(within) == result.probability_within(within)
+    assert again.probability == result.probability
+    words = f"{again.probability_within(within):.2f} within 20 mm and 30 degrees"
+    assert again.verdict == "absent" or words in again.describe()
+    several = load(calibrated, device="cpu", pose_tolerance=within)
+    for one in several.predict(rgb, depth, K, instances=1):
+        assert one.pose_tolerance == within
+        assert 0 < one.probability_within(within) <= one.presence
     plain = load(weights, device="cpu").predict(rgb, depth, K)
+    with pytest.raises(UserError, match="has no probability"):
+        plain.probability_within(within)
+    with pytest.raises(UserError, match="expected posefilter.PoseTolerance"):
+        load(weights, pose_tolerance=0.1)  # type: ignore[arg-type]
     assert plain.probability is plain.presence is plain.verdict is None
     assert "run calibrate" in plain.calibration_note
     other = load(calibrated, overrides=["filter.particles=8"], device="cpu").predict(rgb, depth, K)
@@ -177,6 +261,12 @@ def test_an_evaluation_reports_how_much_the_probability_tells(
     assert metrics["confidence"]["frames"] == metrics["instances"] > 5
     assert metrics["confidence"]["frames_without"] == 0
     assert 0 <= metrics["confidence"]["ece"] <= 1
+    assert metrics["confidence"]["pose_tolerance"] == "within ADD 0.1 d"
+    wide = [*typed[:-1], f"out={tmp_path / 'wide'}", "pose_tolerance.translation_mm=1e6"]
+    assert run_command("evaluate", HOME, [*wide, "data.split={train: 0, val: 0, test: 1.0}"]) == 0
+    wide_metrics = json.loads((tmp_path / "wide" / "metrics.json").read_text())
+    assert wide_metrics["confidence"]["wrong"] == 0 < metrics["confidence"]["wrong"]
+    assert wide_metrics["add"] == metrics["add"]
     with (tmp_path / "errors.csv").open() as file:
         rows = list(csv.DictReader(file))
     with (tmp_path / "poses.csv").open() as file:

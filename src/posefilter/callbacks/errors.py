@@ -86,7 +86,8 @@ def measure_batch(
     shares = on_object(batch.mask, method.particle_pixels(trace.particles[-1], batch)).tolist()
     seconds = method.seconds_per_image[-1] if method.seconds_per_image else math.nan
     scores, times = trace.belief.score.tolist(), [seconds] * count
-    found = [values.tolist() for values in method.last_assessment(count)]
+    judged = method.last_assessment(count)
+    found = [judged.presence.tolist(), judged.probability.tolist()]
     if "pose" in method.capabilities:
         at_truth = method.scores["credibility"].last()
         found += [at_truth.log_density.tolist(), at_truth.rank.tolist()]

@@ -27,6 +27,7 @@ from posefilter.confidence.fit import (
     fit_choice,
     make_frames,
 )
+from posefilter.confidence.tolerance import PoseErrors, measure_pose_errors
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.data.absent import hide_annotation
 from posefilter.data.dataset import FrameDataset
@@ -35,7 +36,6 @@ from posefilter.errors import UserError
 from posefilter.locks import hold
 from posefilter.metrics.confidence import Confidence
 from posefilter.metrics.credibility import score_truth
-from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.metrics.registry import find_metric
 from posefilter.models.base import PoseEstimator
 from posefilter.progress import watched
@@ -107,7 +107,7 @@ def collect_frames(
     shown: bool = False,
 ) -> Frames:
     """Run a filter on frames with the object and without, and return what speaks for each
-    estimate, and whether it is right.
+    estimate, and how far it is off.
 
     Args:
         method: A method with its weights.
@@ -115,7 +115,7 @@ def collect_frames(
         absent: Frames without.
         shown: Draw a bar.
     """
-    values, there, right, scores = [], [], [], []
+    values, there, errors, scores = [], [], [], []
     parts = [(one, True) for one in present] + [(one, False) for one in absent]
     batches = [
         (batch, is_there) for one, is_there in parts for batch in make_loader(one, _BATCH, 0)
@@ -127,20 +127,15 @@ def collect_frames(
             trace = method.predict_step(seen, number)
             values.append(method.collect_features(trace, seen))
         there.append(np.full(len(truth), is_there))
-        right.append(is_there & is_right(method, trace.belief.best.cpu(), truth).numpy())
-        own = np.full(len(truth), np.nan)
+        nothing = np.full(len(truth), np.nan)
+        off, surprise = PoseErrors(*[nothing] * 4), nothing
         if is_there:
-            own = score_truth(trace.belief, truth, method.model).nonconformity.numpy()
-        scores.append(own)
-    return make_frames(values, there, right, scores)
-
-
-def is_right(method: PoseEstimator, best: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-    """Return which estimates are within 0.1 diameters (ADD) of the truth, or of a pose that the
-    object's symmetries make of it.  (B, 4, 4) x 2 -> (B,) bool.
-    """
-    model = method.model
-    return add_up_to_symmetry(best, truth, model.points, model.symmetries) < 0.1 * model.diameter
+            measured = measure_pose_errors(trace.belief.best.cpu(), truth, method.model)
+            off = PoseErrors(*(part.double().numpy() for part in measured))
+            surprise = score_truth(trace.belief, truth, method.model).nonconformity.numpy()
+        errors.append(off)
+        scores.append(surprise)
+    return make_frames(values, there, errors, scores)
 
 
 def learn(
@@ -176,7 +171,8 @@ def measure_quality(frames: Frames, found: Assessment) -> dict[str, Any]:
     """Return the numbers of `Confidence` for probabilities of frames, at the default costs."""
     metric = Confidence()
     there, right = torch.from_numpy(frames.there), torch.from_numpy(frames.right)
-    metric.update(*found, there, right, score_verdicts(found, Costs()))
+    verdicts = score_verdicts(found, Costs())
+    metric.update(found.presence, found.probability, there, right, verdicts)
     quality: dict[str, Any] = metric.compute()
     return quality
 

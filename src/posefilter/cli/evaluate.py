@@ -23,6 +23,7 @@ from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.reuse import check_same
+from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
@@ -85,6 +86,9 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method = method_of(checkpoint, changes(job.cfg))
     if job.cfg.seed is not None:
         method.seed = job.cfg.seed
+    method.pose_tolerance = read_pose_tolerance(job.cfg.pose_tolerance) or RIGHT
+    if method.calibration is not None:
+        method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)
     data = build_data(
         data_settings(job, checkpoint["recipe"]["settings"], method.model.name), job.cfg.console

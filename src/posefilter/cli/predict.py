@@ -17,6 +17,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
+from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
 from posefilter.confidence.verdicts import Costs
 from posefilter.data.readers.decode import read_color, read_depth
 from posefilter.errors import NotThere, UserError
@@ -41,6 +42,7 @@ _PROBABILITY = (
     "that the object is in the image and the pose within 0.1 diameters (ADD), calibrated on "
     "validation scenes of which half showed the object; presence: that it is in the image"
 )
+_SURFACE = PoseTolerance(add_s=0.1)
 _COVARIANCE = (
     "about the mean pose: x, y, z of the object's center in the camera's axes [m], then the "
     "rotation vector about it in the object's own axes [rad]"
@@ -65,15 +67,15 @@ def predict_one(job: Job) -> list[Result]:
     view.rrd.
     """
     cfg, folder = job.cfg, job.folder
-    costs = read_costs(cfg)
+    costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
     method = method_of(read_checkpoint(cfg.checkpoint), changes(cfg), lightning=False)
-    estimator = Estimator([method])
+    estimator = Estimator([method], pose_tolerance=tolerance)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     shape = load_shape(open_shapes(cfg, [method.model.name]), method.model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
-    ((result,),) = collect_results([run], costs)
+    ((result,),) = collect_results([run], costs, tolerance)
     folder.mkdir(parents=True, exist_ok=True)
     save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
     save_image(result.draw_band(rgb, K, shape), folder / "band.png")
@@ -110,8 +112,9 @@ def predict_several(job: Job) -> list[Result]:
     found; one overlay of those that are not absent; poses.csv, and each one's belief.
     """
     cfg, folder = job.cfg, job.folder
-    costs = read_costs(cfg)
-    estimator = Estimator(methods_of(cfg.checkpoint, changes(cfg)), costs=costs)
+    costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
+    methods = methods_of(cfg.checkpoint, changes(cfg))
+    estimator = Estimator(methods, costs=costs, pose_tolerance=tolerance)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
     store = open_shapes(cfg, estimator.objects)
@@ -196,10 +199,22 @@ def print_result(result: Result) -> None:
         print(f"{result.describe()}, {result.seconds:.2f} s")
     else:
         print(f"{result.describe()}, at {place} mm, {result.seconds:.2f} s")
+    if is_found_by_surface(result):
+        said = f"probability {result.probability_within(_SURFACE):.2f} {_SURFACE.describe()}"
+        print(
+            f"{said}: its place is surer than its rotation (pose_tolerance.add_s={_SURFACE.add_s})"
+        )
     if result.verdict != "absent":
         print(f"the belief: {result.belief.uncertainty().describe()}")
     for warning in result.warnings:
         print(f"warning: {warning}")
+
+
+def is_found_by_surface(result: Result) -> bool:
+    """Tell whether an unsure object would be found if ADD-S were all that counts."""
+    known = result.calibration is not None and result.calibration.errors is not None
+    asked = result.verdict == "unsure" and result.pose_tolerance is None
+    return asked and known and result.decide(result.costs, _SURFACE) == "found"
 
 
 def describe_uncertainty(result: Result) -> dict[str, Any]:
@@ -229,6 +244,7 @@ def describe(
         "probability": result.probability,
         "presence": result.presence,
         "probability_is": result.calibration_note or _PROBABILITY,
+        **describe_tolerance(result),
         "camera_from_object": None if absent else pose.tolist(),
         "rotation": None if absent else pose[:3, :3].tolist(),
         "translation_mm": None if absent else (1000 * pose[:3, 3]).tolist(),
@@ -240,6 +256,16 @@ def describe(
         "visible_pixels": None if result.mask is None else int(result.mask.sum()),
         "seconds": result.seconds,
     }
+
+
+def describe_tolerance(result: Result) -> dict[str, Any]:
+    """Return the probability that the verdict goes by where a tolerance is given."""
+    tolerance = result.pose_tolerance
+    if tolerance is None:
+        return {"pose_tolerance": None, "probability_within": None}
+    known = result.probability is not None
+    within = result.probability_within(tolerance) if known else None
+    return {"pose_tolerance": asdict(tolerance), "probability_within": within}
 
 
 def describe_belief(result: Result) -> dict[str, Any]:
@@ -279,6 +305,8 @@ def describe_absent(
         "probability": None,
         "presence": None,
         "probability_is": _PROBABILITY,
+        "pose_tolerance": None,
+        "probability_within": None,
         "costs": asdict(costs),
         "camera_from_object": None,
         "rotation": None,

@@ -1,22 +1,29 @@
 """The calibrated probability: two logistic regressions on features of a finished filter.
 
 presence    = sigmoid(a . x + b)                that the object is in the image
-probability = presence * sigmoid(c . x + d)     that it is, and the pose within 0.1 diameters
+probability = presence * sigmoid(c . x + d)     that it is, and the pose right: ADD < 0.1 diameters
 
 x are the features, standardized by the calibration frames and limited to `LIMIT` standard
 deviations on either side: what lies beyond what calibration saw counts as its edge. Each feature is
 such that more of it speaks for the estimate, and a, c >= 0: so both probabilities rise with each.
+
+The errors of the calibration frames' estimates are kept, so that c and d can be fitted to another
+tolerance when it is asked for.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from posefilter.confidence.conformal import GROUPED_BY, Conformal
+from posefilter.confidence.logistic import Logistic, fit_logistic
+from posefilter.confidence.tolerance import RIGHT, PoseErrors, PoseTolerance
 from posefilter.errors import UserError
 
 LIMIT = 3.0  # standard deviations
@@ -29,15 +36,8 @@ _RENAMED = {  # features, by their names in earlier versions
     "recognized": "mask_recall",
     "glimpsed": "top_objectness",
 }
-_LATER = {"conformal", "choice"}  # keys that earlier versions do not have
+_LATER = {"conformal", "choice", "errors"}  # keys that earlier versions do not have
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
-
-
-class Logistic(NamedTuple):
-    """A logistic regression on standardized features."""
-
-    weights: tuple[float, ...]  # >= 0
-    bias: float
 
 
 class Assessment(NamedTuple):
@@ -45,6 +45,32 @@ class Assessment(NamedTuple):
 
     presence: Tensor  # (B,) that the object is there
     probability: Tensor  # (B,) that it is there and the pose right; at most `presence`
+    features: Mapping[str, Tensor] | None = None  # (B,) each, that they are of
+
+
+@dataclass(frozen=True)
+class CalibrationErrors:
+    """Features and pose errors of the n calibration frames that show the object.
+
+    Attributes:
+        features: (n, F), standardized, in the order of the calibration's.
+        translation: (n,), as the other three of `PoseErrors`.
+        rotation: (n,).
+        add: (n,).
+        add_s: (n,).
+    """
+
+    features: tuple[tuple[float, ...], ...]
+    translation: tuple[float, ...]
+    rotation: tuple[float, ...]
+    add: tuple[float, ...]
+    add_s: tuple[float, ...]
+
+    def accepted_by(self, tolerance: PoseTolerance) -> np.ndarray:
+        """Return which of the estimates keep a tolerance, (n,) bool."""
+        errors = PoseErrors(*(np.array(getattr(self, name)) for name in PoseErrors._fields))
+        accepted: np.ndarray = tolerance.accepts(errors)
+        return accepted
 
 
 @dataclass(frozen=True)
@@ -64,6 +90,8 @@ class Calibration:
         choice: Whether the first answer of a filter is right, object there or not, counted as if
             half of them were; several answers to one image are compared by it. None: of an earlier
             version, whose filter gives one answer.
+        errors: What the success at other tolerances is learned from. None: of an earlier version,
+            which knows of an ADD below 0.1 diameters alone.
     """
 
     features: tuple[str, ...]
@@ -76,26 +104,47 @@ class Calibration:
     quality: Mapping[str, float]
     conformal: Conformal | None = None
     choice: Logistic | None = None
+    errors: CalibrationErrors | None = None
 
-    def assess(self, values: Mapping[str, Tensor]) -> Assessment:
+    def assess(self, values: Mapping[str, Tensor], tolerance: PoseTolerance = RIGHT) -> Assessment:
         """Return the probabilities of estimates.
 
         Args:
             values: Features (B,) by name; more than the calibration uses does no harm.
+            tolerance: What a right pose is.
 
         Raises:
-            UserError: The method has no feature of a name that the calibration uses.
+            UserError: The method has no feature of a name that the calibration uses, or the
+                calibration knows of no other tolerance.
         """
-        return self.assess_features(self._stack(values))
+        return self.assess_features(self._stack(values), tolerance)._replace(features=values)
 
-    def assess_features(self, x: Tensor) -> Assessment:
+    def assess_features(self, x: Tensor, tolerance: PoseTolerance = RIGHT) -> Assessment:
         """Return the probabilities of features (B, F), in the order of `features`.
 
         A feature that is not a number speaks against the estimate as far as any can.
         """
         x = self._standardize(x)
-        presence, success = (_evaluate(one, x) for one in (self.presence, self.success))
+        parts = (self.presence, self.fit_success(tolerance))
+        presence, success = (_evaluate(one, x) for one in parts)
         return Assessment(presence, presence * success)
+
+    def fit_success(self, tolerance: PoseTolerance = RIGHT) -> Logistic:
+        """Return the regression of whether the pose of an object that is there keeps a tolerance.
+
+        Each tolerance has a regression of its own, from the same frames.
+
+        Raises:
+            UserError: The calibration is of an earlier version.
+        """
+        if tolerance == RIGHT:
+            return self.success
+        if self.errors is None:
+            raise UserError(
+                "pose_tolerance: the checkpoint was calibrated by an earlier version, which knows "
+                "of an ADD below 0.1 diameters alone; calibrate it again"
+            )
+        return _fit_success(self.errors, tolerance)
 
     def rank(self, values: Mapping[str, Tensor]) -> Tensor:
         """Return what answers to one image are compared by, (B,) in [0, 1]; see `choice`.
@@ -121,8 +170,7 @@ class Calibration:
         return torch.stack([values[name].detach().double().cpu() for name in self.features], dim=-1)
 
     def _standardize(self, x: Tensor) -> Tensor:
-        x = (x - x.new_tensor(self.center)) / x.new_tensor(self.scale)
-        return x.nan_to_num(-LIMIT).clamp(-LIMIT, LIMIT)
+        return torch.from_numpy(standardize(x.numpy(), self.center, self.scale))
 
     def to_plain(self) -> dict[str, Any]:
         """Return it as dictionaries, lists, numbers and strings; `read_calibration` reads them."""
@@ -135,6 +183,9 @@ class Calibration:
             scores = [list(own) for own in self.conformal.scores]
             edges, by = list(self.conformal.edges), self.conformal.by
             plain["conformal"] = {"by": by, "edges": edges, "scores": scores}
+        if self.errors is not None:
+            plain["errors"] = {key: list(x) for key, x in asdict(self.errors).items()}
+            plain["errors"]["features"] = [list(row) for row in self.errors.features]
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
@@ -143,6 +194,17 @@ class Calibration:
 def _evaluate(one: Logistic, x: Tensor) -> Tensor:
     """Return the probability by a regression on standardized features.  (B, F) -> (B,)."""
     return torch.sigmoid(x @ x.new_tensor(one.weights) + one.bias)
+
+
+def standardize(x: np.ndarray, center: Sequence[float], scale: Sequence[float]) -> np.ndarray:
+    """Return features (n, F) as the regressions take them."""
+    x = (x - np.array(center)) / np.array(scale)
+    return np.nan_to_num(x, nan=-LIMIT).clip(-LIMIT, LIMIT)
+
+
+@lru_cache(maxsize=256)
+def _fit_success(errors: CalibrationErrors, tolerance: PoseTolerance) -> Logistic:
+    return fit_logistic(np.array(errors.features), errors.accepted_by(tolerance))
 
 
 def read_calibration(content: Any, said: str) -> Calibration:
@@ -199,6 +261,7 @@ def _read(content: Any) -> Calibration:
         dict(zip(quality, numbers, strict=True)),
         _conformal(content.get("conformal")),
         None if content.get("choice") is None else _logistic(content["choice"], count, "choice"),
+        _errors(content.get("errors"), count),
     )
 
 
@@ -207,6 +270,24 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
         raise ValueError(f"should have weights and bias in {name}")
     weights = _numbers(content["weights"], count, f"{name}'s weights", least=0.0)
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
+
+
+def _errors(content: Any, count: int) -> CalibrationErrors | None:
+    if content is None:
+        return None
+    names = {field.name for field in fields(CalibrationErrors)}
+    if not isinstance(content, dict) or set(content) != names:
+        raise ValueError(f"should have {', '.join(sorted(names))} in errors")
+    rows = content["features"]
+    if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SCORES:
+        raise ValueError(f"should have the features of 1 to {_MOST_SCORES} frames in errors")
+    values = [
+        _numbers(content[name], len(rows), f"errors' {name}", least=0.0)
+        for name in PoseErrors._fields
+    ]
+    return CalibrationErrors(
+        tuple(_numbers(row, count, "errors' features") for row in rows), *values
+    )
 
 
 def _conformal(content: Any) -> Conformal | None:

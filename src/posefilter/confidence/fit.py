@@ -1,13 +1,4 @@
-"""Fit a calibration to frames with and without the object.
-
-Each regression is the maximum of a posterior (MAP): a logistic likelihood with Platt's targets
-(1999), which are a little off 0 and 1 as few frames warrant, and a normal prior on the weights,
-which are not negative. It is convex, so that the same frames give the same calibration.
-
-References:
-    Platt: Probabilistic outputs for support vector machines. Advances in Large Margin Classifiers
-        (1999).
-"""
+"""Fit a calibration to frames with and without the object."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,12 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from posefilter.confidence.calibration import LIMIT, Assessment, Calibration, Logistic
+from posefilter.confidence.calibration import (
+    Assessment,
+    Calibration,
+    CalibrationErrors,
+    standardize,
+)
 from posefilter.confidence.conformal import choose_edges, fit_conformal
+from posefilter.confidence.logistic import Logistic, fit_logistic
+from posefilter.confidence.tolerance import RIGHT, PoseErrors
 from posefilter.errors import UserError
 
 FEWEST = 10  # frames with the object, and without
-PENALTY = 1.0  # of the squared weights: the inverse variance of their prior
 
 
 class Frames(NamedTuple):
@@ -33,25 +30,31 @@ class Frames(NamedTuple):
     right: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
     # (n,) of the true pose, NaN where the object is not in the image [nat]; None: not measured
     nonconformity: np.ndarray | None = None
+    # of (n,) each, NaN where the object is not in the image; None: not measured
+    errors: PoseErrors | None = None
 
     def select(self, index: np.ndarray) -> "Frames":
         """Return some of the frames."""
         nonconformity = None if self.nonconformity is None else self.nonconformity[index]
+        errors = None if self.errors is None else PoseErrors(*(x[index] for x in self.errors))
         own = (self.values[index], self.there[index], self.right[index])
-        return Frames(self.features, *own, nonconformity)
+        return Frames(self.features, *own, nonconformity, errors)
 
 
 def make_frames(
     values: Sequence[Mapping[str, torch.Tensor]],
     there: Sequence[np.ndarray],
-    right: Sequence[np.ndarray],
+    errors: Sequence[PoseErrors],
     nonconformity: Sequence[np.ndarray],
 ) -> Frames:
-    """Return the frames of batches of features, each (B,) by name."""
+    """Return the frames of batches of features, each (B,) by name; errors are NaN where the object
+    is not in the image.
+    """
     names = tuple(values[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
-    parts = (np.concatenate(one) for one in (rows, there, right, nonconformity))
-    return Frames(names, *parts)
+    all_rows, seen, scores = (np.concatenate(one) for one in (rows, there, nonconformity))
+    off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
+    return Frames(names, all_rows, seen, RIGHT.accepts(off), scores, off)
 
 
 def fit_choice(frames: Frames, source: str) -> Calibration:
@@ -144,48 +147,22 @@ def _fit(
     x = _standardize(frames, out)
     share = there.mean()
     balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
+    errors = None
+    if frames.errors is not None:
+        rows = tuple(tuple(row) for row in x[there].tolist())
+        own = (tuple(part[there].tolist()) for part in frames.errors)
+        errors = CalibrationErrors(rows, *own)
     return replace(
         out,
         presence=fit_logistic(x, there, balance),
         success=fit_logistic(x[there], right[there]),
+        errors=errors,
     )
 
 
 def _standardize(frames: Frames, calibration: Calibration) -> np.ndarray:
     """Return the features as a calibration standardizes them, (n, F)."""
-    x = (frames.values - np.array(calibration.center)) / np.array(calibration.scale)
-    return np.nan_to_num(x, nan=-LIMIT).clip(-LIMIT, LIMIT)
-
-
-def fit_logistic(
-    x: np.ndarray, label: np.ndarray, balance: np.ndarray | None = None, penalty: float = PENALTY
-) -> Logistic:
-    """Return the logistic regression of highest posterior density, with weights of 0 or more.
-
-    Args:
-        x: (n, F) standardized features.
-        label: (n,) bool.
-        balance: (n,) how much each frame counts; None: 1.
-        penalty: Inverse variance of the weights' normal prior.
-    """
-    from scipy.optimize import minimize  # prediction needs none
-
-    count = np.ones(len(x)) if balance is None else balance
-    many, few = float(count[label].sum()), float(count[~label].sum())
-    target = np.where(label, (many + 1) / (many + 2), 1 / (few + 2))
-
-    def loss(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        weights, bias = parameters[:-1], parameters[-1]
-        z = x @ weights + bias
-        value = (count * (np.logaddexp(0, z) - target * z)).sum()
-        slope = count * (1 / (1 + np.exp(-z)) - target)
-        gradient = np.append(x.T @ slope + penalty * weights, slope.sum())
-        return value + 0.5 * penalty * weights @ weights, gradient
-
-    start = np.zeros(x.shape[1] + 1)
-    bounds = [(0, None)] * x.shape[1] + [(None, None)]
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, tol=1e-10).x
-    return Logistic(tuple(found[:-1].tolist()), float(found[-1]))
+    return standardize(frames.values, calibration.center, calibration.scale)
 
 
 def cross_validate(
@@ -212,5 +189,5 @@ def cross_validate(
             continue
         part = _fit(frames.select(np.flatnonzero(fold != k)), "held_out", {}, first)
         found = part.assess_features(torch.from_numpy(frames.values[held]))
-        presence[held], probability[held] = found
+        presence[held], probability[held] = found.presence, found.probability
     return Assessment(presence, probability)

@@ -220,8 +220,7 @@ def _judge(one: Detection, costs: Costs) -> Verdict | None:
     """Return the verdict on a detection; None where nothing is known of it."""
     if one.assessment is None:
         return None
-    presence, probability = (float(value[0]) for value in one.assessment)
-    return decide(presence, probability, costs)
+    return decide(float(one.assessment.presence[0]), one.probability, costs)
 
 
 def _keep_best(found: Sequence[Detection], counts: Sequence[int]) -> list[Detection]:

@@ -22,6 +22,7 @@ from posefilter.confidence.blank import find_blank
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.features import measure_belief, measure_depth, measure_print
 from posefilter.confidence.second_look import look_again
+from posefilter.confidence.tolerance import RIGHT, measure_pose_errors
 from posefilter.confidence.verdicts import Costs, score_verdicts
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
@@ -67,6 +68,7 @@ class PoseEstimator(Module):
     calibration: Calibration | None = None
     calibration_note: str = "the checkpoint is not calibrated (run calibrate)"
     costs = Costs()  # of errors, by which verdicts are chosen
+    pose_tolerance = RIGHT  # what a right pose is, in the metrics of probabilities
     test_only_settings: ClassVar[tuple[str, ...]] = ()  # settings that training does not read
 
     def __init__(
@@ -238,7 +240,8 @@ class PoseEstimator(Module):
         """
         if self.calibration is None:
             return None
-        return self.calibration.assess(self.collect_features(trace, batch))
+        features = self.collect_features(trace, batch)
+        return self.calibration.assess(features, self.pose_tolerance)
 
     # -- training ---------------------------------------------------------------------------------
 
@@ -380,7 +383,8 @@ class PoseEstimator(Module):
         """
         if self.calibration is None or "confidence" not in self.scores:
             return Assessment(*torch.full((2, count), torch.nan, dtype=torch.float64))
-        return Assessment(*self.scores["confidence"].rows[-1][:, :2].T)
+        presence, probability = self.scores["confidence"].rows[-1][:, :2].T
+        return Assessment(presence, probability)
 
     def judge_confidence(self, trace: Trace, batch: Batch, there: bool) -> None:
         """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it
@@ -391,17 +395,17 @@ class PoseEstimator(Module):
             batch: Its images.
             there: Whether the object is in them; if not, the batch's poses are not used.
         """
-        from posefilter.metrics.errors import add_up_to_symmetry  # trees of scipy
-
         size = self.measure_apparent_size(trace, batch)
         if size is not None and there:
             self.scores["apparent_size"].update(size.scale, size.contradicts())
         found = self.assess(trace, batch)
         if found is None:
             return
-        model, best = self.model, trace.belief.best
-        error = add_up_to_symmetry(best, batch.camera_from_object, model.points, model.symmetries)
-        right = (error < 0.1 * model.diameter) & there
+        right = torch.zeros(len(batch.rgb), dtype=torch.bool)
+        if there:
+            truth = batch.camera_from_object
+            errors = measure_pose_errors(trace.belief.best, truth, self.model)
+            right = self.pose_tolerance.accepts(errors)
         verdict = score_verdicts(found, self.costs)
         if size is not None:  # of a wrong size none is found
             verdict = torch.where(
@@ -411,7 +415,9 @@ class PoseEstimator(Module):
         pairs = zip(rgb.numpy(), depth.numpy(), strict=True)
         blank = torch.tensor([bool(find_blank(*pair)) for pair in pairs])
         verdict = torch.where(blank.to(verdict.device), 0, verdict)  # as of a result
-        self.scores["confidence"].update(*found, torch.full_like(right, there), right, verdict)
+        self.scores["confidence"].update(
+            found.presence, found.probability, torch.full_like(right, there), right, verdict
+        )
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
@@ -445,6 +451,8 @@ class PoseEstimator(Module):
         out["belief"] = self.scores["belief"].compute() if "poses" in self.scores else None
         known = self.calibration is not None and "confidence" in self.scores
         out["confidence"] = self.scores["confidence"].compute() if known else None
+        if known:
+            out["confidence"]["pose_tolerance"] = self.pose_tolerance.describe()
         for name in ("credibility", "by_visibility", "apparent_size", "parts"):
             out[name] = self.scores[name].compute() if name in self.scores else None
         return out

@@ -1,0 +1,120 @@
+"""How far an estimate may be off and still be right: by default ADD below 0.1 diameters, or a
+tolerance of the user's own, such as what a gripper allows.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from posefilter.errors import UserError
+from posefilter.geometry.pose import origin_of, rotation_of
+from posefilter.geometry.rotation import angle_between
+from posefilter.types import ObjectModel
+
+
+class PoseErrors(NamedTuple):
+    """Errors of B estimates, up to the object's symmetries: (B,) each, tensors or arrays."""
+
+    translation: Any  # of the object's center [m]
+    rotation: Any  # [rad]
+    add: Any  # [diameters]
+    add_s: Any  # [diameters]
+
+
+@dataclass(frozen=True)
+class PoseTolerance:
+    """What an estimate has to keep to be right: all of what is given.
+
+    Errors are to the pose that the object's symmetries make of the truth and that is nearest by
+    ADD. ADD-S asks where the surface lies, and not which way the object is turned where its shape
+    hardly tells, as of a can about its axis or of a mug whose handle is hidden.
+
+    Attributes:
+        translation_mm: Largest error of the object's center [mm].
+        rotation_deg: Largest error of the rotation [degrees].
+        add: Largest ADD [diameters].
+        add_s: Largest ADD-S [diameters].
+
+    Raises:
+        UserError: None is given, or one is no positive number.
+    """
+
+    translation_mm: float | None = None
+    rotation_deg: float | None = None
+    add: float | None = None
+    add_s: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        given = {key: value for key, value in asdict(self).items() if value is not None}
+        for key, value in given.items():
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (number and 0 < value < math.inf):
+                raise UserError(f"pose_tolerance.{key}={value}: must be a positive number")
+        if not given:
+            names = ", ".join(field.name for field in fields(self))
+            raise UserError(f"pose_tolerance: gives none of {names}")
+
+    def accepts(self, errors: PoseErrors) -> Any:
+        """Return which estimates keep it, (B,) bool, of tensors or arrays alike."""
+        limits = (
+            None if self.translation_mm is None else self.translation_mm / 1000,
+            None if self.rotation_deg is None else math.radians(self.rotation_deg),
+            self.add,
+            self.add_s,
+        )
+        pairs = zip(errors, limits, strict=True)
+        kept = [error < limit for error, limit in pairs if limit is not None]
+        out = kept[0]
+        for one in kept[1:]:
+            out = out & one
+        return out
+
+    def describe(self) -> str:
+        """Return it in a few words: `within 5 mm and 10 degrees`."""
+        said = {
+            "translation_mm": "{:g} mm",
+            "rotation_deg": "{:g} degrees",
+            "add": "ADD {:g} d",
+            "add_s": "ADD-S {:g} d",
+        }
+        given = [(said[key], value) for key, value in asdict(self).items() if value is not None]
+        return f"within {' and '.join(text.format(value) for text, value in given)}"
+
+
+RIGHT = PoseTolerance(add=0.1)  # what `probability` is of
+
+
+def read_pose_tolerance(given: Mapping[str, Any] | None) -> PoseTolerance | None:
+    """Return the tolerance of a configuration; None where all of it is null."""
+    if given is None or all(value is None for value in given.values()):
+        return None
+    return PoseTolerance(**given)
+
+
+def measure_pose_errors(poses: Tensor, truth: Tensor, model: ObjectModel) -> PoseErrors:
+    """Return how far estimates are off.
+
+    Args:
+        poses: (B, 4, 4) camera_from_object [m].
+        truth: (B, 4, 4).
+        model: The object.
+    """
+    from posefilter.metrics.errors import add, add_s  # trees of scipy, prediction needs none
+
+    truth, points = truth.to(poses), model.points.to(poses)
+    equal = truth[:, None] @ model.symmetries.to(truth)
+    distances = add(poses[:, None], equal, points)
+    least, which = distances.min(1)
+    near = equal[torch.arange(len(equal)), which]
+    center = model.center.to(poses)
+    return PoseErrors(
+        (origin_of(poses, center) - origin_of(near, center)).norm(dim=-1),
+        angle_between(rotation_of(poses), rotation_of(near)),
+        least / model.diameter,
+        add_s(poses, truth, points) / model.diameter,
+    )
