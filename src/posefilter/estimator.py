@@ -66,8 +66,8 @@ class Estimator:
                 f"pose_tolerance={pose_tolerance!r}: expected posefilter.PoseTolerance(...)"
             )
         self.costs, self.pose_tolerance = costs or Costs(), pose_tolerance
-        for method in self.methods if pose_tolerance is not None else ():
-            if method.calibration is not None:
+        for method in self.methods:
+            if pose_tolerance is not None and method.calibration is not None:
                 method.calibration.fit_success(pose_tolerance)  # refused now, or ready
         self._sizes = tuple(get_trained_size(one.recipe.get("settings", {})) for one in methods)
 

@@ -243,7 +243,7 @@ def test_the_library_gives_what_the_command_gives(
     plain = load(weights, device="cpu").predict(rgb, depth, K)
     with pytest.raises(UserError, match="has no probability"):
         plain.probability_within(within)
-    with pytest.raises(UserError, match="expected posefilter.PoseTolerance"):
+    with pytest.raises(UserError, match=r"expected posefilter\.PoseTolerance"):
         load(weights, pose_tolerance=0.1)  # type: ignore[arg-type]
     assert plain.probability is plain.presence is plain.verdict is None
     assert "run calibrate" in plain.calibration_note
