@@ -35,6 +35,7 @@ import cv2
 import numpy as np
 import torch
 from checkpoint_frames import open_frames
+from confidence import read_tolerance
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.confidence.fit import Frames, fit_calibration
@@ -303,11 +304,10 @@ def main() -> int:
     parser.add_argument("--cross", type=Path, help="the same, of calibrations on these rows")
     parser.add_argument("--most", type=int, help="frames with the object, and without, of these")
     parser.add_argument("--leave-out", nargs="+", default=[], help="witnesses")
-    parser.add_argument("--tolerance", nargs="+", default=["add=0.1"], help="such as add_s=0.1")
+    parser.add_argument("--tolerance", nargs="+", default=[], help="such as add_s=0.1")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    pairs = (one.split("=") for one in options.tolerance)
-    tolerance = PoseTolerance(**{name: float(value) for name, value in pairs})
+    tolerance = read_tolerance(options.tolerance) or RIGHT
     whole = True
     if options.table is None and options.cross is None:
         if not (options.files and options.root and options.meshes and options.rows):

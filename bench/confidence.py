@@ -2,13 +2,13 @@
 what calibrated checkpoints declare.
 
     python bench/confidence.py --source ycb_video --root DIR --meshes DIR [--weights FILE ...]
-        [--every 10] [--input depth_x2 ...] [--out FILE.json]
+        [--every 10] [--input depth_x2 ...] [--tolerance add_s=0.1] [--out FILE.json]
 
 Photographs serve as a test alone: no calibration sees them.  `--input` spoils what a user types or
 connects: a wrong depth scale, intrinsics of another resolution or with two numbers exchanged, the
 depth of another photograph, colors exchanged or upside down.  `--input all` does so in every way,
 with the objects that a photograph shows, and counts the answers that are declared found and wrong
-(ADD of 0.1 diameters or more, up to symmetry).
+(ADD of 0.1 diameters or more, up to symmetry; or by --tolerance, see `posefilter.PoseTolerance`).
 """
 
 import argparse
@@ -23,10 +23,10 @@ import torch
 from marked import format_row
 
 import posefilter
+from posefilter.confidence.tolerance import RIGHT, PoseTolerance, measure_pose_errors
 from posefilter.data.frames import FrameRecord, Reader, Sample
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
-from posefilter.metrics.errors import add_up_to_symmetry
 from posefilter.result import Result
 
 Inputs = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -90,11 +90,23 @@ def list_images(reader: Reader, every: int) -> list[list[int]]:
 
 
 def is_right(result: Result, sample: Sample) -> bool:
-    """Return whether a pose is within 0.1 diameters (ADD, up to symmetry)."""
+    """Return whether a pose keeps the tolerance that was asked for, else 0.1 diameters (ADD)."""
     truth = torch.from_numpy(sample.camera_from_object).double()[None]
-    model = result.object_model
-    pose, symmetries = torch.from_numpy(result.pose)[None], model.symmetries.double()
-    return bool(add_up_to_symmetry(pose, truth, model.points, symmetries) < 0.1 * model.diameter)
+    errors = measure_pose_errors(torch.from_numpy(result.pose)[None], truth, result.object_model)
+    return bool((result.pose_tolerance or RIGHT).accepts(errors))
+
+
+def read_tolerance(words: list[str]) -> PoseTolerance | None:
+    """Return the tolerance of words such as add_s=0.1; None where there are none."""
+    pairs = (one.split("=") for one in words)
+    return PoseTolerance(**{name: float(value) for name, value in pairs}) if words else None
+
+
+def probability_of(result: Result) -> float | None:
+    """Return the probability that the verdict goes by; None where there is none."""
+    if result.pose_tolerance is None or result.probability is None:
+        return result.probability
+    return result.probability_within(result.pose_tolerance)
 
 
 def look(
@@ -118,7 +130,7 @@ def look(
         for result in results:
             row = {"object": result.object, "image": records[own[0]].name, "input": spoil}
             row |= {"there": result.object in there, "verdict": result.verdict}
-            row |= {"probability": result.probability, "presence": result.presence}
+            row |= {"probability": probability_of(result), "presence": result.presence}
             row |= {"apparent_size": result.apparent_size, "wrong_size": result.wrong_size}
             if result.object in there:
                 row["right"] = is_right(result, there[result.object])
@@ -171,6 +183,7 @@ def main() -> int:
     parser.add_argument("--meshes", required=True)
     parser.add_argument("--every", type=int, default=10, help="images of a scene")
     parser.add_argument("--input", choices=[*SPOILED, "all"], default="as_it_is")
+    parser.add_argument("--tolerance", nargs="+", default=[], help="such as add_s=0.1")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     meshes = open_meshes(options.meshes, None, options.source, None)
@@ -178,7 +191,7 @@ def main() -> int:
     weights = options.weights
     if options.input == "all" and weights == ["all"]:
         weights = list(reader.objects)
-    estimator = posefilter.load(weights)
+    estimator = posefilter.load(weights, pose_tolerance=read_tolerance(options.tolerance))
     inputs = list(SPOILED) if options.input == "all" else [options.input]
     images = list_images(reader, options.every)
     rows = [row for spoil in inputs for row in look(estimator, reader, images, spoil)]
