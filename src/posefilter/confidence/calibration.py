@@ -226,8 +226,11 @@ def read_calibration(content: Any, said: str) -> Calibration:
 
 def _read(content: Any) -> Calibration:
     names = {field.name for field in fields(Calibration)}
-    if not isinstance(content, dict) or set(content) | _LATER != names:
-        raise ValueError(f"should hold {', '.join(sorted(names))}, nothing else")
+    if not isinstance(content, dict) or not names <= set(content) | _LATER:
+        raise ValueError(f"should hold {', '.join(sorted(names))}")
+    if set(content) - names:
+        unknown = sorted(str(key)[:30] for key in set(content) - names)[0]
+        raise ValueError(f"holds {unknown!r}, which this version does not know; it may be of a newer one")
     features = content["features"]
     good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
     if not good or not all(isinstance(one, str) and _NAME.fullmatch(one) for one in features):
