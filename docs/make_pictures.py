@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from convergence import animate_convergence, encode_webp
 from PIL import Image
 
 from posefilter.cli.build import quiet
@@ -31,7 +32,6 @@ from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
 from posefilter.figures.belief import draw_belief
 from posefilter.figures.canvas import ESTIMATE, TRUTH, arrange_grid, draw_row, full_view
-from posefilter.figures.convergence import animate_convergence, encode_webp
 from posefilter.figures.layout import TITLE, draw_text
 from posefilter.figures.overlay import Shape, draw_poses, list_axes
 from posefilter.figures.particles import draw_iterations

@@ -15,6 +15,14 @@ class UserError(Exception):
     """
 
 
+def find_reason(error: Exception) -> str:
+    """Return what an error says in one line: its message's first, or its class where there is
+    none.
+    """
+    lines = str(error).splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
 class ProblemsFound(UserError):  # noqa: N818
     """A check was done, and something is wrong with what it checked: the commands exit with 1."""
 

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from posefilter.confidence.blank import find_blank
 from posefilter.confidence.tolerance import PoseTolerance
 from posefilter.confidence.verdicts import Costs
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.images import Images, check_images, make_batch
 from posefilter.instances.detect import detect
 from posefilter.instances.pixels import resize_mask
@@ -57,7 +57,7 @@ class Estimator:
         try:
             self.methods = tuple(method.to(device).eval() for method in methods)
         except (RuntimeError, AssertionError) as error:  # torch's, of devices that are not there
-            why = str(error).splitlines()[0]
+            why = find_reason(error)
             raise UserError(f"device={device}: cannot be used ({why})") from error
         if not isinstance(costs, Costs | None):
             raise UserError(f"costs={costs!r}: expected posefilter.Costs(...)")

@@ -68,8 +68,8 @@ UNITS = Range(
     "BOP's scene_camera.json calls 0.1 is 10000 here",
 )
 
-# By the end of a setting's place, the command's name before it: of several that fit, the longest
-# counts.  tests/conf/test_ranges.py holds it to have every number of conf/.
+# By the end of a setting's place, the command's name before it, `components` left out: of several
+# that fit, the longest counts.  tests/conf/test_ranges.py holds it to have every number of conf/.
 RANGES: dict[str, Range] = {
     # every command
     "seed": SEED,
@@ -191,10 +191,7 @@ RANGES: dict[str, Range] = {
     "trainer.num_sanity_val_steps": _whole(-1, 10**12),
     "trainer.gradient_clip_val": WEIGHT,
     "trainer.accumulate_grad_batches": COUNT,
-    "trainer.limit_train_batches": BATCHES,
-    "trainer.limit_val_batches": BATCHES,
-    "trainer.limit_test_batches": BATCHES,
-    "trainer.limit_predict_batches": BATCHES,
+    **{f"trainer.limit_{part}_batches": BATCHES for part in ("train", "val", "test", "predict")},
     "trainer.overfit_batches": BATCHES,
     "trainer.num_nodes": COUNT,
     "trainer.devices": _whole(1, 1024, words=("auto", -1), many=True),
@@ -224,7 +221,6 @@ RANGES: dict[str, Range] = {
     "schedule.initial_sigma": POSITIVE,
     "schedule.final_sigma": POSITIVE,
     "propagate.noise_scale": Range(0, 100),
-    "propagate.components.noise_scale": Range(0, 100),
     "uniform_angle_probability": SHARE,
     "resample.alpha": SHARE,
     "resample.epsilon": POSITIVE,
@@ -242,27 +238,16 @@ RANGES: dict[str, Range] = {
     "refine.top_k": _whole(0, 100_000),
     "refine.pixels": COUNT,
     "refine.sigma": METERS,
-    "refine.components.top_k": _whole(0, 100_000),
-    "refine.components.pixels": COUNT,
-    "refine.components.sigma": METERS,
-    "refine.components.steps": COUNT_OR_NONE,
-    "refine.components.iterations": COUNT,
-    "refine.components.antithetic_pairs": COUNT,
-    "refine.components.samples": COUNT,
-    "refine.components.rounds": COUNT,
-    "refine.components.sweeps": _whole(0, 10_000),
-    "refine.components.turn_probability": SHARE,
-    "refine.components.widening": Range(1, 1e6),
-    "refine.components.temperature": POSITIVE,
-    "refine.components.initial_scale": METERS,
-    "refine.components.final_scale": METERS,
-    "refine.components.initial_gate": METERS,
-    "refine.components.final_gate": METERS,
-    "refine.components.prior": METERS,
-    "refine.components.noise": METERS,
-    "refine.components.effective": POSITIVE,
-    "refine.components.points": COUNT,
-    "refine.components.learned_weight": WEIGHT,
+    "refine.steps": COUNT_OR_NONE,
+    "refine.antithetic_pairs": COUNT,
+    "refine.samples": COUNT,
+    "refine.rounds": COUNT,
+    "refine.sweeps": _whole(0, 10_000),
+    "refine.turn_probability": SHARE,
+    "refine.widening": Range(1, 1e6),
+    "refine.temperature": POSITIVE,
+    "refine.initial_scale": METERS,
+    "refine.final_scale": METERS,
     "refine.learned_weight": WEIGHT,
     "refine.iterations": COUNT,
     "refine.initial_gate": METERS,
@@ -333,9 +318,7 @@ RANGES: dict[str, Range] = {
     "loss.gamma": Range(0, 100),
     "loss.alpha": SHARE,
     "loss.weight": WEIGHT,
-    "aux_losses.displacement.weight": WEIGHT,
-    "aux_losses.likelihood.weight": WEIGHT,
-    "aux_losses.pose.weight": WEIGHT,
+    **{f"aux_losses.{name}.weight": WEIGHT for name in ("displacement", "likelihood", "pose")},
     "fragment_weight": WEIGHT,
     "offset_weight": WEIGHT,
     "label.size": _whole(1, 1024),
@@ -346,12 +329,10 @@ RANGES: dict[str, Range] = {
     "label.max_displacement": Range(0, 10, above=True),
     "margin_px": PIXELS,
     "loss_schedule.until": SHARE,
-    "loss_schedule.factors.loss": WEIGHT,
-    "loss_schedule.factors.likelihood": WEIGHT,
-    "loss_schedule.factors.displacement": WEIGHT,
-    "loss_schedule.factors.pose": WEIGHT,
-    "loss_schedule.factors.objectness": WEIGHT,
-    "loss_schedule.factors.sides": WEIGHT,
+    **{
+        f"loss_schedule.factors.{name}": WEIGHT
+        for name in ("loss", "likelihood", "displacement", "pose", "objectness", "sides")
+    },
 }
 
 
@@ -391,7 +372,8 @@ def find_range(place: str) -> Range | None:
     Args:
         place: Dotted, the command's name first.
     """
-    parts = [part.partition("[")[0] for part in place.split(".")]
+    names = [part.partition("[")[0] for part in place.split(".")]
+    parts = [name for name in names if name != "components"]  # the parts of a Compose
     ends = [".".join(parts[i:]) for i in range(len(parts))]
     entry = "[]" if place.endswith("]") else ""  # one of a list may have a range of its own
     keys = [key for end in ends for key in (f"{end}{entry}", end)]

@@ -7,7 +7,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from urllib.parse import urlparse
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.paths import is_plain_name
 
 # the address of a folder of weights with a registry.txt: lines of `<name>.ckpt sha256:<digest>`
@@ -140,5 +140,5 @@ def fetch_weights(name: str, url: str, cache: Path | None = None) -> Path:
             f"checkpoint={name}: {url} cannot be fetched ({type(error).__name__})"
         ) from error
     except (ValueError, OSError) as error:
-        reason = str(error).splitlines()[0][:200]
+        reason = find_reason(error)[:200]
         raise UserError(f"checkpoint={name}: {url} sent something else ({reason})") from error

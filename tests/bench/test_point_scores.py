@@ -6,7 +6,8 @@ from types import ModuleType
 import pytest
 import torch
 
-from posefilter.models.candidate_samplers import make_uniform_particles, one_step_trace
+from posefilter.filters.loop import make_particles
+from posefilter.models.candidate_samplers import one_step_trace
 from posefilter.types import ParticleOutput
 
 
@@ -21,7 +22,7 @@ def test_points_are_told_apart_and_padding_is_left_out(points: ModuleType) -> No
     own = torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     state = torch.stack([torch.zeros(6), torch.zeros(6), offset, own], dim=-1)[None]
     weights = torch.tensor([[1.0, 1.0, 1.0, 1.0, 1.0, 0.0]]).log()
-    particles = make_uniform_particles(state)._replace(log_weights=weights)
+    particles = make_particles(state, 0)._replace(log_weights=weights)
     scores = torch.arange(1.0, 7.0)[None]
     pose = torch.eye(4).expand(1, 6, 4, 4)
     output = ParticleOutput(scores, torch.zeros(1, 6, 6), pose, particles.latent)

@@ -10,7 +10,7 @@ from posefilter.cli.command import run_command
 from posefilter.data.readers.registry import open_reader
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
-from posefilter.metrics.bop_targets import Target, write_targets
+from posefilter.metrics.bop_targets import Target
 from posefilter.synthetic.generate import generate
 
 
@@ -87,7 +87,8 @@ def test_a_file_of_targets_says_how_many_count(scenes: Path, tmp_path: Path) -> 
     shifted = first.camera_from_native.copy()
     shifted[:3, 3] += np.array([0.0, 0.0, 5.0])
     path = tmp_path / "targets.json"
-    write_targets(path, [Target(first.scene_id, first.im_id, first.obj_id, 2)])
+    target = Target(first.scene_id, first.im_id, first.obj_id, 2)
+    path.write_text(json.dumps([target._asdict()]))
     only = [one for one in rows if one.im_id == first.im_id]
     found = evaluate(only, scenes, tmp_path / "one", str(path))
     assert found["bop"]["targets"] == 2

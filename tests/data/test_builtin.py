@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
+from ycb_sizes import YCB_SIZES
 
-from posefilter.meshes import ycb
 from posefilter.meshes.builtin import carton as builtin_carton
 from posefilter.meshes.builtin import catalog as builtin
 from posefilter.meshes.builtin.shapes import box, disc, lathe, tube, weld
@@ -57,11 +57,11 @@ def test_every_mesh_has_a_twin_to_be_measured_by() -> None:
 def test_sizes_are_those_of_ycb(name: str) -> None:
     twin, order = TWINS[name]
     size = np.ptp(builtin.build(name).vertices, axis=0)
-    expected = np.array(ycb.SIZES_ALIGNED[twin])[list(order)]
+    expected = np.array(YCB_SIZES[twin])[list(order)]
     if name == "brick":  # the table's y and z differ by a millimeter: either way up is right
         size, expected = np.sort(size), np.sort(expected)
     if name == "banana":
-        expected = np.array(ycb.SIZES_ALIGNED[twin])[[0, 2, 1]]
+        expected = np.array(YCB_SIZES[twin])[[0, 2, 1]]
     assert size == pytest.approx(expected, abs=8e-4)
 
 

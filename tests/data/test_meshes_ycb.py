@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from ycb_sizes import YCB_SIZES
 
 from posefilter.meshes import ycb
 from posefilter.meshes.mesh import (
@@ -54,7 +55,7 @@ def test_ids_and_sizes_are_those_of_fat(fat_settings: dict[str, dict]) -> None:
     assert list(fat_settings) == list(ycb.CLASSES)
     for name, entry in fat_settings.items():
         assert 12 * ycb.ycbvideo_index(name) == entry["segmentation_class_id"]
-        assert np.array(ycb.SIZES_ALIGNED[name]) * 100 == pytest.approx(
+        assert np.array(YCB_SIZES[name]) * 100 == pytest.approx(
             np.array(entry["cuboid_dimensions"]), abs=2e-3
         )
 
@@ -68,7 +69,7 @@ def test_meshes_fill_the_cuboids_of_fat(
         fat_settings[name]["fixed_model_transform"]
     )
     low, high = aligned[:, :3].min(0) / 100, aligned[:, :3].max(0) / 100
-    assert high - low == pytest.approx(np.array(ycb.SIZES_ALIGNED[name]), abs=1e-4)
+    assert high - low == pytest.approx(np.array(YCB_SIZES[name]), abs=1e-4)
     assert (high + low) / 2 == pytest.approx(np.zeros(3), abs=1e-4)
 
 

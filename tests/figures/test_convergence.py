@@ -8,16 +8,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from test_animation import HULL, RGB, H, K, W, pose, trace_of
-
-from posefilter.figures.canvas import ESTIMATE
-from posefilter.figures.convergence import (
+from docs.convergence import (
     animate_convergence,
     choose_keyframes,
     encode_webp,
     interpolate_poses,
 )
+from PIL import Image
+from test_animation import HULL, RGB, H, K, W, pose, trace_of
+
+from posefilter.figures.canvas import ESTIMATE
 from posefilter.geometry.pose import make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.types import BeliefBatch

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from posefilter.figures.canvas import draw_row, full_view, split_dashes
-from posefilter.figures.detections import Drawn, draw_detections, pick_colors, wrap_words
+from posefilter.figures.detections import Drawn, draw_detections, pick_colors
 from posefilter.figures.overlay import draw_overlay, outline_object
 
 H, W = 120, 160
@@ -63,14 +63,6 @@ def test_dashes_lie_on_the_line_and_are_spread_evenly(closed: bool) -> None:
     starts = np.stack(dashes)[:, 0]
     gaps = np.abs(np.diff(starts, axis=0)).sum(1)  # along the sides: city blocks
     assert np.allclose(gaps, length / len(dashes))
-
-
-def test_lines_are_no_wider_than_the_picture() -> None:
-    words = [f"{i:03d}_object," for i in range(20)]
-    lines = wrap_words(words, 300)
-    assert " ".join(lines).split() == words
-    assert len(lines) > 5
-    assert wrap_words(["a" * 500], 300) == ["a" * 500]
 
 
 def test_long_labels_have_lines_of_their_own_in_the_legend() -> None:

@@ -74,6 +74,7 @@ def test_long_writing_goes_on_in_the_next_line_and_loses_nothing() -> None:
     assert len(draw_text(text, TITLE)) == len(lines) * round(TITLE * 1.25)
     assert (draw_text(text, TITLE)[:, -3:] == 255).all()
     assert wrap_text("", letters, WIDTH) == [""]
+    assert wrap_text(f"no {'a' * 99} no", letters, WIDTH) == ["no", "a" * 99, "no"]
 
 
 def test_a_legend_shows_each_color_once_and_breaks_where_it_must() -> None:

@@ -6,20 +6,21 @@ import pytest
 import torch
 from tests.models.toy import scenes, square
 
+from posefilter.filters.loop import make_particles
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
 from posefilter.labels.paper_points import PaperPoints
 from posefilter.losses.contrastive import Contrastive, pose_distance
 from posefilter.losses.regression import Regression
 from posefilter.metrics.errors import add
-from posefilter.models.candidate_samplers import make_uniform_particles, one_step_trace
+from posefilter.models.candidate_samplers import one_step_trace
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Trace
 
 MODEL = square()
 
 
 def trace(poses: torch.Tensor, scores: torch.Tensor, sigma: float) -> Trace:
-    particles = make_uniform_particles(poses)
+    particles = make_particles(poses, 0)
     output = ParticleOutput(scores, torch.zeros(*scores.shape, 6), poses, particles.latent)
     return one_step_trace(particles, output, torch.full((len(poses),), sigma))
 
@@ -83,7 +84,7 @@ def test_the_papers_labels() -> None:
     offset = torch.tensor([-0.5, -0.011, -0.009, 0.009, 0.011, -0.009, 0.009, 0.02])
     own = torch.tensor([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
     state = torch.stack([torch.zeros(8), torch.zeros(8), offset, own], -1)[None]
-    particles = make_uniform_particles(state)
+    particles = make_particles(state, 0)
     output = ParticleOutput(
         torch.zeros(1, 8), torch.zeros(1, 8, 6), torch.eye(4).expand(1, 8, 4, 4), particles.latent
     )

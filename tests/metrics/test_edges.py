@@ -274,12 +274,13 @@ def test_the_score_of_a_detector_is_of_particles_and_box() -> None:
     assert flatten({"a": {"b": 1, "c": "x"}, "d": 2.5}) == {"a/b": 1.0, "d": 2.5}
 
 
-def test_found_and_finite_are_both_due() -> None:
+def test_a_pose_that_is_not_finite_is_missed() -> None:
     truth = torch.eye(4).expand(3, 4, 4)
     guess = truth.clone()
     guess[1, 2, 3] = torch.inf
+    guess[2] = torch.nan
     metric = PoseErrors([MODEL])
-    metric.update(guess, truth, found=torch.tensor([True, True, False]))
+    metric.update(guess, truth)
     assert metric.compute()["missed"] == 2
     empty = PoseErrors([MODEL]).compute()
     assert (empty["instances"], empty["missed"]) == (0, 0)

@@ -79,8 +79,9 @@ def test_misses_count_as_infinitely_wrong() -> None:
     truth = shifted(0, 0, 0, 0)
     guess = shifted(0.0, 0.005, 0.005, 0.05)
     guess[1, 0, 0] = math.nan
+    guess[2] = math.nan
     metric.update(guess[:2], truth[:2])
-    metric.update(guess[2:], truth[2:], found=torch.tensor([False, True]))
+    metric.update(guess[2:], truth[2:])
     found = metric.compute()
     assert (found["instances"], found["missed"]) == (4, 2)
     assert found["add"]["recall_2cm"] == 25

@@ -245,16 +245,3 @@ def test_candidates_hold_the_truth_whatever_the_camera() -> None:
     )
     relative = invert(batch.camera_from_object)[:, None] @ trace.particles[0].state
     assert (relative[:, 0] - torch.eye(4)).abs().max() < 1e-5
-
-
-def test_a_checkpoint_without_persistent_particles_is_reported(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    method = working()
-    checkpoint = {"object_model": method.model._asdict()}
-    method.on_load_checkpoint({**checkpoint, "candidate_sampler": {}})
-    assert not caplog.messages
-    method.on_load_checkpoint(checkpoint)
-    (warning,) = caplog.messages
-    assert "persistent particles" in warning
-    assert "\n" not in warning

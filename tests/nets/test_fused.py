@@ -148,7 +148,7 @@ def test_what_is_kept_of_a_network_goes_when_the_network_changes() -> None:
         assert torch.equal(halved, anew(0.02))
         for level in range(70):
             score(0.01 + 0.001 * level)
-        assert 1 <= fused.CACHE.count(likelihood) <= 32
+        assert 1 <= len(fused.CACHE._entries[likelihood].values) <= 32
 
 
 def test_weights_are_computed_once_for_a_noise_level(monkeypatch: pytest.MonkeyPatch) -> None:

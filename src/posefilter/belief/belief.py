@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.belief.sets import PoseSet, find_threshold
+from posefilter.belief.sets import PoseSet
 from posefilter.belief.storage import read_arrays, write_arrays
 from posefilter.belief.summaries import (
     AXES,
@@ -17,6 +17,7 @@ from posefilter.belief.summaries import (
     Projection,
     Uncertainty,
     check_probability,
+    find_quantile,
     measure_uncertainty,
     project_belief,
 )
@@ -190,7 +191,8 @@ class Belief:
         """
         check_probability("level", level)
         weights = self._density.log_weights.exp().numpy()
-        return self.highest_density_region(level, find_threshold(self._held_out, weights, level))
+        threshold = -find_quantile(-self._held_out, weights, level)
+        return self.highest_density_region(level, threshold)
 
     def highest_density_region(self, coverage: float, min_log_density: float) -> PoseSet:
         """Return the set of the poses whose log density is at least a threshold.

@@ -52,13 +52,3 @@ class PoseSet:
             (*) bool.
         """
         return np.asarray(self.log_density(poses) >= self.min_log_density)
-
-
-def find_threshold(values: np.ndarray, weights: np.ndarray, coverage: float) -> float:
-    """Return the largest number such that `coverage` of the weight has values of at least that.
-
-    (N,), (N,) that sum to 1 -> a value.
-    """
-    order = np.argsort(-values, kind="stable")
-    mass = np.cumsum(weights[order])
-    return float(values[order][min(int(np.searchsorted(mass, coverage - 1e-9)), len(values) - 1)])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.files import open_whole
 from posefilter.limits import MOST_BYTES
 
@@ -63,5 +63,5 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
         raise
     # a damaged archive, a header that lies of its array: their readers raise anything
     except Exception as error:
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        reason = find_reason(error)
         raise UserError(f"{path}: holds no belief as posefilter writes it ({reason})") from error

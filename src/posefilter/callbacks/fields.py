@@ -16,7 +16,7 @@ from torch import Tensor
 
 from posefilter.figures.field import PLANES, PointField, PoseField
 from posefilter.figures.maps import Proposals
-from posefilter.figures.particles import project_axes
+from posefilter.figures.particles import choose_steps, project_axes
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import (
     invert,
@@ -50,8 +50,7 @@ def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
     between them.
     """
     found = sorted({float(step.sigma.reshape(-1)[0]) for step in steps}, reverse=True)
-    picked = {round(i) for i in np.linspace(0, len(found) - 1, min(most, len(found))).tolist()}
-    return tuple(found[i] for i in sorted(picked))
+    return tuple(found[i] for i in choose_steps(len(found), most))
 
 
 def evaluate_pose_field(

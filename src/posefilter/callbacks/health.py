@@ -8,6 +8,7 @@ from lightning import LightningModule, Trainer
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.callbacks.trace_callback import TraceCallback
 from posefilter.figures.curves import draw_health
+from posefilter.figures.particles import choose_steps
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.beliefs import spread
 from posefilter.models.base import PoseEstimator
@@ -109,19 +110,7 @@ def name_scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
     """
     out: dict[str, float] = {}
     for name, values in curves.items():
-        for step in choose_evenly(len(values), most):
+        # a single one is the last
+        for step in choose_steps(len(values), most) if most > 1 else [len(values) - 1]:
             out[f"filter/{name}/step_{step:02d}"] = values[step]
     return out
-
-
-def choose_evenly(count: int, most: int) -> list[int]:
-    """Return at most `most` indices below `count`, evenly spread, the first and the last among
-    them.
-    """
-    if count <= most:
-        return list(range(count))
-    return (
-        sorted({round(i * (count - 1) / (most - 1)) for i in range(most)})
-        if most > 1
-        else [count - 1]
-    )

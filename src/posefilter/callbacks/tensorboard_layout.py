@@ -29,66 +29,53 @@ from posefilter.metrics.registry import find_metric
 
 Setting = bool | int | float | str
 
-Chart = tuple[str, list[str]]
-# Regular expressions of tags, one line each in a chart. What a method does not log, its charts
-# leave out.
-LAYOUT: dict[str, dict[str, Chart]] = {
+# By category and title of a chart, regular expressions of the tags whose lines it shows. What a
+# method does not log, its charts leave out.
+LAYOUT: dict[str, dict[str, list[str]]] = {
     "1  Does it work?": {
-        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": (
-            "Multiline",
-            ["val/score$"],
-        ),
-        "AUC of ADD and ADD-S": ("Multiline", [r"val/add/auc$", r"val/add_s/auc$"]),
-        "median error [mm]": ("Multiline", [r"val/add/median_mm$", r"val/add_s/median_mm$"]),
-        "found: share of the images [%]": (
-            "Multiline",
-            [r"val/add/recall_01d$", r"val/add/recall_2cm$"],
-        ),
-        "box IoU, and share of the particles on the object": (
-            "Multiline",
-            [r"val/iou$", r"val/particles_on_object$"],
-        ),
+        "score on validation (ADD AUC, or mean of box IoU and particles on the object)": [
+            "val/score$"
+        ],
+        "AUC of ADD and ADD-S": [r"val/add/auc$", r"val/add_s/auc$"],
+        "median error [mm]": [r"val/add/median_mm$", r"val/add_s/median_mm$"],
+        "found: share of the images [%]": [r"val/add/recall_01d$", r"val/add/recall_2cm$"],
+        "box IoU, and share of the particles on the object": [
+            r"val/iou$",
+            r"val/particles_on_object$",
+        ],
     },
     "2  Does it learn?": {
-        "losses": ("Multiline", [r"train/loss(_.*)?$"]),
-        "error of the proposed coordinates [mm]": ("Multiline", [r"train/coordinate_error_mm$"]),
-        "learning rate": ("Multiline", [r"train/learning_rate$"]),
+        "losses": [r"train/loss(_.*)?$"],
+        "error of the proposed coordinates [mm]": [r"train/coordinate_error_mm$"],
+        "learning rate": [r"train/learning_rate$"],
     },
     "3  What do the particles do?": {
-        "effective sample size over the number of particles, by iteration": (
-            "Multiline",
-            [r"filter/ess/step_\d+$"],
-        ),
-        "spread of the centers [m], by iteration": ("Multiline", [r"filter/spread_m/step_\d+$"]),
-        "spread of the rotations [rad], by iteration": (
-            "Multiline",
-            [r"filter/spread_rad/step_\d+$"],
-        ),
-        "spread [px], by iteration": ("Multiline", [r"filter/spread_px/step_\d+$"]),
-        "noise level [m] or [px], by iteration": ("Multiline", [r"filter/sigma_(m|px)/step_\d+$"]),
-        "diagnostics at the last iteration": ("Multiline", [r"diagnostics/.*/last$"]),
+        "effective sample size over the number of particles, by iteration": [
+            r"filter/ess/step_\d+$"
+        ],
+        "spread of the centers [m], by iteration": [r"filter/spread_m/step_\d+$"],
+        "spread of the rotations [rad], by iteration": [r"filter/spread_rad/step_\d+$"],
+        "spread [px], by iteration": [r"filter/spread_px/step_\d+$"],
+        "noise level [m] or [px], by iteration": [r"filter/sigma_(m|px)/step_\d+$"],
+        "diagnostics at the last iteration": [r"diagnostics/.*/last$"],
     },
     "4  Is the belief calibrated?": {
-        "coverage of the 50 % and 90 % mean-distance regions [%]": (
-            "Multiline",
-            [r"val/belief/(distance_)?coverage_\d+$"],  # both: a run that was begun before
-        ),
-        "weight near the truth": ("Multiline", [r"val/belief/mass_.*"]),
-        "share of the images in which a particle outscores the truth": (
-            "Multiline",
-            [r"val/belief/truth_outscored.*"],
-        ),
+        "coverage of the 50 % and 90 % mean-distance regions [%]": [
+            r"val/belief/(distance_)?coverage_\d+$"  # both: a run that was begun before
+        ],
+        "weight near the truth": [r"val/belief/mass_.*"],
+        "share of the images in which a particle outscores the truth": [
+            r"val/belief/truth_outscored.*"
+        ],
     },
     "5  How fast?": {
-        "images a second, in training and in validation": (
-            "Multiline",
-            [r"speed/(train|validation)_images_per_second$"],
-        ),
-        "share of the training that waits for data": ("Multiline", [r"speed/waiting_share$"]),
-        "validation: seconds, and the share of them that is drawing": (
-            "Multiline",
-            [r"speed/(validation_seconds|drawing_share)$"],
-        ),
+        "images a second, in training and in validation": [
+            r"speed/(train|validation)_images_per_second$"
+        ],
+        "share of the training that waits for data": [r"speed/waiting_share$"],
+        "validation: seconds, and the share of them that is drawing": [
+            r"speed/(validation_seconds|drawing_share)$"
+        ],
     },
 }
 
@@ -125,8 +112,12 @@ class TensorBoardLayout(Callback):
         """Write layout and settings."""
         if not trainer.is_global_zero:
             return
+        layout = {
+            category: {title: ("Multiline", tags) for title, tags in charts.items()}
+            for category, charts in LAYOUT.items()
+        }
         for writer in get_writers(trainer):
-            writer.add_summary(custom_scalars(LAYOUT))
+            writer.add_summary(custom_scalars(layout))
             for summary in describe_run(self.settings, self.swept, str(writer.get_logdir())):
                 writer.add_summary(summary)
 

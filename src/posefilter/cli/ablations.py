@@ -1,9 +1,9 @@
 """The ablations between the paper's methods and the working ones, as one ordered table.
 
-Each row is a name, what it changes, the row that it builds on, and overrides. Names begin with `s`
-for one modification of the paper's method alone, `c` for one more modification each, `m` for the
-working method without one of them; `pose_` and `box_` before it are for image-space methods with a
-pose and for detectors, `pose_pf_` for the pose-space method.
+Each row is a name, what it changes, and overrides; its series says what it builds on. Names begin
+with `s` for one modification of the paper's method alone, `c` for one more modification each, `m`
+for the working method without one of them; `pose_` and `box_` before it are for image-space methods
+with a pose and for detectors, `pose_pf_` for the pose-space method.
 """
 
 from typing import NamedTuple
@@ -20,6 +20,17 @@ class Ablation(NamedTuple):
     overrides: tuple[str, ...] = ()  # `group/choice=name` or `key.of.setting=value`
 
 
+def _build_on(parent: str, *rows: tuple[str, ...]) -> tuple[Ablation, ...]:
+    """Return a series of which each row builds on `parent`; rows are (name, text, *overrides)."""
+    return tuple(Ablation(name, text, parent, tuple(more)) for name, text, *more in rows)
+
+
+def _chain_from(parent: str, *rows: tuple[str, ...]) -> tuple[Ablation, ...]:
+    """Return a series of which each row builds on the row before it, the first on `parent`."""
+    parents = (parent, *(name for name, *_ in rows[:-1]))
+    return tuple(Ablation(row[0], row[1], p, row[2:]) for p, row in zip(parents, rows, strict=True))
+
+
 _BALANCED = "loss/aux/likelihood=balanced"
 _TOWARDS = "loss/aux/displacement=towards"
 _DETACHED = "model.detach_position=true"
@@ -29,252 +40,103 @@ _SMALL_NOISE = ("filter/propagate=learned_and_gaussian", "filter/schedule=pixels
 IMAGE_SPACE_ABLATIONS = (
     Ablation("paper", "The paper's.", "variant=paper"),
     Ablation("working", "All modifications.", "variant=working"),
-    Ablation("s1_glimpse", "Paper, with bilinear glimpses.", "paper", ("model/glimpse=smooth",)),
-    Ablation(
-        "s2_bounded", "Paper, with bounded displacement.", "paper", ("model/displacement=bounded",)
-    ),
-    Ablation(
-        "s3_balanced", "Paper, with a class-balanced loss on the likelihood.", "paper", (_BALANCED,)
-    ),
-    Ablation(
-        "s4_displacement_loss",
-        "Paper, with a loss on the displacement itself.",
+    *_build_on(
         "paper",
-        (_TOWARDS,),
+        ("s1_glimpse", "Paper, with bilinear glimpses.", "model/glimpse=smooth"),
+        ("s2_bounded", "Paper, with bounded displacement.", "model/displacement=bounded"),
+        ("s3_balanced", "Paper, with a class-balanced loss on the likelihood.", _BALANCED),
+        ("s4_displacement_loss", "Paper, with a loss on the displacement itself.", _TOWARDS),
+        ("s5_position", "Paper, without gradient through the position.", _DETACHED),
+        ("s6_informed",
+         "Paper, with half of the particles started on or around the object in training.",
+         "filter/initialize=informed"),
+        ("s7_context", "Paper, with features of the whole image.", "model/encoder=unet"),
+        ("s8_resample", "Paper, with resampling by likelihood.", "filter/resample=systematic"),
+        ("s9_displacement_loss_and_position",
+         "Paper, with a loss on the displacement itself, without gradient through the position.",
+         _TOWARDS, _DETACHED),
+        ("box_s10_steps", "Paper, with ten steps instead of 30 (detectors).", "filter.steps=10"),
     ),
-    Ablation("s5_position", "Paper, without gradient through the position.", "paper", (_DETACHED,)),
-    Ablation(
-        "s6_informed",
-        "Paper, with half of the particles started on or around the object in training.",
+    *_chain_from(
         "paper",
-        ("filter/initialize=informed",),
+        ("c1_normalization", "Paper, with normalization that does not mix particles.", _LAYER),
+        ("c2_glimpse", "Also bilinear glimpses.", "model/glimpse=smooth"),
+        ("c3_bounded", "Also bounded displacement.", "model/displacement=bounded"),
+        ("c4_balanced", "Also a class-balanced loss on the likelihood.", _BALANCED),
+        ("c5_displacement_loss", "Also a loss on the displacement itself.", _TOWARDS),
+        ("c6_position", "Also no gradient through the position.", _DETACHED),
+        ("c7_informed", "Also half of the particles started on or around the object in training.",
+         "filter/initialize=informed"),
+        ("c8_short", "Also training roll-outs of two steps.", "model/train_rollout=short"),
+        ("c9_context", "Also features of the whole image.", "model/encoder=unet"),
+        ("c10_resample",
+         "Also resampling by likelihood (in tests; the short roll-out of training has none).",
+         "filter/resample=systematic"),
     ),
-    Ablation(
-        "s7_context", "Paper, with features of the whole image.", "paper", ("model/encoder=unet",)
-    ),
-    Ablation(
-        "s8_resample",
-        "Paper, with resampling by likelihood.",
-        "paper",
-        ("filter/resample=systematic",),
-    ),
-    Ablation(
-        "s9_displacement_loss_and_position",
-        "Paper, with a loss on the displacement itself, without gradient through the position.",
-        "paper",
-        (_TOWARDS, _DETACHED),
-    ),
-    Ablation(
-        "box_s10_steps",
-        "Paper, with ten steps instead of 30 (detectors).",
-        "paper",
-        ("filter.steps=10",),
-    ),
-    Ablation(
-        "c1_normalization",
-        "Paper, with normalization that does not mix particles.",
-        "paper",
-        (_LAYER,),
-    ),
-    Ablation(
-        "c2_glimpse", "Also bilinear glimpses.", "c1_normalization", ("model/glimpse=smooth",)
-    ),
-    Ablation(
-        "c3_bounded", "Also bounded displacement.", "c2_glimpse", ("model/displacement=bounded",)
-    ),
-    Ablation(
-        "c4_balanced", "Also a class-balanced loss on the likelihood.", "c3_bounded", (_BALANCED,)
-    ),
-    Ablation(
-        "c5_displacement_loss",
-        "Also a loss on the displacement itself.",
-        "c4_balanced",
-        (_TOWARDS,),
-    ),
-    Ablation(
-        "c6_position",
-        "Also no gradient through the position.",
-        "c5_displacement_loss",
-        (_DETACHED,),
-    ),
-    Ablation(
-        "c7_informed",
-        "Also half of the particles started on or around the object in training.",
-        "c6_position",
-        ("filter/initialize=informed",),
-    ),
-    Ablation(
-        "c8_short",
-        "Also training roll-outs of two steps.",
-        "c7_informed",
-        ("model/train_rollout=short",),
-    ),
-    Ablation(
-        "c9_context", "Also features of the whole image.", "c8_short", ("model/encoder=unet",)
-    ),
-    Ablation(
+    *_chain_from(
         "c10_resample",
-        "Also resampling by likelihood (in tests; the short roll-out of training has none).",
-        "c9_context",
-        ("filter/resample=systematic",),
+        ("pose_c11_surface_point",
+         "Also a pose head on the particle's own object point, with a loss of its own.",
+         "model/pose_head=surface_point", "loss/aux/pose=surface_point"),
+        ("pose_c12_loss", "Also a loss on the pose that is weighted by its confidence.",
+         "loss=confidence"),
+        ("pose_c13_agreement", "Also the pose on which most particles agree as the estimate.",
+         "filter/estimate=agreement"),
+        ("pose_c14_fragments", "Also the own object point as a fragment and an offset in it.",
+         "model/pose_head=fragments"),
+        ("pose_c15_noise", "Also a little noise beside the learned displacement.", *_SMALL_NOISE),
+        ("pose_c16_gated", "Also displacement gated by the likelihood.",
+         "model/displacement=gated"),
+        ("pose_c17_muon", "Also Muon.", "optimizer=muon"),
     ),
-    Ablation(
-        "pose_c11_surface_point",
-        "Also a pose head on the particle's own object point, with a loss of its own.",
+    *_chain_from(
         "c10_resample",
-        ("model/pose_head=surface_point", "loss/aux/pose=surface_point"),
+        ("box_c11_votes", "Also votes for the box (detectors).", "model/box_head=votes"),
+        ("box_c12_gated", "Also displacement gated by the likelihood.", "model/displacement=gated"),
+        ("box_c13_muon", "Also Muon.", "optimizer=muon"),
+        ("box_c14_size",
+         "Also the working method's size: ten steps in tests, a narrower network with two layers "
+         "more.", f"{SIZE}=${{model}}"),
     ),
-    Ablation(
-        "pose_c12_loss",
-        "Also a loss on the pose that is weighted by its confidence.",
-        "pose_c11_surface_point",
-        ("loss=confidence",),
-    ),
-    Ablation(
-        "pose_c13_agreement",
-        "Also the pose on which most particles agree as the estimate.",
-        "pose_c12_loss",
-        ("filter/estimate=agreement",),
-    ),
-    Ablation(
-        "pose_c14_fragments",
-        "Also the own object point as a fragment and an offset in it.",
-        "pose_c13_agreement",
-        ("model/pose_head=fragments",),
-    ),
-    Ablation(
-        "pose_c15_noise",
-        "Also a little noise beside the learned displacement.",
-        "pose_c14_fragments",
-        _SMALL_NOISE,
-    ),
-    Ablation(
-        "pose_c16_gated",
-        "Also displacement gated by the likelihood.",
-        "pose_c15_noise",
-        ("model/displacement=gated",),
-    ),
-    Ablation("pose_c17_muon", "Also Muon.", "pose_c16_gated", ("optimizer=muon",)),
-    Ablation(
-        "box_c11_votes",
-        "Also votes for the box (detectors).",
-        "c10_resample",
-        ("model/box_head=votes",),
-    ),
-    Ablation(
-        "box_c12_gated",
-        "Also displacement gated by the likelihood.",
-        "box_c11_votes",
-        ("model/displacement=gated",),
-    ),
-    Ablation("box_c13_muon", "Also Muon.", "box_c12_gated", ("optimizer=muon",)),
-    Ablation(
-        "box_c14_size",
-        "Also the working method's size: ten steps in tests, a narrower network with two layers "
-        "more.",
-        "box_c13_muon",
-        (f"{SIZE}=${{model}}",),
-    ),
-    Ablation(
-        "m1_normalization",
-        "Working, with the paper's normalization.",
+    *_build_on(
         "working",
-        ("model.net.normalization=batch",),
+        ("m1_normalization", "Working, with the paper's normalization.",
+         "model.net.normalization=batch"),
+        ("m2_glimpse", "Working, with whole-pixel glimpses.", "model/glimpse=integer"),
+        ("m3_bounded", "Working, with displacement that is neither bounded nor gated.",
+         "model/displacement=unbounded"),
+        ("m4_balanced", "Working, without the loss on the likelihood.", "loss/aux/likelihood=none"),
+        ("m5_displacement_loss", "Working, without the loss on the displacement itself.",
+         "loss/aux/displacement=none"),
+        ("m6_position", "Working, with gradient through the position.",
+         "model.detach_position=false"),
+        ("m7_informed", "Working, with training particles that start anywhere.",
+         "model.train_filter.initialize.object_fraction=0.0"),
+        ("m8_short",
+         "Working, with full training roll-outs of particles half of which start on or around the "
+         "object.", "model/train_rollout=full", "filter/initialize=informed"),
+        ("m9_context", "Working, without features of the whole image.", "model/encoder=none"),
+        ("m10_resample",
+         "Working, without resampling (in tests; the short roll-out of training has none).",
+         "filter/resample=none"),
+        ("m11_muon", "Working, with AdamW instead of Muon.", "optimizer=adamw"),
+        ("m12_gated", "Working, with bounded displacement that is not gated.",
+         "model/displacement=bounded"),
+        ("m13_scheduler", "Working, with a constant learning rate.", "scheduler=none"),
+        ("pose_m14_surface_point",
+         "Working, with a pose head without a surface point (so that no agreement is possible).",
+         "model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax"),
+        ("pose_m15_loss", "Working, with the paper's ADD loss.", "loss=add"),
+        ("pose_m16_agreement", "Working, with the likeliest particle's pose as the estimate.",
+         "filter/estimate=argmax"),
+        ("pose_m17_fragments", "Working, with the own point predicted directly.",
+         "model/pose_head=surface_point"),
+        ("pose_m18_noise", "Working, without noise beside the learned displacement.",
+         "filter/propagate=learned", "filter/schedule=constant"),
+        ("box_m14_votes", "Working, without votes for the box (detectors).",
+         "model/box_head=quantiles"),
     ),
-    Ablation(
-        "m2_glimpse", "Working, with whole-pixel glimpses.", "working", ("model/glimpse=integer",)
-    ),
-    Ablation(
-        "m3_bounded",
-        "Working, with displacement that is neither bounded nor gated.",
-        "working",
-        ("model/displacement=unbounded",),
-    ),
-    Ablation(
-        "m4_balanced",
-        "Working, without the loss on the likelihood.",
-        "working",
-        ("loss/aux/likelihood=none",),
-    ),
-    Ablation(
-        "m5_displacement_loss",
-        "Working, without the loss on the displacement itself.",
-        "working",
-        ("loss/aux/displacement=none",),
-    ),
-    Ablation(
-        "m6_position",
-        "Working, with gradient through the position.",
-        "working",
-        ("model.detach_position=false",),
-    ),
-    Ablation(
-        "m7_informed",
-        "Working, with training particles that start anywhere.",
-        "working",
-        ("model.train_filter.initialize.object_fraction=0.0",),
-    ),
-    Ablation(
-        "m8_short",
-        "Working, with full training roll-outs of particles half of which start on or around the "
-        "object.",
-        "working",
-        ("model/train_rollout=full", "filter/initialize=informed"),
-    ),
-    Ablation(
-        "m9_context",
-        "Working, without features of the whole image.",
-        "working",
-        ("model/encoder=none",),
-    ),
-    Ablation(
-        "m10_resample",
-        "Working, without resampling (in tests; the short roll-out of training has none).",
-        "working",
-        ("filter/resample=none",),
-    ),
-    Ablation("m11_muon", "Working, with AdamW instead of Muon.", "working", ("optimizer=adamw",)),
-    Ablation(
-        "m12_gated",
-        "Working, with bounded displacement that is not gated.",
-        "working",
-        ("model/displacement=bounded",),
-    ),
-    Ablation(
-        "m13_scheduler", "Working, with a constant learning rate.", "working", ("scheduler=none",)
-    ),
-    Ablation(
-        "pose_m14_surface_point",
-        "Working, with a pose head without a surface point (so that no agreement is possible).",
-        "working",
-        ("model/pose_head=absolute", "loss/aux/pose=none", "filter/estimate=argmax"),
-    ),
-    Ablation("pose_m15_loss", "Working, with the paper's ADD loss.", "working", ("loss=add",)),
-    Ablation(
-        "pose_m16_agreement",
-        "Working, with the likeliest particle's pose as the estimate.",
-        "working",
-        ("filter/estimate=argmax",),
-    ),
-    Ablation(
-        "pose_m17_fragments",
-        "Working, with the own point predicted directly.",
-        "working",
-        ("model/pose_head=surface_point",),
-    ),
-    Ablation(
-        "pose_m18_noise",
-        "Working, without noise beside the learned displacement.",
-        "working",
-        ("filter/propagate=learned", "filter/schedule=constant"),
-    ),
-    Ablation(
-        "box_m14_votes",
-        "Working, without votes for the box (detectors).",
-        "working",
-        ("model/box_head=quantiles",),
-    ),
-)
+)  # fmt: skip
 
 _CANDIDATES = ("model/candidate_sampler=candidates", "loss=contrastive")
 _NO_NEGATIVES = "model.candidate_sampler.particles=0"
@@ -285,186 +147,78 @@ _TURNS = "filter/propagate=gaussian_and_turns"
 # paper's network only), context needs the dense network, and the filter's own particles need
 # candidates: these have no row alone, and c1 is the row of candidates alone.
 POSE_SPACE_ABLATIONS = (
-    Ablation(
-        "pose_pf_s4_schedule",
-        "Paper, with a noise level that falls.",
+    *_build_on(
         "paper",
-        ("filter/schedule=geometric",),
+        ("pose_pf_s4_schedule", "Paper, with a noise level that falls.",
+         "filter/schedule=geometric"),
+        ("pose_pf_s5_muon", "Paper, with Muon.", "optimizer=muon"),
+        ("pose_pf_s6_scheduler", "Paper, with a learning rate that falls.",
+         "scheduler=warmup_cosine"),
+        ("pose_pf_s7_proposals", "Paper, with poses voted by a dense network first.", *_DENSE),
+        ("pose_pf_s10_turns",
+         "Paper, with particles that also turn about the object's axes (and noise of 0.4 noise "
+         "levels in place of 0.5).", _TURNS),
+        ("pose_pf_s12_refine", "Paper, with a refined estimate.", "filter/refine=mean_shift_icp"),
     ),
-    Ablation("pose_pf_s5_muon", "Paper, with Muon.", "paper", ("optimizer=muon",)),
-    Ablation(
-        "pose_pf_s6_scheduler",
-        "Paper, with a learning rate that falls.",
+    *_chain_from(
         "paper",
-        ("scheduler=warmup_cosine",),
+        ("pose_pf_c1_contrast",
+         "Paper, trained on candidate poses of one image, among which the truth must score "
+         "highest, in place of labels.", *_CANDIDATES, _NO_NEGATIVES),
+        ("pose_pf_c2_network",
+         "Also a likelihood that is given the viewing ray and the noise level.",
+         "model/likelihood=contrastive"),
+        ("pose_pf_c3_negatives", "Also wrong poses of the filter's own.",
+         "model.candidate_sampler.particles=16"),
+        ("pose_pf_c4_schedule", "Also a noise level that falls.", "filter/schedule=geometric"),
+        ("pose_pf_c5_muon", "Also Muon.", "optimizer=muon"),
+        ("pose_pf_c6_scheduler", "Also a learning rate that falls.", "scheduler=warmup_cosine"),
+        ("pose_pf_c7_proposals",
+         "Also poses voted by a dense network, first and among the candidates.", *_DENSE),
+        ("pose_pf_c8_context", "Also the dense network's features at each image point.",
+         "model/likelihood=contextual"),
+        ("pose_pf_c9_surface", "Also the term of the pose's own surface.",
+         "model/likelihood=surface"),
+        ("pose_pf_c10_turns",
+         "Also particles that turn about the object's axes (and noise of 0.4 noise levels in "
+         "place of 0.5).", _TURNS),
+        ("pose_pf_c11_quasi_monte_carlo",
+         "Also image points of a low-discrepancy sequence. With the refinement it is `working`.",
+         "model.quasi_monte_carlo=true"),
     ),
-    Ablation(
-        "pose_pf_s7_proposals", "Paper, with poses voted by a dense network first.", "paper", _DENSE
-    ),
-    Ablation(
-        "pose_pf_s10_turns",
-        "Paper, with particles that also turn about the object's axes (and noise of 0.4 noise "
-        "levels in place of 0.5).",
-        "paper",
-        (_TURNS,),
-    ),
-    Ablation(
-        "pose_pf_s12_refine",
-        "Paper, with a refined estimate.",
-        "paper",
-        ("filter/refine=mean_shift_icp",),
-    ),
-    Ablation(
-        "pose_pf_c1_contrast",
-        "Paper, trained on candidate poses of one image, among which the truth must score highest, "
-        "in place of labels.",
-        "paper",
-        (*_CANDIDATES, _NO_NEGATIVES),
-    ),
-    Ablation(
-        "pose_pf_c2_network",
-        "Also a likelihood that is given the viewing ray and the noise level.",
-        "pose_pf_c1_contrast",
-        ("model/likelihood=contrastive",),
-    ),
-    Ablation(
-        "pose_pf_c3_negatives",
-        "Also wrong poses of the filter's own.",
-        "pose_pf_c2_network",
-        ("model.candidate_sampler.particles=16",),
-    ),
-    Ablation(
-        "pose_pf_c4_schedule",
-        "Also a noise level that falls.",
-        "pose_pf_c3_negatives",
-        ("filter/schedule=geometric",),
-    ),
-    Ablation("pose_pf_c5_muon", "Also Muon.", "pose_pf_c4_schedule", ("optimizer=muon",)),
-    Ablation(
-        "pose_pf_c6_scheduler",
-        "Also a learning rate that falls.",
-        "pose_pf_c5_muon",
-        ("scheduler=warmup_cosine",),
-    ),
-    Ablation(
-        "pose_pf_c7_proposals",
-        "Also poses voted by a dense network, first and among the candidates.",
-        "pose_pf_c6_scheduler",
-        _DENSE,
-    ),
-    Ablation(
-        "pose_pf_c8_context",
-        "Also the dense network's features at each image point.",
-        "pose_pf_c7_proposals",
-        ("model/likelihood=contextual",),
-    ),
-    Ablation(
-        "pose_pf_c9_surface",
-        "Also the term of the pose's own surface.",
-        "pose_pf_c8_context",
-        ("model/likelihood=surface",),
-    ),
-    Ablation(
-        "pose_pf_c10_turns",
-        "Also particles that turn about the object's axes (and noise of 0.4 noise levels in place "
-        "of 0.5).",
-        "pose_pf_c9_surface",
-        (_TURNS,),
-    ),
-    Ablation(
-        "pose_pf_c11_quasi_monte_carlo",
-        "Also image points of a low-discrepancy sequence. With the refinement it is `working`.",
-        "pose_pf_c10_turns",
-        ("model.quasi_monte_carlo=true",),
-    ),
-    Ablation(
-        "pose_pf_m1_contrast",
-        "Working, with the paper's likelihood trained on labeled points (so that there is no ray, "
-        "context or surface).",
+    *_build_on(
         "working",
-        ("model/likelihood=paper", "model/candidate_sampler=labeled_rays", "loss=regression"),
+        ("pose_pf_m1_contrast",
+         "Working, with the paper's likelihood trained on labeled points (so that there is no "
+         "ray, context or surface).",
+         "model/likelihood=paper", "model/candidate_sampler=labeled_rays", "loss=regression"),
+        ("pose_pf_m2_network", "Working, with the paper's likelihood trained on candidates.",
+         "model/likelihood=paper"),
+        ("pose_pf_m2_ray", "Working, without the viewing ray.", "model.likelihood.ray=false"),
+        ("pose_pf_m3_negatives", "Working, without wrong poses of the filter's own in training.",
+         _NO_NEGATIVES),
+        ("pose_pf_m4_schedule", "Working, with one noise level.", "filter/schedule=constant"),
+        ("pose_pf_m5_muon", "Working, with Adam.", "optimizer=adam"),
+        ("pose_pf_m6_scheduler", "Working, with a constant learning rate.", "scheduler=none"),
+        ("pose_pf_m7_start",
+         "Working, with first poses anywhere on the measured surfaces; the dense network remains.",
+         "filter/initialize=from_depth"),
+        ("pose_pf_m7_proposals",
+         "Working, without the dense network (so that there is no context).",
+         "model/proposals=none", "filter/initialize=from_depth", "model.likelihood.context=null"),
+        ("pose_pf_m8_context", "Working, without the dense network's features at the image points.",
+         "model.likelihood.context=null", "model.proposals.features=0"),
+        ("pose_pf_m9_surface", "Working, without the term of the pose's own surface.",
+         "model/likelihood=contextual"),
+        ("pose_pf_m10_turns", "Working, with particles that do not turn about the object's axes.",
+         "filter/propagate=gaussian"),
+        ("pose_pf_m11_quasi_monte_carlo", "Working, with independent image points.",
+         "model.quasi_monte_carlo=false"),
+        ("pose_pf_m12_refine", "Working, without refinement.", "filter/refine=none"),
+        ("pose_pf_m13_icp", "Working, without the alignment with the measured depth.",
+         "filter/refine=mean_shift"),
     ),
-    Ablation(
-        "pose_pf_m2_network",
-        "Working, with the paper's likelihood trained on candidates.",
-        "working",
-        ("model/likelihood=paper",),
-    ),
-    Ablation(
-        "pose_pf_m2_ray",
-        "Working, without the viewing ray.",
-        "working",
-        ("model.likelihood.ray=false",),
-    ),
-    Ablation(
-        "pose_pf_m3_negatives",
-        "Working, without wrong poses of the filter's own in training.",
-        "working",
-        (_NO_NEGATIVES,),
-    ),
-    Ablation(
-        "pose_pf_m4_schedule",
-        "Working, with one noise level.",
-        "working",
-        ("filter/schedule=constant",),
-    ),
-    Ablation("pose_pf_m5_muon", "Working, with Adam.", "working", ("optimizer=adam",)),
-    Ablation(
-        "pose_pf_m6_scheduler",
-        "Working, with a constant learning rate.",
-        "working",
-        ("scheduler=none",),
-    ),
-    Ablation(
-        "pose_pf_m7_start",
-        "Working, with first poses anywhere on the measured surfaces; the dense network remains.",
-        "working",
-        ("filter/initialize=from_depth",),
-    ),
-    Ablation(
-        "pose_pf_m7_proposals",
-        "Working, without the dense network (so that there is no context).",
-        "working",
-        (
-            "model/proposals=none",
-            "filter/initialize=from_depth",
-            "model.likelihood.context=null",
-        ),
-    ),
-    Ablation(
-        "pose_pf_m8_context",
-        "Working, without the dense network's features at the image points.",
-        "working",
-        ("model.likelihood.context=null", "model.proposals.features=0"),
-    ),
-    Ablation(
-        "pose_pf_m9_surface",
-        "Working, without the term of the pose's own surface.",
-        "working",
-        ("model/likelihood=contextual",),
-    ),
-    Ablation(
-        "pose_pf_m10_turns",
-        "Working, with particles that do not turn about the object's axes.",
-        "working",
-        ("filter/propagate=gaussian",),
-    ),
-    Ablation(
-        "pose_pf_m11_quasi_monte_carlo",
-        "Working, with independent image points.",
-        "working",
-        ("model.quasi_monte_carlo=false",),
-    ),
-    Ablation(
-        "pose_pf_m12_refine", "Working, without refinement.", "working", ("filter/refine=none",)
-    ),
-    Ablation(
-        "pose_pf_m13_icp",
-        "Working, without the alignment with the measured depth.",
-        "working",
-        ("filter/refine=mean_shift",),
-    ),
-)
+)  # fmt: skip
 ABLATIONS = (*IMAGE_SPACE_ABLATIONS, *POSE_SPACE_ABLATIONS)
 
 # Left out of the detectors' sweep: s5_position equals paper (a whole-pixel glimpse has no gradient

@@ -15,7 +15,7 @@ from posefilter.cli.job import Job
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.cli.trust import Scope
 from posefilter.confidence.calibration import read_calibration
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
@@ -80,7 +80,7 @@ def _check_references(settings: DictConfig) -> None:
         if OmegaConf.is_config(node):
             OmegaConf.to_container(node, resolve=True)
     except OmegaConfBaseException as error:
-        reason = str(error).splitlines()[0][:200]
+        reason = find_reason(error)[:200]
         raise UserError(f"model: its settings refer to what is not there ({reason})") from error
 
 

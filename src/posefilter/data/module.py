@@ -270,10 +270,6 @@ class PoseDataModule(LightningDataModule):
         )
         return FrameDataset(chosen, decoder.cache)
 
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the epoch whose augmentation is drawn (Lightning's loops do it by themselves)."""
-        self.train_dataset.set_epoch(epoch)
-
     def train_dataloader(self) -> DataLoader[Batch]:
         """Return shuffled, augmented batches; of several processes, each has frames of its own."""
         dataset = self.train_dataset

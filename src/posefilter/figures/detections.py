@@ -2,14 +2,14 @@
 outline, what is unsure with dashes; what is absent is only named.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from posefilter.figures.canvas import Color, draw_row, draw_tag, full_view, load_font
-from posefilter.figures.layout import draw_legend
+from posefilter.figures.layout import draw_legend, wrap_text
 from posefilter.figures.overlay import WIDTH, Shape, draw_pose, outline_object
 
 _LETTERS = 15  # [px] of a row
@@ -56,8 +56,9 @@ def draw_detections(
     _draw_tags(picture, shown, detections, colors)
     entries = [(one.label, color) for one, color in zip(detections, colors, strict=True)]
     rows = [draw_legend(entries, picture.shape[1], _LETTERS)] if entries else []
-    words = f"absent: {', '.join(absent)}".split() if absent else []
-    texts = [*wrap_words(words, picture.shape[1] - 16), *([caption] if caption else [])]
+    names, room = f"absent: {', '.join(absent)}", picture.shape[1] - 16
+    texts = wrap_text(names, load_font(_LETTERS), room) if absent else []
+    texts += [caption] if caption else []
     rows += [draw_row(picture.shape[1], text, size=_LETTERS) for text in texts]
     return np.concatenate([picture, *rows])
 
@@ -68,18 +69,6 @@ def pick_colors(count: int) -> list[Color]:
     hsv = np.array([[[hue, 190 if i % 2 else 230, 255] for i, hue in enumerate(hues)]], np.uint8)
     rgb = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if count else np.zeros((0, 3), np.uint8)
     return [(int(r), int(g), int(b)) for r, g, b in rgb]
-
-
-def wrap_words(words: Iterable[str], width: int) -> list[str]:
-    """Return words as lines that are at most `width` pixels wide; a longer word has its own."""
-    letters, lines = load_font(_LETTERS), list[str]()
-    for word in words:
-        longer = f"{lines[-1]} {word}" if lines else word
-        if lines and letters.getlength(longer) <= width:
-            lines[-1] = longer
-        else:
-            lines.append(word)
-    return lines
 
 
 def _draw_tags(

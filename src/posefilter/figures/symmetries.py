@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from posefilter.figures.canvas import AXES, PAPER, arrange_grid, draw_lines, draw_row
+from posefilter.figures.canvas import AXES, arrange_grid, draw_lines, draw_row
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.symmetries import rotation_about
 from posefilter.meshes.turns import ANY, Turn
@@ -52,7 +52,7 @@ def draw_symmetries(
     if not found:
         rows.append(draw_row(width, "no turn leaves its shape as it is", size=13))
         rows.append(arrange_grid([_render(renderer, mesh, camera, K)], 1))
-    return _stack(rows, width)
+    return arrange_grid(rows, 1, gap=0)
 
 
 def describe_turn(turn: Turn) -> str:
@@ -99,14 +99,3 @@ def _draw_axis(
     points: Any = ends @ camera[:3, :3].T + camera[:3, 3]
     pixels = points @ K.T
     draw_lines(tile, [pixels[:, :2] / pixels[:, 2:]], AXES[2], 2)
-
-
-def _stack(rows: Sequence[np.ndarray], width: int) -> np.ndarray:
-    """Put rows below each other, on paper."""
-    wide = max(width, *(row.shape[1] for row in rows))
-    out = []
-    for row in rows:
-        full = np.full((row.shape[0], wide, 3), PAPER, np.uint8)
-        full[:, : row.shape[1]] = row
-        out.append(full)
-    return np.concatenate(out)

@@ -1,6 +1,6 @@
 """The loss of belief maps."""
 
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -11,30 +11,14 @@ from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
 from posefilter.types import Batch, ObjectModel, Trace
 
 
-class HasBeliefMaps(Protocol):
-    """An encoded image with belief maps."""
-
-    @property
-    def logits(self) -> Tensor:
-        """(B, 9, h, w)."""
-        ...
-
-    @property
-    def keypoints(self) -> Tensor:
-        """(9, 3) in the object's frame [m]."""
-        ...
-
-    @property
-    def stride(self) -> int:
-        """Pixels of a cell."""
-        ...
-
-
 class BeliefMaps:
     """Cross-entropy of each cell against a Gaussian about the keypoint, summed over each map.
 
     Keypoints out of the frame have an empty map; hidden ones are drawn as any other. DOPE has the
     squared error, whose gradient is near zero while a new network takes all cells for empty.
+
+    The trace's encoding has `logits` (B, 9, h, w), `keypoints` (9, 3) in the object's frame [m] and
+    `stride`, the pixels of a cell.
 
     Args:
         sigma: Standard deviation of the Gaussian [cells].
@@ -46,8 +30,8 @@ class BeliefMaps:
         self.sigma = sigma
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,); the trace's encoding is `HasBeliefMaps`."""
-        encoding: HasBeliefMaps = trace.encoding
+        """Return the loss of each image, (B,)."""
+        encoding = trace.encoding
         pixels, ahead = project_keypoints(
             batch.camera_from_object[:, None], encoding.keypoints, batch.intrinsics
         )

@@ -1,6 +1,6 @@
 """The loss of a posterior over crops and rotations of a grid."""
 
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -9,25 +9,6 @@ from posefilter.capabilities import Capabilities
 from posefilter.geometry.crops import look_at
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.types import Batch, ObjectModel, Trace
-
-
-class HasGridScores(Protocol):
-    """An encoded image whose crops are scored against rotations."""
-
-    @property
-    def scores(self) -> Tensor:
-        """Log likelihoods (B, C, M) of rotation m, given that crop c is about the object."""
-        ...
-
-    @property
-    def centers(self) -> Tensor:
-        """(B, C, 3) where the crops are about [m]."""
-        ...
-
-    @property
-    def rotations(self) -> Tensor:
-        """(M, 3, 3) of the object, relative to a camera that looks at its center."""
-        ...
 
 
 def squared_distances(
@@ -53,6 +34,10 @@ class GridPosterior:
     One softmax over all pairs of an image learns both what a particle's likelihood must tell: which
     translation is right, and which rotation, given one.
 
+    The trace's encoding has `scores` (B, C, M), the log likelihoods of rotation m, given that crop
+    c is about the object; `centers` (B, C, 3), where the crops are about [m]; and `rotations`
+    (M, 3, 3) of the object, relative to a camera that looks at its center.
+
     Args:
         sigma: Standard deviation of the Gaussian, in radii of the object.
     """
@@ -63,11 +48,11 @@ class GridPosterior:
         self.sigma = sigma
 
     def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
-        """Return the loss of each image, (B,); the trace's encoding is `HasGridScores`."""
-        encoding: HasGridScores = trace.encoding
+        """Return the loss of each image, (B,)."""
+        encoding = trace.encoding
         far = squared_distances(
             encoding.centers, encoding.rotations, batch.camera_from_object, model
         )
         wanted = (-0.5 * far / (self.sigma * model.radius) ** 2).flatten(1).log_softmax(1)
-        found = encoding.scores.flatten(1).log_softmax(1)
+        found: Tensor = encoding.scores.flatten(1).log_softmax(1)
         return (wanted.exp() * (wanted - found)).sum(1)

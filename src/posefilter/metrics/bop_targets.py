@@ -3,12 +3,10 @@
 """
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
-from posefilter.files import write_whole
 from posefilter.limits import read_bytes
 
 _KEYS = ("scene_id", "im_id", "obj_id", "inst_count")
@@ -43,12 +41,6 @@ def read_targets(path: Path) -> list[Target]:
     if len({one[:3] for one in targets}) < len(targets):
         raise UserError(f"targets={path}: names a class of an image twice")
     return targets
-
-
-def write_targets(path: Path, targets: Sequence[Target]) -> None:
-    """Write a file of targets, all of it or nothing."""
-    rows = ",\n".join(json.dumps(one._asdict()) for one in targets)
-    write_whole(path, f"[\n{rows}\n]\n".encode())
 
 
 def _read_one(one: Any, where: str) -> Target:

@@ -54,25 +54,16 @@ class PoseErrors(Metric):
         for name in ("add", "add_s", "diameter"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
-    def update(
-        self,
-        poses: Tensor,
-        truth: Tensor,
-        object_id: Tensor | None = None,
-        found: Tensor | None = None,
-    ) -> None:
+    def update(self, poses: Tensor, truth: Tensor, object_id: Tensor | None = None) -> None:
         """Accumulate errors, in the order of the instances.
 
         Args:
             poses: (B, 4, 4) estimates, camera_from_object [m].
             truth: (B, 4, 4) true poses.
             object_id: (B,) index into `models`; the only one if None.
-            found: (B,) bool, False where there is no estimate.
         """
         ids = [0] * len(truth) if object_id is None else object_id.tolist()
         good = poses.isfinite().flatten(1).all(1)
-        if found is not None:
-            good = good & found
         errors = torch.full((3, len(truth)), torch.inf, dtype=torch.float64, device=truth.device)
         for index in sorted(set(ids)):
             selected = torch.tensor([i == index for i in ids], device=truth.device)

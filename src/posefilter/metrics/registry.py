@@ -15,6 +15,7 @@ from posefilter.errors import UserError
 
 HIGHER, LOWER, NEITHER = 1, -1, 0  # which way is better
 PERCENT = (-3.0, 103.0)  # limits of a chart of percentages: what lies at an end is seen
+UNIT, SIGNED_UNIT = (-0.03, 1.03), (-1.05, 1.05)  # the same of numbers in [0, 1] and in [-1, 1]
 
 
 class MetricInfo(NamedTuple):
@@ -63,6 +64,25 @@ class MetricInfo(NamedTuple):
     def describe(self, value: float) -> str:
         """Return a stored number as it is written, with its unit: `94.7 %`."""
         return f"{self.format(value)} {self.unit}".strip()
+
+
+def _share(
+    key: str, label: str, direction: int = NEITHER, short: str = "", meaning: str = ""
+) -> MetricInfo:
+    """Return a metric that is stored as a share in [0, 1] and shown in percent."""
+    return MetricInfo(key, label, "%", ".1f", direction, 100.0, PERCENT, short, meaning)
+
+
+def _unit(
+    key: str, label: str, short: str = "", meaning: str = "", form: str = ".3f"
+) -> MetricInfo:
+    """Return a metric in [0, 1] that is best at 1 and shown as it is stored."""
+    return MetricInfo(key, label, "", form, HIGHER, 1.0, UNIT, short, meaning)
+
+
+def _signed_unit(key: str, label: str, direction: int, short: str) -> MetricInfo:
+    """Return a metric in [-1, 1], shown as it is stored."""
+    return MetricInfo(key, label, "", ".2f", direction, 1.0, SIGNED_UNIT, short)
 
 
 def _describe_errors(name: str, label: str) -> tuple[MetricInfo, ...]:
@@ -118,33 +138,18 @@ _METRICS = (
     *_describe_errors("add_s", "ADD-S"),
     *_describe_bop("mssd", "mm", "0.05 to 0.5 diameters, as in the BOP challenge"),
     *_describe_bop("mspd", "px", "5 to 50 pixels in an image 640 wide"),
-    MetricInfo("iou", "box IoU", form=".3f", direction=HIGHER, limits=(-0.03, 1.03)),
-    MetricInfo(
+    _unit("iou", "box IoU"),
+    _unit(
         "parts/box_iou",
         "part box IoU",
-        form=".3f",
-        direction=HIGHER,
-        limits=(-0.03, 1.03),
         meaning="mean over the object's parts, each at the estimated and at the true pose",
     ),
-    MetricInfo(
+    _unit(
         "parts/mask_iou",
         "part mask IoU",
-        form=".3f",
-        direction=HIGHER,
-        limits=(-0.03, 1.03),
         meaning="the same of visible pixels, each of which belongs to the nearest part",
     ),
-    MetricInfo(
-        "particles_on_object",
-        "particles on the object",
-        "%",
-        ".1f",
-        HIGHER,
-        100.0,
-        PERCENT,
-        "on object",
-    ),
+    _share("particles_on_object", "particles on the object", HIGHER, "on object"),
     MetricInfo("seconds_per_image", "time per image", "s", ".3g", LOWER, short="s / image"),
     # the belief, means over the images
     MetricInfo(
@@ -177,27 +182,14 @@ _METRICS = (
         factor=180 / math.pi,
         meaning="the same, of the angle",
     ),
-    MetricInfo(
+    _share(
         "belief/mass_01d",
         "weight within 0.1 diameter of the truth",
-        "%",
-        ".1f",
         HIGHER,
-        100.0,
-        PERCENT,
         "within 0.1 diameter",
         "100 where the belief is narrow and right",
     ),
-    MetricInfo(
-        "belief/mass_2cm",
-        "weight within 2 cm of the truth",
-        "%",
-        ".1f",
-        HIGHER,
-        100.0,
-        PERCENT,
-        "within 2 cm",
-    ),
+    _share("belief/mass_2cm", "weight within 2 cm of the truth", HIGHER, "within 2 cm"),
     MetricInfo(
         "belief/rank",
         "rank of the truth by mean distance",
@@ -244,56 +236,38 @@ _METRICS = (
         meaning="over the images; the same unit",
     ),
     *_describe_credible(),
-    MetricInfo(
+    _share(
         "belief/truth_outscored",
         "images in which a particle outscores the truth",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         "by any pose",
     ),
-    MetricInfo(
+    _share(
         "belief/truth_outscored_by_wrong",
         "images in which a wrong pose outscores the truth",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         "by a wrong pose",
         "more particles cannot correct these",
     ),
-    MetricInfo(
+    _share(
         "belief/truth_outscored_by_misplaced",
         "images in which a pose of wrong ADD-S outscores the truth",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         "by a misplaced pose",
         "no look-alike of the truth",
     ),
     # calibrated probabilities, on frames with the object and without
     MetricInfo("confidence/frames", "frames with the object", form=".0f"),
     MetricInfo("confidence/frames_without", "frames without the object", form=".0f"),
-    MetricInfo(
+    _unit(
         "confidence/auroc",
         "AUROC of the probability, right against wrong",
-        form=".3f",
-        direction=HIGHER,
-        limits=(-0.03, 1.03),
         short="AUROC right",
         meaning="among frames with the object; 0.5: no better than chance",
     ),
-    MetricInfo(
+    _unit(
         "confidence/auroc_presence",
         "AUROC of the presence",
-        form=".3f",
-        direction=HIGHER,
-        limits=(-0.03, 1.03),
         short="AUROC presence",
         meaning="frames with the object against frames without",
     ),
@@ -312,44 +286,23 @@ _METRICS = (
         direction=LOWER,
         meaning="mean square of probability less outcome",
     ),
-    MetricInfo(
+    _share(
         "confidence/wrong",
         "wrong poses",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         meaning="of the frames with the object: 0.1 diameters or more from the truth",
     ),
-    MetricInfo(
+    _share(
         "confidence/wrong_at_80",
         "wrong poses at 80 % kept",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         meaning="of the 80 % of highest probability",
     ),
-    MetricInfo(
-        "confidence/found",
-        "declared found",
-        "%",
-        ".1f",
-        HIGHER,
-        100.0,
-        PERCENT,
-        meaning="of the frames with the object",
-    ),
-    MetricInfo(
+    _share("confidence/found", "declared found", HIGHER, meaning="of the frames with the object"),
+    _share(
         "confidence/absent",
         "declared absent, but there",
-        "%",
-        ".1f",
         LOWER,
-        100.0,
-        PERCENT,
         meaning="of the frames with the object",
     ),
     MetricInfo(
@@ -374,86 +327,37 @@ _METRICS = (
         meaning="between depth and mesh: there depth or intrinsics cannot be right",
     ),
     # where particles that are pixels are; lists over the iterations
-    MetricInfo("diagnostics/on_object", "on the object", "%", ".1f", HIGHER, 100.0, PERCENT),
-    MetricInfo(
-        "diagnostics/on_object/first",
-        "on the object at the start",
-        "%",
-        ".1f",
-        HIGHER,
-        100.0,
-        PERCENT,
-        "on object at start",
+    _share("diagnostics/on_object", "on the object", HIGHER),
+    _share(
+        "diagnostics/on_object/first", "on the object at the start", HIGHER, "on object at start"
     ),
-    MetricInfo(
-        "diagnostics/on_object/last",
-        "on the object at the end",
-        "%",
-        ".1f",
-        HIGHER,
-        100.0,
-        PERCENT,
-        "on the object",
-    ),
-    MetricInfo(
-        "diagnostics/off_frame", "off the frame", "%", ".1f", LOWER, 100.0, PERCENT, "off frame"
-    ),
-    MetricInfo("diagnostics/near_edge", "at an edge", "%", ".1f", LOWER, 100.0, PERCENT),
-    MetricInfo("diagnostics/near_corner", "in a corner", "%", ".1f", LOWER, 100.0, PERCENT),
-    MetricInfo(
-        "diagnostics/distinct", "distinct particles", "%", ".1f", HIGHER, 100.0, PERCENT, "distinct"
-    ),
-    MetricInfo(
+    _share("diagnostics/on_object/last", "on the object at the end", HIGHER, "on the object"),
+    _share("diagnostics/off_frame", "off the frame", LOWER, "off frame"),
+    _share("diagnostics/near_edge", "at an edge", LOWER),
+    _share("diagnostics/near_corner", "in a corner", LOWER),
+    _share("diagnostics/distinct", "distinct particles", HIGHER, "distinct"),
+    _share(
         "diagnostics/line_share",
         "variance along a line",
-        "%",
-        ".1f",
-        factor=100.0,
-        limits=PERCENT,
         short="along a line",
         meaning="share of the particles' variance along its first principal axis; 50: round",
     ),
-    MetricInfo(
+    _share(
         "diagnostics/line_share/first",
         "variance along a line at the start",
-        "%",
-        ".1f",
-        factor=100.0,
-        limits=PERCENT,
         short="along a line at start",
     ),
-    MetricInfo(
+    _signed_unit(
         "diagnostics/pairwise_cosine",
         "pairwise cosine of the displacements",
-        form=".2f",
-        direction=LOWER,
-        limits=(-1.05, 1.05),
-        short="pairwise cosine",
+        LOWER,
+        "pairwise cosine",
     ),
-    MetricInfo(
-        "diagnostics/offset_r2",
-        "true offsets explained (R²)",
-        form=".2f",
-        direction=HIGHER,
-        limits=(-1.05, 1.05),
-        short="offset R2",
+    _signed_unit("diagnostics/offset_r2", "true offsets explained (R²)", HIGHER, "offset R2"),
+    _signed_unit(
+        "diagnostics/heading", "cosine of displacement and true offset", HIGHER, "offset cosine"
     ),
-    MetricInfo(
-        "diagnostics/heading",
-        "cosine of displacement and true offset",
-        form=".2f",
-        direction=HIGHER,
-        limits=(-1.05, 1.05),
-        short="offset cosine",
-    ),
-    MetricInfo(
-        "diagnostics/auroc",
-        "AUROC of the likelihood",
-        form=".2f",
-        direction=HIGHER,
-        limits=(-0.03, 1.03),
-        short="AUROC",
-    ),
+    _unit("diagnostics/auroc", "AUROC of the likelihood", short="AUROC", form=".2f"),
     # of a training
     MetricInfo("training/steps", "training steps", form=".0f", short="steps"),
     MetricInfo("training/tested_step", "tested step", form=".0f"),
@@ -484,7 +388,7 @@ _METRICS = (
     MetricInfo("filter/sigma_px", "noise level", "px", ".1f"),
     MetricInfo("filter/best_log_likelihood", "best log-likelihood", "nat", ".1f", HIGHER),
     # of a run, derived from several of the above
-    MetricInfo("missed_fraction", "images without an estimate", "%", ".1f", LOWER, 100.0, PERCENT),
+    _share("missed_fraction", "images without an estimate", LOWER),
     MetricInfo(
         "val_score_drop", "validation score lost since its best", form=".1f", direction=LOWER
     ),

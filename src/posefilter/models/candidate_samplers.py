@@ -1,7 +1,7 @@
 """Candidates that the pose-space method's likelihood is trained on, as a trace of one step."""
 
 import math
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import torch
 from torch import Generator, Tensor
@@ -13,12 +13,16 @@ from posefilter.filters.candidates import (
     sample_around_truth,
     sample_from_depth,
 )
+from posefilter.filters.estimate import select_particle
+from posefilter.filters.loop import make_particles
 from posefilter.filters.propagate import HalfTurns
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
-from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Encoding, Propagate
-from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, ParticleOutput, Particles, Step, Trace
+
+if TYPE_CHECKING:
+    from posefilter.models.pose_pf import PosePF
 
 
 @runtime_checkable
@@ -30,42 +34,11 @@ class ScoresSamples(Protocol):
         ...
 
 
-class ScoredMethod(Protocol):
-    """The method that candidates are drawn for."""
-
-    likelihood: Any
-
-    @property
-    def model(self) -> ObjectModel:
-        """The object."""
-        ...
-
-    @property
-    def space(self) -> PoseSpace:
-        """The space of its particles."""
-        ...
-
-    @property
-    def capabilities(self) -> frozenset[str]:
-        """What it provides; see capabilities.py."""
-        ...
-
-    def measure(
-        self, encoding: Encoding, particles: Particles, step: Step, generator: Generator
-    ) -> ParticleOutput:
-        """Score every particle."""
-        ...
-
-    def propose_poses(self, encoding: Encoding, particles: int, generator: Generator) -> Tensor:
-        """Draw likely poses, (B, particles, 4, 4) camera_from_object [m]."""
-        ...
-
-
 class CandidateSampler(Protocol):
     """Draw and score the candidates of one batch."""
 
     def __call__(
-        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
+        self, method: "PosePF", encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Return a trace of one step whose scores are differentiable.
 
@@ -94,20 +67,9 @@ def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) 
         output: Their scores and poses.
         sigma: (B,) noise level [m].
     """
-    log_weights = torch.log_softmax(output.log_likelihood, dim=1)
-    top = log_weights.argmax(1)
-    best = output.pose[torch.arange(len(top), device=top.device), top]
-    belief = BeliefBatch(output.pose, log_weights, best, output.log_likelihood.amax(1))
+    scored = particles._replace(log_weights=output.log_likelihood.log_softmax(1))
+    belief = select_particle(scored, output, output.log_likelihood)
     return Trace((particles,), (output,), (Step(0, 1, sigma),), belief)
-
-
-def make_uniform_particles(state: Tensor) -> Particles:
-    """Return particles of equal weight without latent.  (B, N, *S) -> N particles per image."""
-    B, N = state.shape[:2]
-    weights = state.new_full((B, N), -math.log(N))
-    return Particles(
-        state, state.new_zeros(B, N, 0), weights, torch.arange(N, device=state.device).expand(B, N)
-    )
 
 
 class CandidatePoses:
@@ -150,7 +112,7 @@ class CandidatePoses:
         )
 
     def __call__(
-        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
+        self, method: "PosePF", encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Draw and score candidates, and advance the persistent particles by a step."""
         B, device = len(batch.rgb), batch.rgb.device
@@ -188,7 +150,7 @@ class CandidatePoses:
             )
             sigma = torch.where(own, level, sigma)
             groups.append(states)
-        particles = make_uniform_particles(torch.cat(groups, dim=1))
+        particles = make_particles(torch.cat(groups, dim=1), 0)
         output = method.measure(encoding, particles, Step(0, 1, sigma), generator)
         if self.persistent is not None:
             scores = output.log_likelihood[:, -self.persistent.particles :].detach()
@@ -254,7 +216,7 @@ class LabeledRays:
         self.margin_behind, self.tolerance = margin_behind, tolerance
 
     def __call__(
-        self, method: ScoredMethod, encoding: Encoding, batch: Batch, generator: Generator
+        self, method: "PosePF", encoding: Encoding, batch: Batch, generator: Generator
     ) -> Trace:
         """Draw and score samples.
 
@@ -297,9 +259,7 @@ class LabeledRays:
         weight = torch.cat([valid, near], dim=1).float()
         scores = net.score_samples(torch.cat([point, point], 1), torch.cat([random, observed], 1))
         log_weights = (weight / weight.sum(1, keepdim=True).clamp_min(1)).log()
-        particles = make_uniform_particles(torch.cat(state, dim=1))._replace(
-            log_weights=log_weights
-        )
+        particles = make_particles(torch.cat(state, dim=1), 0)._replace(log_weights=log_weights)
         pose = batch.camera_from_object[:, None].expand(-1, scores.shape[1], -1, -1)
         output = ParticleOutput(
             scores, scores.new_zeros(B, scores.shape[1], 6), pose, particles.latent

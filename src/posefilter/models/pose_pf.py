@@ -1,6 +1,6 @@
 """The paper's fifth method: particles are poses, weighted by a learned likelihood."""
 
-import logging
+from contextlib import nullcontext
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -19,8 +19,6 @@ from posefilter.nets.likelihood import Pixels, flatten_images
 from posefilter.nets.pose_votes import draw_poses, measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
-
-log = logging.getLogger(__name__)
 
 # images in which the estimate scores higher than the truth: all, those whose ADD is wrong, and
 # those whose ADD-S is
@@ -142,7 +140,7 @@ class PosePF(PoseParticles):
     ) -> ParticleOutput:
         """Score every particle at the step's noise level."""
         count = self.train_pixels if self.training else self.pixels
-        score = self._score_fast(encoding, particles.state, step.sigma, generator, count)
+        score = self._score(encoding, particles.state, step.sigma, generator, count, fast=True)
         no_move = particles.state.new_zeros(*particles.state.shape[:2], self.space.dimensions)
         return ParticleOutput(score, no_move, particles.state, particles.latent)
 
@@ -162,9 +160,8 @@ class PosePF(PoseParticles):
             Log-likelihoods up to a constant for each image, (B, N).
         """
         at = poses.new_tensor(sigma)
-        # a gradient would be that of a rounded score
-        how = self._score if torch.is_grad_enabled() else self._score_fast
-        return how(encoding, poses, at, generator, pixels)
+        fast = not torch.is_grad_enabled()  # a gradient would be that of a rounded score
+        return self._score(encoding, poses, at, generator, pixels, fast)
 
     def propose_poses(self, encoding: PoseEncoding, particles: int, generator: Generator) -> Tensor:
         """Draw poses from the votes of the proposal network.
@@ -284,13 +281,8 @@ class PosePF(PoseParticles):
         checkpoint["candidate_sampler"] = self.candidate_sampler.state()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the candidate sampler's state; a warning says where there is none."""
+        """Restore the candidate sampler's state; without one, particles start anew."""
         super().on_load_checkpoint(checkpoint)
-        if "candidate_sampler" not in checkpoint:
-            log.warning(
-                "resume: the checkpoint is from an earlier version, without the candidate "
-                "sampler's persistent particles: every frame's start anew"
-            )
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 
     def _center(self) -> Tensor:
@@ -303,21 +295,16 @@ class PosePF(PoseParticles):
         sigma: Tensor,
         generator: Generator,
         pixels: int,
+        fast: bool = False,
     ) -> Tensor:
-        score: Tensor = self.likelihood(
-            encoding.image, poses, sigma, self._center(), self.model.radius, pixels, generator
+        """Score poses; if `fast`, in bfloat16 where that is fast: its error is far below the noise
+        of few pixels.
+        """
+        bfloat16 = torch.autocast(
+            self.device.type, torch.bfloat16, enabled=fast_bfloat16(self.device)
         )
-        return score
-
-    def _score_fast(
-        self,
-        encoding: PoseEncoding,
-        poses: Tensor,
-        sigma: Tensor,
-        generator: Generator,
-        pixels: int,
-    ) -> Tensor:
-        """Score in bfloat16 where that is fast; its error is far below the noise of few pixels."""
-        fast = fast_bfloat16(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=fast):
-            return self._score(encoding, poses, sigma, generator, pixels).float()
+        with bfloat16 if fast else nullcontext():
+            score: Tensor = self.likelihood(
+                encoding.image, poses, sigma, self._center(), self.model.radius, pixels, generator
+            )
+        return score.float() if fast else score

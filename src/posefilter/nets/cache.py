@@ -52,11 +52,6 @@ class ModuleCache(Generic[T]):
         self._entries[module] = _Entry(state, {**known, key: value})
         return value
 
-    def count(self, module: nn.Module) -> int:
-        """Return how many values of a module are kept."""
-        entry = self._entries.get(module)
-        return 0 if entry is None else len(entry.values)
-
     def clear(self) -> None:
         """Forget everything."""
         self._entries.clear()

@@ -32,16 +32,9 @@ class EmbreeRenderer(Renderer):
     ) -> Surfaces:
         """Return what each pixel sees; see `Renderer.surfaces`."""
         rays = pixel_rays(K, height, width)
-        far = np.full((height, width), np.inf, np.float32)
+        hits, far, index = self._find_nearest(instances, rays, K)
+        unoccluded = np.array([len(hit.pixel) for hit in hits], np.int64)
         albedo, normal = np.zeros((2, height, width, 3), np.float32)
-        index = np.full((height, width), -1, np.int32)
-        unoccluded = np.zeros(len(instances), np.int64)
-        hits = [self.caster.cast(one, rays, K) for one in instances]
-        for i, hit in enumerate(hits):
-            unoccluded[i] = len(hit.pixel)
-            near = hit.t < far.reshape(-1)[hit.pixel]
-            far.reshape(-1)[hit.pixel[near]] = hit.t[near]
-            index.reshape(-1)[hit.pixel[near]] = i
         for plane in planes:
             self._write_plane(plane, rays, K, far, albedo, normal, index)
         for i, (one, hit) in enumerate(zip(instances, hits, strict=True)):
@@ -60,17 +53,24 @@ class EmbreeRenderer(Renderer):
             z-depth (H, W) float32 [m], 0 = nothing, and the index of the instance that is seen
             (H, W) int32, -1 = none.
         """
-        rays = pixel_rays(K, height, width)
-        far, index = (
-            np.full(height * width, np.inf, np.float32),
-            np.full(height * width, -1, np.int32),
-        )
-        for i, one in enumerate(instances):
-            hit = self.caster.cast(one, rays, K)
-            near = hit.t < far[hit.pixel]
-            far[hit.pixel[near]], index[hit.pixel[near]] = hit.t[near], i
+        _, far, index = self._find_nearest(instances, pixel_rays(K, height, width), K)
         far[index < 0] = 0
-        return far.reshape(height, width), index.reshape(height, width)
+        return far, index
+
+    def _find_nearest(
+        self, instances: Sequence[Instance], rays: np.ndarray, K: np.ndarray
+    ) -> tuple[list[Hits], np.ndarray, np.ndarray]:
+        """Return all hits of each instance, and of each pixel the depth (H, W) [m] of the nearest,
+        infinite without, and its instance (H, W), -1 without.
+        """
+        far = np.full(rays.shape[:2], np.inf, np.float32)
+        index = np.full(rays.shape[:2], -1, np.int32)
+        hits = [self.caster.cast(one, rays, K) for one in instances]
+        for i, hit in enumerate(hits):
+            near = hit.t < far.reshape(-1)[hit.pixel]
+            far.reshape(-1)[hit.pixel[near]] = hit.t[near]
+            index.reshape(-1)[hit.pixel[near]] = i
+        return hits, far, index
 
     def _write_instance(
         self,

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.limits import PlainLoader, read_bytes
 from posefilter.metrics.image_errors import FILE, ImageError
@@ -213,7 +213,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = yaml.load(read_bytes(path, _MOST_YAML).decode(), Loader=PlainLoader)
     # YAML, UTF-8, whole numbers too long to read, days that there are not
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is no YAML ({str(error).splitlines()[0]})") from error
+        raise UserError(f"{path}: is no YAML ({find_reason(error)})") from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one mapping")
     return content

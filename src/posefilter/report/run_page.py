@@ -19,6 +19,7 @@ from posefilter.report.blocks import (
     draw_charts,
     show_images,
 )  # fmt: skip
+from posefilter.report.charts import shorten
 from posefilter.report.diagnostics import (
     collect_numbers,
     collect_timings,
@@ -208,15 +209,10 @@ def list_changes(changed: Sequence[Change], names: tuple[str, str]) -> Table:
     """
 
     def cell(value: str | None) -> Cell:
-        return "–" if value is None else Text(shorten(value), "code")
+        return "–" if value is None else Text(shorten(value, 160), "code")
 
     rows = [[Text(key, "code"), cell(own), cell(other)] for key, other, own in changed]
     return Table(("setting", *names), rows, form="settings")
-
-
-def shorten(text: str, most: int = 160) -> str:
-    """Return a setting that fits in a table."""
-    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def list_machine(run: Run) -> Table:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 from posefilter.locks import hold, release
 from posefilter.ros.messages import (
     CAMERA_INFO,
@@ -68,7 +68,7 @@ class BagReader:
             self.reader.open()
         except Exception as error:  # a damaged header decides what breaks, memory included
             raise UserError(
-                f"bag={path}: cannot be read as a ROS 2 bag ({first_words(error)})"
+                f"bag={path}: cannot be read as a ROS 2 bag ({find_reason(error)[:200]})"
             ) from error
         try:
             self._check_topics()
@@ -110,7 +110,7 @@ class BagReader:
         try:
             yield from self.reader.messages()
         except Exception as error:  # of storages and compressions, many kinds
-            raise UserError(f"bag={self.path}: is damaged ({first_words(error)})") from error
+            raise UserError(f"bag={self.path}: is damaged ({find_reason(error)[:200]})") from error
 
     def frames(self) -> Iterator[BagFrame]:
         """Yield each color image with the depth of its moment, once the camera is known.
@@ -149,7 +149,7 @@ class BagReader:
         except Exception as error:  # of struct, numpy and assertions
             raise UserError(
                 f"bag={self.path}: a message of {connection.topic} is damaged "
-                f"({first_words(error)})"
+                f"({find_reason(error)[:200]})"
             ) from error
 
     def _make(self, color: tuple[int, int, Any], depth: tuple[int, int, Any], camera: Any) -> Any:
@@ -235,9 +235,3 @@ class BagWriter:
             )
         for connection, time, raw in messages:
             self.writer.write(self.copies[connection.id], time, raw)
-
-
-def first_words(error: Exception) -> str:
-    """Return what an error says in one short line."""
-    lines = str(error).splitlines()
-    return (lines[0] if lines else type(error).__name__)[:200]

@@ -171,17 +171,12 @@ def write_image(path: Path, image: np.ndarray) -> None:
     else:
         ok, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 2])
     assert ok
-    write_bytes(path, data.tobytes())
+    write_whole(path, data.tobytes())
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write JSON; all of the file or nothing."""
-    write_bytes(path, (json.dumps(content, indent=1) + "\n").encode())
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file, all of it or nothing: to a temporary file that is then renamed."""
-    write_whole(path, data)
+    write_whole(path, json.dumps(content, indent=1) + "\n")
 
 
 def depth_units(depth: np.ndarray) -> np.ndarray:

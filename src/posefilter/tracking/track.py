@@ -27,8 +27,9 @@ from posefilter.result import Result, Run, make_result
 from posefilter.tracking.estimate import ModeMean, smooth
 from posefilter.tracking.fit import QuadraticFit
 from posefilter.tracking.frame import Frame
+from posefilter.tracking.kld import bin_poses, count_needed
 from posefilter.tracking.objectness import measure_objectness, measure_presence
-from posefilter.tracking.predict import FromBelief, draw_predicted, take_enough
+from posefilter.tracking.predict import FromBelief
 from posefilter.tracking.scoring import FrameScorer, check_method
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import LOST, TRACKED, TrackLossDetector
@@ -181,31 +182,20 @@ class Track:
     # -- the steps of a frame ---------------------------------------------------------------------
 
     def _predict(self, state: State) -> State:
-        """Return where the object is expected: draws of the moved belief, of equal weight."""
-        settings = self.settings
-        filter_settings = settings.probe if self.loss_detector.lost else settings.follow
-        motion = settings.motion
+        """Return where the object is expected: draws of the moved belief, of equal weight, as many
+        as KLD sampling calls for.
+        """
+        settings, motion = self.settings, self.settings.motion
+        wanted = settings.probe if self.loss_detector.lost else settings.follow
         drift = motion.expect(state.velocity)
         expected = self.space.move(state.best, drift)
-        draws = draw_predicted(
-            state.belief,
-            drift,
-            motion.noise_scale(state.squared_innovation),
-            motion,
-            filter_settings.max_particles,
-            self.space,
-            self.generator,
-        )
-        draws = take_enough(
-            draws,
-            expected[0],
-            self.space,
-            settings.kld_cell,
-            settings.kld_epsilon,
-            settings.kld_quantile,
-            filter_settings.min_particles,
-        )
-        return state._replace(belief=make_particles(draws, 0), best=expected)
+        scale = motion.noise_scale(state.squared_innovation)
+        drawn = Multinomial()(state.belief, wanted.max_particles, self.space, self.generator)
+        draws = motion(inherit(state.belief.state, drawn), drift, scale, self.space, self.generator)
+        cells = bin_poses(draws[0], expected[0], self.space, settings.kld_cell)
+        least, epsilon, quantile = wanted.min_particles, settings.kld_epsilon, settings.kld_quantile
+        count = count_needed(cells, epsilon, quantile, least)
+        return state._replace(belief=make_particles(draws[:, :count], 0), best=expected)
 
     def _estimate(self, frame: Frame) -> FrameEstimate:
         """Run the estimator's own filter on the whole image."""

@@ -1,7 +1,9 @@
 """What all readers share: counting what they leave out, and asking meshes about masks."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +15,14 @@ from posefilter.paths import check_inside
 
 
 class BaseReader:
-    """A dataset on disk whose classes are `objects`."""
+    """A dataset on disk whose classes are `objects`.
+
+    A reader fills `_entries`, one of each record with what reading it takes, or has its own
+    `records`.
+    """
 
     objects: tuple[str, ...]
+    _entries: Sequence[Any]
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
@@ -23,6 +30,10 @@ class BaseReader:
         self.examples: dict[str, str] = {}  # of each reason to skip, the first message
         self.notes: Counter[str] = Counter()
         self._geometry = None if meshes is None else Geometry(meshes)
+
+    def records(self) -> Sequence[FrameRecord]:
+        """Return every object of every image, in a fixed order."""
+        return [entry.record for entry in self._entries]
 
     def visible_share(self, sample: Sample) -> float:
         """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
@@ -45,6 +56,11 @@ class BaseReader:
             raise error
         self.skipped[error.cause] += 1
         self.examples.setdefault(error.cause, str(error))
+
+    def _drop_absent(self) -> None:
+        """Leave out classes of which no image shows any."""
+        shown = {record.object for record in self.records()}
+        self.objects = tuple(name for name in self.objects if name in shown)
 
     def _distrust_builtin(self) -> None:
         """Take no silhouettes from builtin meshes: they are not the objects of real photographs."""

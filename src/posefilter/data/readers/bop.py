@@ -131,10 +131,6 @@ class BopReader(BaseReader):
             entry for folder, scene in scenes for entry in self._list_scene(base, folder, *scene)
         ]
 
-    def records(self) -> list[FrameRecord]:
-        """Return every object of every image, in a fixed order."""
-        return [entry.record for entry in self._entries]
-
     def native_from_mesh(self, name: str) -> np.ndarray:
         """Return BOP's object frame from the mesh file's.  -> (4, 4) [m], not millimeters."""
         out = np.eye(4)

@@ -111,13 +111,7 @@ class FatReader(BaseReader):
             if one is not None:
                 self._entries += self._list_folder(number, folder, *one)
         if objects is None:
-            self.objects = tuple(
-                name for name in self.objects if any(e.record.object == name for e in self._entries)
-            )
-
-    def records(self) -> list[FrameRecord]:
-        """Return every object of every image, in a fixed order."""
-        return [entry.record for entry in self._entries]
+            self._drop_absent()
 
     def native_from_mesh(self, name: str) -> np.ndarray:
         """Return FAT's aligned frame from the mesh file's.  -> (4, 4) [m]."""

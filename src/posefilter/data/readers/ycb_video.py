@@ -101,13 +101,7 @@ class YCBVideoReader(BaseReader):
             except BadData as error:
                 self._leave_out(error)
         if objects is None:
-            self.objects = tuple(
-                name for name in self.objects if any(e.record.object == name for e in self._entries)
-            )
-
-    def records(self) -> list[FrameRecord]:
-        """Return every object of every image, in a fixed order."""
-        return [entry.record for entry in self._entries]
+            self._drop_absent()
 
     def native_from_mesh(self, name: str) -> np.ndarray:
         """Return YCB-Video's object frame from the mesh file's.  -> (4, 4) [m]."""

@@ -24,7 +24,7 @@ def join(*soups: Soup) -> Soup:
     return Soup(np.concatenate([s.corners for s in soups]), np.concatenate([s.uv for s in soups]))
 
 
-def weld(name: str, soup: Soup, texture: np.ndarray, symmetries: np.ndarray | None = None) -> Mesh:
+def weld(name: str, soup: Soup, texture: np.ndarray) -> Mesh:
     """Make a mesh: merge corners at one position, drop triangles without area."""
     rounded = np.round(soup.corners.reshape(-1, 3), 8)
     vertices, inverse = np.unique(rounded, axis=0, return_inverse=True)
@@ -33,13 +33,7 @@ def weld(name: str, soup: Soup, texture: np.ndarray, symmetries: np.ndarray | No
         (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     )
     faces, uv = faces[solid], soup.uv[solid].astype(np.float32)
-    normals = creased_normals(vertices, faces)
-    mesh = Mesh(name, vertices, faces, uv, texture, None, normals)
-    return (
-        mesh
-        if symmetries is None
-        else Mesh(name, vertices, faces, uv, texture, None, normals, symmetries)
-    )
+    return Mesh(name, vertices, faces, uv, texture, None, creased_normals(vertices, faces))
 
 
 def transform(soup: Soup, linear: np.ndarray, shift: np.ndarray) -> Soup:

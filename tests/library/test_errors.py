@@ -1,0 +1,24 @@
+"""Reasons are told in one line, those of errors without a message too."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from posefilter.errors import UserError, find_reason
+from posefilter.estimator import Estimator
+
+
+def test_a_reason_is_the_first_line_or_the_class() -> None:
+    assert find_reason(ValueError("too long\nby far")) == "too long"
+    assert find_reason(ValueError()) == "ValueError"
+    assert find_reason(ValueError("")) == "ValueError"
+
+
+def test_a_device_that_fails_without_a_message_is_refused() -> None:
+    def fail(device: str) -> None:
+        raise AssertionError
+
+    method: Any = SimpleNamespace(capabilities={"pose"}, to=fail)
+    with pytest.raises(UserError, match=r"^device=cuda: cannot be used \(AssertionError\)$"):
+        Estimator([method], device="cuda")
