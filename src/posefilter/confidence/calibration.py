@@ -230,7 +230,9 @@ def _read(content: Any) -> Calibration:
         raise ValueError(f"should hold {', '.join(sorted(names))}")
     if set(content) - names:
         unknown = sorted(str(key)[:30] for key in set(content) - names)[0]
-        raise ValueError(f"holds {unknown!r}, which this version does not know; it may be of a newer one")
+        raise ValueError(
+            f"holds {unknown!r}, which this version does not know; it may be of a newer one"
+        )
     features = content["features"]
     good = isinstance(features, list) and 0 < len(features) <= _MOST_FEATURES
     if not good or not all(isinstance(one, str) and _NAME.fullmatch(one) for one in features):
