@@ -9,7 +9,9 @@ from torch import Generator, Tensor
 
 from posefilter.errors import UserError
 from posefilter.filters.texture import TextureTurns, blur, list_turns, measure_texture
-from posefilter.geometry.pose import make_pose
+from posefilter.geometry.camera import project
+from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
+from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import angle_between, exp_so3, random_rotation
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.meshes.store import MeshStore
@@ -86,6 +88,57 @@ def test_exposure_white_balance_and_light_hardly_matter() -> None:
     assert first > 20
     assert second == pytest.approx(first, rel=0.25)
     assert third == pytest.approx(first, rel=0.35)
+
+
+def measure_plainly(pose: Tensor, encoding: Seen, model: ObjectModel, shift: float) -> Tensor:
+    """Return the evidence of one pose: all of the image blurred, a regression a shift."""
+    color, K = encoding.measured_color[0].double(), encoding.intrinsics[0].double()
+    assert model.texture is not None
+    points, normals, own = model.texture.double().split(3, dim=1)
+    pose = pose.double()
+    at, normals = transform(pose, points), normals @ pose[:3, :3].T
+    cosine = -(normals * torch.nn.functional.normalize(at, dim=-1)).sum(-1)
+    pixels = project(at, K)
+    z = gather_pixels(encoding.measured_depth[None].double(), nearest_pixel(pixels)[None])[0, :, 0]
+    seen = (z > 0) & ((z - at[:, 2]).abs() < 0.004 + 0.03 * model.diameter) & (cosine > 0.25)
+    root = (seen * cosine).sqrt()[:, None]
+    basis = root * torch.cat([torch.ones_like(root), normals], dim=1)
+
+    def leave(values: Tensor) -> Tensor:
+        ridge = 1e-6 * basis[:, 0].square().sum() + 1e-9
+        gram = basis.T @ basis + ridge * torch.eye(4, dtype=torch.float64)
+        return root * values - basis @ torch.linalg.inv(gram) @ basis.T @ (root * values)
+
+    focal, spacing = float(K[0, 0]), model.radius * (4 * np.pi / 3 / len(points)) ** 0.5
+    middle = float((pose[:3, :3] @ model.center.double() + pose[:3, 3])[2])
+    image = (blur(color, max(0.5, 0.33 * spacing * focal / middle)) + 0.03).log()
+    x, best = leave((own + 0.03).log()), 0.0
+    for u in (-1, 0, 1):
+        for v in (-1, 0, 1):
+            moved = pixels + shift * focal * torch.tensor([u, v])
+            y = leave(sample(image[None], moved[None])[0])
+            r = float((x * y).sum() / (x.square().sum() * y.square().sum()).sqrt())
+            best = max(best, r)
+    covered = (root[:, 0].square() * (spacing * focal / at[:, 2]).square()).sum()
+    count = 0.4 * min(float(seen.sum()), float(covered) / 2)
+    return torch.tensor(-0.5 * count * np.log1p(-(min(best, 0.99) ** 2)))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.002])
+@pytest.mark.parametrize("beside", [0.0, 0.07, -0.09])  # [m] where the frame cuts the object off
+def test_the_part_of_the_image_that_matters_gives_what_the_whole_does(
+    shift: float, beside: float
+) -> None:
+    model = load("carton")
+    for pose in draw("carton", 3):
+        pose = pose.clone()
+        pose[0, 3] += beside * float(pose[2, 3]) / 0.5
+        encoding, off = look("carton", pose), pose.clone()
+        off[:3, 3] += torch.tensor([0.002, -0.001, 0.001])
+        for one in (pose, off):
+            found = float(measure_texture(one[None, None], encoding, model, shift=shift))
+            plain = float(measure_plainly(one, encoding, model, shift))
+            assert found == pytest.approx(plain, rel=1e-3, abs=0.01)
 
 
 def test_what_is_hidden_is_not_compared() -> None:

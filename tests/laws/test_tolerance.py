@@ -72,9 +72,9 @@ def test_the_usual_tolerance_has_the_usual_probability() -> None:
     rows = torch.from_numpy(frames.values)
     usual, named = made.assess_features(rows), made.assess_features(rows, PoseTolerance(add=0.1))
     assert torch.equal(usual.probability, named.probability)
-    # and so has the regression that is fitted when it is asked for
+    # and so has the regression that is fitted when it is asked for, to features of float16
     nearly = made.assess_features(rows, PoseTolerance(add=0.1 + 1e-12))
-    assert torch.allclose(usual.probability, nearly.probability, atol=1e-6)
+    assert torch.allclose(usual.probability, nearly.probability, atol=1e-3)
 
 
 def test_a_tolerance_that_all_keep_or_none_leaves_doubt() -> None:
@@ -93,20 +93,17 @@ def test_errors_survive_as_plain_data_and_are_checked() -> None:
     made = fit_calibration(draw(200), "scenes")
     plain = made.to_plain()
     assert read_calibration(plain, "x") == made
+    given = plain["errors"]
     del plain["errors"]
     old = read_calibration(plain, "x")
     assert old == replace(made, errors=None)
     with pytest.raises(UserError, match="earlier version"):
         old.fit_success(PoseTolerance(add_s=0.1))
-    for key, value in (
-        ("add", [0.1]),
-        ("add", [-1.0] * 100),
-        ("rotation", [math.nan] * 100),
-        ("features", []),
-        ("features", [[1.0]]),
-        ("more", []),
-    ):
-        wrong = {**made.to_plain()["errors"], key: value}
+    far = torch.cat([given[:, :2] + 10, given[:, 2:]], 1)
+    for wrong in (
+        given.tolist(), given[:0], given[0], given[:, 1:], given.long(), given.float(), -given,
+        given * math.nan, far, {"errors": given},
+    ):  # fmt: skip
         with pytest.raises(UserError, match="errors"):
             read_calibration({**plain, "errors": wrong}, "x")
 

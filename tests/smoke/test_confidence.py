@@ -153,13 +153,11 @@ def test_verdicts_go_by_what_errors_cost(
 def plant_errors(path: Path, out: Path) -> Path:
     """Write a copy whose calibration frames were all turned: wrong by ADD, right by ADD-S."""
     content = torch.load(path, weights_only=True)
-    rows, none = content["calibration"]["errors"], len(content["calibration"]["features"])
-    count = len(rows["add"])
-    assert count == 12
-    assert rows["features"] != [[0.0] * none] * count
-    turned = {"translation": [0.001] * count, "rotation": [3.0] * count}
-    turned |= {"add": [0.5] * count, "add_s": [0.02] * count, "features": [[0.0] * none] * count}
-    content["calibration"]["errors"] = turned
+    rows, count = content["calibration"]["errors"], len(content["calibration"]["features"])
+    assert rows.shape == (12, count + 4)
+    turned = torch.zeros(12, count + 4)
+    turned[:, count:] = torch.tensor([0.001, 3.0, 0.5, 0.02])
+    content["calibration"]["errors"] = turned.half()
     torch.save(content, out)
     return out
 

@@ -30,6 +30,7 @@ LIMIT = 3.0  # standard deviations
 COUNTS = ("right", "wrong", "absent")
 _MOST_FEATURES, _LARGEST, _MOST_FRAMES = 16, 1e6, 10_000_000
 _MOST_GROUPS, _MOST_SCORES = 16, 100_000
+_FARTHEST = 60_000.0  # error that float16 holds
 _RENAMED = {  # features, by their names in earlier versions
     "solid": "free_space",
     "explained": "mask_precision",
@@ -50,26 +51,20 @@ class Assessment(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationErrors:
-    """Features and pose errors of the n calibration frames that show the object.
+    """Features and pose errors of the n calibration frames that show the object, as they are
+    stored: of float16.
 
     Attributes:
         features: (n, F), standardized, in the order of the calibration's.
-        translation: (n,), as the other three of `PoseErrors`.
-        rotation: (n,).
-        add: (n,).
-        add_s: (n,).
+        errors: (n, 4), in the order of `PoseErrors`.
     """
 
     features: tuple[tuple[float, ...], ...]
-    translation: tuple[float, ...]
-    rotation: tuple[float, ...]
-    add: tuple[float, ...]
-    add_s: tuple[float, ...]
+    errors: tuple[tuple[float, ...], ...]
 
     def accepted_by(self, tolerance: PoseTolerance) -> np.ndarray:
         """Return which of the estimates keep a tolerance, (n,) bool."""
-        errors = PoseErrors(*(np.array(getattr(self, name)) for name in PoseErrors._fields))
-        accepted: np.ndarray = tolerance.accepts(errors)
+        accepted: np.ndarray = tolerance.accepts(PoseErrors(*np.array(self.errors).T))
         return accepted
 
 
@@ -184,8 +179,8 @@ class Calibration:
             edges, by = list(self.conformal.edges), self.conformal.by
             plain["conformal"] = {"by": by, "edges": edges, "scores": scores}
         if self.errors is not None:
-            plain["errors"] = {key: list(x) for key, x in asdict(self.errors).items()}
-            plain["errors"]["features"] = [list(row) for row in self.errors.features]
+            both = (torch.tensor(self.errors.features), torch.tensor(self.errors.errors))
+            plain["errors"] = torch.cat(both, 1).half()  # a fifth of what lists take
         return {
             key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
         }
@@ -200,6 +195,14 @@ def standardize(x: np.ndarray, center: Sequence[float], scale: Sequence[float]) 
     """Return features (n, F) as the regressions take them."""
     x = (x - np.array(center)) / np.array(scale)
     return np.nan_to_num(x, nan=-LIMIT).clip(-LIMIT, LIMIT)
+
+
+def tabulate_errors(features: np.ndarray, errors: np.ndarray) -> CalibrationErrors:
+    """Return standardized features (n, F) and errors (n, 4), as they are stored."""
+    tables = (features, errors.clip(max=_FARTHEST))
+    return CalibrationErrors(
+        *(tuple(tuple(row) for row in table.astype(np.float16).tolist()) for table in tables)
+    )
 
 
 @lru_cache(maxsize=256)
@@ -280,19 +283,17 @@ def _logistic(content: Any, count: int, name: str) -> Logistic:
 def _errors(content: Any, count: int) -> CalibrationErrors | None:
     if content is None:
         return None
-    names = {field.name for field in fields(CalibrationErrors)}
-    if not isinstance(content, dict) or set(content) != names:
-        raise ValueError(f"should have {', '.join(sorted(names))} in errors")
-    rows = content["features"]
-    if not isinstance(rows, list) or not 0 < len(rows) <= _MOST_SCORES:
-        raise ValueError(f"should have the features of 1 to {_MOST_SCORES} frames in errors")
-    values = [
-        _numbers(content[name], len(rows), f"errors' {name}", least=0.0)
-        for name in PoseErrors._fields
-    ]
-    return CalibrationErrors(
-        tuple(_numbers(row, count, "errors' features") for row in rows), *values
-    )
+    width = count + len(PoseErrors._fields)
+    is_table = isinstance(content, Tensor) and content.dtype == torch.float16
+    if not is_table or content.dim() != 2 or content.shape[1] != width:
+        raise ValueError(f"should have {width} numbers a frame in errors, as float16")
+    if not 0 < len(content) <= _MOST_SCORES:
+        raise ValueError(f"should have 1 to {_MOST_SCORES} frames in errors")
+    features, errors = content[:, :count], content[:, count:]
+    # nan is in no range
+    if not bool((features.abs() <= LIMIT).all() and ((errors >= 0) & (errors <= _FARTHEST)).all()):
+        raise ValueError("has numbers out of range in errors")
+    return tabulate_errors(features.numpy(), errors.numpy())
 
 
 def _conformal(content: Any) -> Conformal | None:

@@ -10,8 +10,8 @@ import torch
 from posefilter.confidence.calibration import (
     Assessment,
     Calibration,
-    CalibrationErrors,
     standardize,
+    tabulate_errors,
 )
 from posefilter.confidence.conformal import choose_edges, fit_conformal
 from posefilter.confidence.logistic import Logistic, fit_logistic
@@ -149,9 +149,7 @@ def _fit(
     balance = np.where(there, 0.5 / share, 0.5 / (1 - share))
     errors = None
     if frames.errors is not None:
-        rows = tuple(tuple(row) for row in x[there].tolist())
-        own = (tuple(part[there].tolist()) for part in frames.errors)
-        errors = CalibrationErrors(rows, *own)
+        errors = tabulate_errors(x[there], np.stack(frames.errors, axis=1)[there])
     return replace(
         out,
         presence=fit_logistic(x, there, balance),

@@ -116,40 +116,79 @@ def _compare(
     covered = (weights * (own.spacing * focal / points[..., 2].clamp_min(0.05)).square()).sum(-1)
     count = _INDEPENDENT * torch.minimum(seen.sum(-1), covered / _PIXELS)
     basis = torch.cat([torch.ones_like(cosine)[..., None], normals], dim=-1)
+    if not bool(seen.any()):
+        return torch.zeros_like(count)
     x = _remove(own.color.expand_as(points), basis, weights)
     middle = float(origin_of(poses, model.center.to(poses))[:, 2].median().clamp_min(0.05))
-    image = (blur(color, max(_SHARPEST, _BLUR * own.spacing * focal / middle)) + _DARK).log()
-    best = torch.zeros_like(count)
-    for offset in torch.cartesian_prod(*2 * [torch.tensor([-1.0, 0, 1])]) if shift else [0]:
-        moved = (pixels + torch.as_tensor(shift * focal * offset).to(pixels)).flatten(0, 1)
-        y = _remove(sample(image[None], moved[None])[0].unflatten(0, cosine.shape), basis, weights)
-        best = torch.maximum(best, _correlate(x, y, weights))
+    sigma, step = max(_SHARPEST, _BLUR * own.spacing * focal / middle), shift * focal
+    image, corner = _blur_around(color, pixels[seen], sigma, step)
+    offsets = torch.cartesian_prod(*2 * [pixels.new_tensor([-step, 0, step] if step else [0])])
+    moved = (pixels - corner)[:, :, None] + offsets.reshape(-1, 2)  # (C, P, S, 2)
+    y = sample((image + _DARK).log()[None], moved.flatten(0, 2)[None])[0]
+    y = _remove(y.reshape(*cosine.shape, -1), basis, weights).unflatten(-1, (-1, 3))
+    best = _correlate(x[:, :, None], y, weights).amax(1).clamp_min(0)
     return -0.5 * count * torch.log1p(-best.clamp_max(_LARGEST).square())
 
 
+def _blur_around(
+    image: Tensor, pixels: Tensor, sigma: float, margin: float
+) -> tuple[Tensor, Tensor]:
+    """Return the part of a blurred image that some pixels are in, since the rest costs time.
+
+    Args:
+        image: (3, H, W).
+        pixels: (P, 2) [px].
+        sigma: Of the Gaussian [px].
+        margin: By which the pixels may be moved [px].
+
+    Returns:
+        The part (3, h, w), and the pixel (2,) that its corner is.
+    """
+    wide = torch.tensor([image.shape[2], image.shape[1]], device=pixels.device)
+    low = (pixels.amin(0) - margin).floor().long().clamp_min(0)
+    high = torch.minimum((pixels.amax(0) + margin).floor().long() + 2, wide)
+    half = _half_width(sigma)
+    first, last = (low - half).clamp_min(0), torch.minimum(high + half, wide)
+    (left, top), (right, bottom) = first.tolist(), last.tolist()
+    (u, v), (width, height) = (low - first).tolist(), (high - low).tolist()
+    blurred = blur(image[:, top:bottom, left:right], sigma)
+    return blurred[:, v : v + height, u : u + width], low
+
+
 def _correlate(x: Tensor, y: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted correlation of colors without means.  (C, P, 3), (C, P) -> (C,)."""
-    xy, xx, yy = ((weights[..., None] * one).sum((1, 2)) for one in (x * y, x * x, y * y))
+    """Return weighted correlations of colors without means.
+
+    (C, P, 1, 3), (C, P, S, 3), (C, P) -> (C, S).
+    """
+    weights = weights[..., None, None]
+    xy, xx, yy = ((weights * one).sum((1, 3)) for one in (x * y, x * x, y * y))
     return xy / (xx * yy).sqrt().clamp_min(1e-9)
 
 
 def _remove(values: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
-    """Return what a weighted regression on a basis leaves.  (C, P, 3), (C, P, 4), (C, P)."""
-    weighted = basis * weights[..., None]
-    gram = weighted.mT @ basis
-    ridge = 1e-6 * weights.sum(-1)[:, None, None] + 1e-9
-    eye = torch.eye(basis.shape[-1], device=basis.device, dtype=basis.dtype)
-    return values - basis @ torch.linalg.solve(gram + ridge * eye, weighted.mT @ values)
+    """Return what a weighted regression on a basis leaves.  (C, P, V), (C, P, 4), (C, P)."""
+    # of a plane, or of two, normals are linearly dependent but for the ridge: too much for float32
+    exact, weighted = basis.double(), (basis * weights[..., None]).double()
+    gram = weighted.mT @ exact
+    ridge = 1e-6 * weights.double().sum(-1)[:, None, None] + 1e-9
+    eye = torch.eye(basis.shape[-1], device=basis.device, dtype=exact.dtype)
+    solved = torch.linalg.solve(gram + ridge * eye, weighted.mT @ values.double())
+    return values - (exact @ solved).to(values)
 
 
 def blur(image: Tensor, sigma: float) -> Tensor:
     """Blur an image by a Gaussian, repeating its edge.  (C, H, W), [px] -> (C, H, W)."""
-    half = min(max(1, round(3 * sigma)), min(image.shape[1:]) - 1)
+    half = min(_half_width(sigma), min(image.shape[1:]) - 1)
     at = torch.arange(-half, half + 1, device=image.device, dtype=image.dtype)
     kernel = torch.exp(-0.5 * (at / sigma).square())
     kernel = (kernel / kernel.sum())[None, None, None]
     padded = F.pad(image[:, None], (half, half, half, half), mode="replicate")
     return F.conv2d(F.conv2d(padded, kernel), kernel.mT)[:, 0]
+
+
+def _half_width(sigma: float) -> int:
+    """Return how far a Gaussian of that deviation reaches [px]."""
+    return max(1, round(3 * sigma))
 
 
 class TextureTurns:
