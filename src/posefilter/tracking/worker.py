@@ -20,6 +20,9 @@ from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult, TrackSnapshot
 
 
+_OF_METHOD = ("object_model", "calibration")  # attributes of a result that both processes have
+
+
 class Start(NamedTuple):
     """What a process needs once."""
 
@@ -38,20 +41,21 @@ class Answer(NamedTuple):
     """What became of one track."""
 
     snapshot: TrackSnapshot
-    result: dict[str, Any]  # the attributes of a `TrackResult`, without its `object_model`
+    result: dict[str, Any]  # the attributes of a `TrackResult`, without what its method has
 
 
 def update(track: Track, snapshot: TrackSnapshot, frame: Frame) -> Answer:
     """Update a track that was elsewhere in the last frame."""
     track.snapshot = snapshot
     content = vars(track.update(frame))
-    return Answer(track.snapshot, {key: x for key, x in content.items() if key != "object_model"})
+    return Answer(track.snapshot, {key: x for key, x in content.items() if key not in _OF_METHOD})
 
 
 def restore(track: Track, answer: Answer) -> TrackResult:
     """Take over what another process made of a track."""
     track.snapshot = answer.snapshot
-    return TrackResult(**answer.result, object_model=track.method.model)
+    calibration = track.method.calibration if answer.result["features"] else None
+    return TrackResult(**answer.result, object_model=track.method.model, calibration=calibration)
 
 
 def main() -> None:
