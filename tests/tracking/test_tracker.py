@@ -11,6 +11,8 @@ import posefilter
 from posefilter.confidence.calibration import Calibration, Logistic
 from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
+from posefilter.filters.icp import PointToPlaneIcp
+from posefilter.filters.refine import Compose
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import TrackLossDetector
@@ -57,6 +59,22 @@ def test_an_object_that_starts_to_move_fast_is_followed(shift: float) -> None:
         assert max(distances[:6]) < 0.01
         off_by.append(max(distances[7:]))
     assert off_by[0] < 0.6 * shift < shift < off_by[1]
+
+
+def test_a_track_is_aligned_as_single_images_of_the_object_are() -> None:
+    toy, estimator = make_toy()
+    (track,) = posefilter.Tracker(estimator).tracks
+    track.method.capabilities = frozenset({*track.method.capabilities, "depth"})
+    for refine, noise in (
+        (PointToPlaneIcp(noise=0.008), 0.008),
+        (Compose([toy.filter.refine, PointToPlaneIcp(noise=0.006)]), 0.006),
+        (toy.filter.refine, PointToPlaneIcp().noise),
+    ):
+        toy.filter.refine = refine
+        icp = track._refine(1).components[-1]
+        assert isinstance(icp, PointToPlaneIcp)
+        assert (icp.noise, icp.prior) == (noise, TrackerSettings().icp_prior)
+        assert icp.iterations < PointToPlaneIcp().iterations
 
 
 def test_the_network_sees_a_window_and_now_and_then_the_whole_image() -> None:

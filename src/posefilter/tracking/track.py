@@ -278,7 +278,11 @@ class Track:
         fit = QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)
         if not self.settings.icp_prior or "depth" not in self.method.capabilities:
             return fit
-        icp = PointToPlaneIcp(iterations=_ICP_STEPS, prior=self.settings.icp_prior)
+        # of single images, whose noise was chosen for the object
+        parts = getattr(self.method.filter.refine, "components", (self.method.filter.refine,))
+        own = next((one for one in parts if isinstance(one, PointToPlaneIcp)), PointToPlaneIcp())
+        prior = self.settings.icp_prior
+        icp = PointToPlaneIcp(iterations=_ICP_STEPS, prior=prior, noise=own.noise)
         return Compose([fit, icp])
 
     def _correct(
