@@ -19,7 +19,6 @@ from posefilter.memory import keep_freed_memory
 from posefilter.tracking.frame import Frame
 from posefilter.tracking.track import Track, TrackResult, TrackSnapshot
 
-
 _OF_METHOD = ("object_model", "calibration")  # attributes of a result that both processes have
 
 
