@@ -197,7 +197,8 @@ def judge_across(
             for i, *parts in each:
                 presence, said, probability = (float(part) for part in parts)
                 row = own[i] | {"presence": presence, "probability": said}
-                row["right"] = bool(tolerance.accepts(PoseErrors(*np.array(row["errors"]))))
+                if tolerance != RIGHT:
+                    row["right"] = bool(tolerance.accepts(PoseErrors(*np.array(row["errors"]))))
                 if row["there"]:
                     limits = [made.conformal.find_limit(one / 100, probability) for one in SHOWN]
                     row["held"] = [row["nonconformity"] <= limit for limit in limits]
@@ -211,7 +212,8 @@ def gather_frames(rows: Sequence[Row], leave_out: Sequence[str]) -> Frames:
     values = np.array([[row["features"][name] for name in names] for row in rows])
     there, right = (np.array([row[key] for row in rows]) for key in ("there", "right"))
     nonconformity = np.array([row.get("nonconformity", np.nan) for row in rows])
-    errors = PoseErrors(*np.array([row["errors"] for row in rows]).T)
+    known = all("errors" in row for row in rows)  # not in rows of earlier versions
+    errors = PoseErrors(*np.array([row["errors"] for row in rows]).T) if known else None
     return Frames(names, values, there, right, nonconformity, errors)
 
 

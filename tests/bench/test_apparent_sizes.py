@@ -26,7 +26,9 @@ SAMPLE = Sample(
     0,
     1.0,
 )
-MODEL = SimpleNamespace(points=torch.eye(3), symmetries=torch.eye(4)[None], diameter=1.0)
+MODEL = SimpleNamespace(
+    points=torch.eye(3), center=torch.zeros(3), symmetries=torch.eye(4)[None], diameter=1.0
+)
 
 
 class Believing:
@@ -44,6 +46,7 @@ class Believing:
             presence=0.95,
             probability=0.9,
             costs=None,
+            pose_tolerance=None,
             apparent_size=factor if self.measures else np.nan,
             wrong_size=self.measures and factor != 1,
         )

@@ -11,6 +11,8 @@ import pytest
 import torch
 from tests.models.toy import scenes
 
+from posefilter.confidence.tolerance import PoseTolerance
+
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))  # scripts import their neighbors
 Load = Callable[[str], ModuleType]
 
@@ -103,5 +105,18 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
     assert rows[0]["presence"] == 0.5  # what was given stays
     blind = bench.judge_across(rows, leave_out=["coordinates"])
     assert np.mean([one["presence"] for one in blind if one["there"]]) < 0.55
+    for one in rows:  # by ADD-S all are right, by ADD those that were
+        errors = [0.001, 0.1, 0.05 if one["right"] else 0.3, 0.04]
+        one["errors"] = errors if one["there"] else [np.nan] * 4
+    wide = bench.judge_across(rows, tolerance=PoseTolerance(add_s=0.1))
+    assert all(one["right"] == one["there"] for one in wide)
+    usual = bench.judge_across(rows)
+    assert [one["right"] for one in usual] == [one["right"] for one in judged]
+    pairs = [(a, b) for a, b in zip(wide, usual, strict=True) if a["there"]]
+    # a third of those that are there are wrong by ADD, and none by ADD-S
+    assert np.mean([a["probability"] for a, _ in pairs]) > 1.2 * np.mean(
+        [b["probability"] for _, b in pairs]
+    )
+    assert [a["held"] for a, _ in pairs] == [b["held"] for _, b in pairs]
     few = bench.judge_across(rows, most=15)
     assert all(one["held"][3] for one in few if one["there"])  # fewer than 19: every pose

@@ -14,6 +14,7 @@ from PIL import Image
 
 from posefilter.callbacks.errors import ErrorTable
 from posefilter.callbacks.gallery import ImageSelection, KeptImage
+from posefilter.confidence.calibration import Assessment
 from posefilter.data.frames import FrameRecord
 from posefilter.figures.layout import CAPTION, cut_text, format_length
 from posefilter.geometry.pose import make_pose
@@ -83,9 +84,9 @@ def test_errors_of_a_batch_are_in_its_order() -> None:
 class Method(torch.nn.Module):
     """What the callback uses of a method."""
 
-    def last_assessment(self, count: int) -> torch.Tensor:
+    def last_assessment(self, count: int) -> Assessment:
         """Return presence and probability."""
-        return torch.full((2, count), 0.5)
+        return Assessment(*torch.full((2, count), 0.5))
 
 
 @pytest.fixture
