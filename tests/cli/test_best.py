@@ -175,6 +175,9 @@ def test_a_training_that_ends_before_its_first_validation_is_refused(
         val_check_interval=interval,
         max_steps=steps,
         accumulate_grad_batches=accumulated,
+        max_epochs=-1,
+        limit_train_batches=1.0,
+        limit_val_batches=1.0,
     )
     run: Any = SimpleNamespace(
         trainer=trainer, data=SimpleNamespace(train_dataloader=lambda: range(4))
@@ -184,3 +187,32 @@ def test_a_training_that_ends_before_its_first_validation_is_refused(
     else:
         with pytest.raises(UserError, match=f"first validation is after step {first},"):
             check_validated(run)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"limit_val_batches": 0}, "trainer.limit_val_batches=0: "),
+        ({"limit_train_batches": 0.0}, "trainer.limit_train_batches=0: "),
+        ({"max_epochs": 2}, "trainer.max_epochs=2: 8 batches, and the first validation is"),
+        ({"max_epochs": 3}, None),
+        ({"max_epochs": 3, "limit_train_batches": 2}, "trainer.max_epochs=3: 6 batches"),
+        ({"max_epochs": 5, "limit_train_batches": 0.5}, None),
+        ({"max_epochs": 1, "check_val_every_n_epoch": 1, "val_check_interval": 1.0}, None),
+    ],
+)
+def test_a_training_without_a_validation_is_refused_before_it_begins(
+    changed: dict[str, Any], told: str | None
+) -> None:
+    settings = {"check_val_every_n_epoch": None, "val_check_interval": 10, "max_steps": -1}
+    settings |= {"accumulate_grad_batches": 1, "max_epochs": -1}
+    settings |= {"limit_train_batches": 1.0, "limit_val_batches": 1.0}
+    trainer = SimpleNamespace(**{**settings, **changed})
+    data = SimpleNamespace(train_dataloader=lambda: range(4))
+    run: Any = SimpleNamespace(trainer=trainer, data=data)
+    if told is None:
+        check_validated(run)
+        return
+    with pytest.raises(UserError) as refusal:
+        check_validated(run)
+    assert str(refusal.value).startswith(told)

@@ -6,12 +6,15 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tests.cli.conftest import Cold
 
 import posefilter
+from posefilter.cli.command import finish_wandb
 from posefilter.cli.main import COMMANDS, main
+from posefilter.errors import MISTAKE
 
 HOME = Path(__file__).parents[2]
 # what takes seconds to import, and is not needed to refuse a setting
@@ -128,3 +131,32 @@ def test_a_command_says_something_before_torch_is_imported(cold: Cold, tmp_path:
     done = cold.run(program, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[0] == "report: starting"
+
+
+def test_another_process_of_a_training_goes_on_with_its_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Lightning starts it with the settings alone."""
+    ran: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(
+        "posefilter.cli.command.run_command",
+        lambda name, arguments: ran.append((name, arguments)) or 0,
+    )
+    monkeypatch.setenv("POSEFILTER_COMMAND", "train")
+    assert main(["seed=1"]) == MISTAKE  # the first process, typed so
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    for words in (["seed=1", "out=x"], ["-m", "seed=1,2"]):
+        assert main(words) == 0
+    assert ran == [("train", ["seed=1", "out=x"]), ("train", ["-m", "seed=1,2"])]
+
+
+def test_a_job_of_wandb_ends_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    finished: list[bool] = []
+    wandb = SimpleNamespace(run=None, finish=lambda: finished.append(True))
+    finish_wandb()  # not imported
+    monkeypatch.setitem(sys.modules, "wandb", wandb)  # type: ignore[arg-type]
+    finish_wandb()
+    assert not finished
+    wandb.run = "a run"
+    finish_wandb()
+    assert finished == [True]

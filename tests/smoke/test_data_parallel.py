@@ -25,9 +25,12 @@ def command(scenes: Path, out: Path, steps: int, *more: str) -> tuple[list[str],
 
 
 @pytest.mark.slow
-def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path) -> None:
+@pytest.mark.parametrize("installed", [False, True])
+def test_two_processes_train_one_method(tmp_path: Path, tiny_scenes: Path, installed: bool) -> None:
     out = tmp_path / "run"
     words, clean = command(tiny_scenes, out, 2)
+    if installed:  # its other process is started without the word `train`
+        words[:2] = [str(Path(sys.executable).parent / "posefilter"), "train"]
     done = subprocess.run(
         words, capture_output=True, text=True, timeout=600, cwd=tmp_path, env=clean
     )

@@ -141,14 +141,15 @@ def test_a_stopped_run_prints_how_to_resume_and_ends_the_same(
         assert run_command("train", HOME, [*settings, f"out={cut}"]) == 128 + number
         assert signal.getsignal(number) == before
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert told == {"event": "stopped", "step": step, "next": f"python train.py resume={cut}"}
+    again = f"data.root={tiny_scenes}"  # outside of the working folder: no record decides on it
+    following = f"python train.py resume={cut} {again}"
+    assert told == {"event": "stopped", "step": step, "next": following}
     assert state(cut)["global_step"] == step
     assert not (cut / "metrics.json").exists()
 
     last, before = (cut / "checkpoints" / name for name in ("last.ckpt", "last.previous.ckpt"))
     if before.is_file():
         last.write_bytes(last.read_bytes()[:1000])
-    again = f"data.root={tiny_scenes}"  # outside of the working folder
     assert run_command("train", HOME, [f"resume={cut}", again]) == 0
     events = [json.loads(line) for line in capfd.readouterr().out.splitlines()]
     fallen_back = [event["checkpoint"] for event in events if event["event"] == "fallback"]
@@ -159,3 +160,22 @@ def test_a_stopped_run_prints_how_to_resume_and_ends_the_same(
     one, other = (json.loads((run / "metrics.json").read_text()) for run in (whole, cut))
     assert one["iou"] == other["iou"]
     assert one["training"]["tested_step"] == other["training"]["tested_step"]
+
+
+def test_a_run_that_cannot_go_on_with_what_is_typed_keeps_its_settings(
+    tmp_path: Path, tiny_scenes: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    (run / ".hydra").mkdir(parents=True)
+    (run / "checkpoints").mkdir()
+    (run / "checkpoints" / "last.ckpt").write_bytes(b"")
+    record = run / ".hydra" / "overrides.yaml"
+    record.write_text("- model=cnn_patch\n- debug=smoke\n")
+    before = record.read_bytes()
+    typed = [f"resume={run}", f"data.root={tiny_scenes}", "console=json"]
+    assert run_command("train", HOME, [*typed, "data.object=nope"]) == 2
+    assert "nope" in capfd.readouterr().err
+    assert record.read_bytes() == before
+    # and so where what is left of the checkpoint is the reason
+    assert run_command("train", HOME, [*typed, "model.net.width=8"]) == 2
+    assert record.read_bytes() == before

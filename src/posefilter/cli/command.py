@@ -2,11 +2,10 @@
 
 import importlib
 import io
-import math
 import os
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -38,8 +37,9 @@ from posefilter.cli.folders import forget_failure, hold_folder, note_failure, re
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.preflight import check_files
+from posefilter.cli.ranks import STARTED
 from posefilter.cli.replaced import replace_typed
-from posefilter.cli.resume import with_resumed
+from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.trust import Scope, installed, trust
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
@@ -52,6 +52,7 @@ from posefilter.errors import (
     Stopped,
     UserError,
 )
+from posefilter.files import write_whole
 from posefilter.locks import release, release_all
 from posefilter.paths import find_conf
 
@@ -89,6 +90,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     register_resolvers()
     show_all_signs()
     before, begun = sys.argv, list[Job]()
+    os.environ[STARTED] = name
+    record: dict[Path, bytes] = {}
     try:
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
@@ -97,6 +100,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
+        record = keep_record(bracketed(arguments))
         arguments = with_resumed(bracketed(arguments))
         check_choices(arguments, conf)  # a resumed run's too
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
@@ -111,11 +115,13 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return 128 + stopped.number
     except (Carrier, *EXPECTED) as caught:
         error = caught.args[0] if isinstance(caught, Carrier) else caught
+        write_record(record)
         if trace:
             traceback.print_exception(error)
         print(f"{name}: {explain(error, name, conf, arguments)}", file=sys.stderr)
         return FAILURE if isinstance(error, _FAILED) else MISTAKE
     except Exception as error:
+        write_record(record)
         if begun or trace:
             raise
         print(f"{name}: {explain_hydra(error, conf, arguments)}", file=sys.stderr)
@@ -124,6 +130,14 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         sys.argv = before
         release_all()
     return 0
+
+
+def write_record(record: Mapping[Path, bytes]) -> None:
+    """Give a run that could not go on its settings back."""
+    for file, content in record.items():
+        with suppress(OSError):  # the error that it could not go on for is told
+            if file.read_bytes() != content:
+                write_whole(file, content)
 
 
 def show_all_signs() -> None:
@@ -165,7 +179,7 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
                     traceback.print_exception(error)
                 print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
                 note_failure(job, first_line(error))
-                return math.nan
+                return None  # of NaN Optuna's sweeper would make an error
             if not isinstance(error, EXPECTED):
                 raise
             release(job.folder)
@@ -175,8 +189,16 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
         finally:
             if job.swept:
                 release(job.folder)
+                finish_wandb()
 
     return task
+
+
+def finish_wandb() -> None:
+    """End the run that Weights & Biases logs, where it is in use: the next job has its own."""
+    wandb = sys.modules.get("wandb")
+    if getattr(wandb, "run", None) is not None:
+        wandb.finish()  # type: ignore[union-attr]
 
 
 def use_plugins(cfg: DictConfig) -> None:
@@ -210,11 +232,13 @@ def job_of(cfg: DictConfig) -> Job:
     own = HydraConfig.get()
     choices = {str(k): str(v) for k, v in own.runtime.choices.items()}
     swept = own.mode is RunMode.MULTIRUN
-    replace_typed(cfg, own.overrides.task)
+    # as typed: what an interpolation stands for may be a secret, or not known yet
+    typed: Any = OmegaConf.to_container(own.overrides.task, resolve=False)
+    replace_typed(cfg, typed)
     return Job(
         cfg,
         choices,
-        list(own.overrides.task),
+        typed,
         Path(own.runtime.output_dir),
         own.job.config_name or "",
         swept,

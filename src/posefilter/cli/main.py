@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 
+from posefilter.cli.ranks import STARTED, is_follower
 from posefilter.errors import MISTAKE
 
 COMMANDS = {
@@ -30,6 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: The command's name and what follows it; None: as typed.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if is_follower() and os.environ.get(STARTED) in COMMANDS:
+        # Lightning starts the other processes of a training with what Hydra's parser is given
+        given = [os.environ[STARTED], *given]
     if not given or given[0] in ("-h", "--help", "help"):
         width = max(map(len, COMMANDS))
         print(_USAGE, *(f"  {name:{width}}  {what}" for name, what in COMMANDS.items()), sep="\n")

@@ -2,6 +2,7 @@
 
 import os
 
+STARTED = "POSEFILTER_COMMAND"  # environment variable: what the first process does
 _RANKS = ("LOCAL_RANK", "RANK", "SLURM_PROCID")  # as Lightning, torchrun and Slurm set them
 
 

@@ -17,6 +17,7 @@ _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 _PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
 _SENDING = ("mlflow", "wandb")  # loggers
 _LONGEST, _MOST = 1 << 16, 1000  # of a file of overrides [bytes], and of its lines
+_RECORD = 1 << 22  # of a file of settings [bytes]
 
 
 def run_folder(resume: str | Path) -> Path:
@@ -62,6 +63,17 @@ def with_resumed(arguments: list[str]) -> list[str]:
     for override in kept:
         check_override(override, folder)
     return [*kept, *arguments, f"out={folder}"]
+
+
+def keep_record(arguments: list[str]) -> dict[Path, bytes]:
+    """Return what a resumed run's folder says of its settings, by file: Hydra writes them anew
+    before it is known whether the run can go on with them. Nothing where no run is resumed.
+    """
+    given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
+    if not given or given[-1] in ("", "null"):
+        return {}
+    files = sorted((run_folder(given[-1]) / ".hydra").glob("*.yaml"))
+    return {file: read_bytes(file, _RECORD) for file in files}
 
 
 def overrides_of(folder: Path) -> list[str]:

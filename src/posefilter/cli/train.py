@@ -135,9 +135,16 @@ def check_validated(run: Run) -> None:
     """
     trainer = run.trainer
     every, interval = trainer.check_val_every_n_epoch, trainer.val_check_interval
+    for name in ("limit_train_batches", "limit_val_batches"):
+        if getattr(trainer, name) == 0:
+            raise UserError(
+                f"trainer.{name}=0: a training needs its validations, which choose the best "
+                "checkpoint"
+            )
+    batches = len(run.data.train_dataloader())
+    _check_epochs(trainer, batches)
     if every is None or trainer.max_steps < 0:
         return
-    batches = len(run.data.train_dataloader())
     last = interval if isinstance(interval, int) else math.ceil(interval * batches)
     step = ((every - 1) * batches + last) // trainer.accumulate_grad_batches
     if step > trainer.max_steps:
@@ -145,6 +152,20 @@ def check_validated(run: Run) -> None:
             f"trainer.check_val_every_n_epoch={every}: an epoch has {batches} batches, so that the "
             f"first validation is after step {step}, and trainer.max_steps={trainer.max_steps}; "
             "null counts trainer.val_check_interval in steps"
+        )
+
+
+def _check_epochs(trainer: Trainer, batches: int) -> None:
+    """Refuse epochs that end before the first validation, which counts batches."""
+    epochs, interval = trainer.max_epochs, trainer.val_check_interval
+    limit = trainer.limit_train_batches
+    batches = min(batches, limit) if isinstance(limit, int) else int(limit * batches)
+    by_batches = trainer.check_val_every_n_epoch is None and isinstance(interval, int)
+    if by_batches and epochs is not None and 0 <= epochs * batches < interval:
+        raise UserError(
+            f"trainer.max_epochs={epochs}: {epochs * batches} batches, and the first validation is "
+            f"after {interval} (trainer.val_check_interval), so that there would be no best "
+            "checkpoint"
         )
 
 
@@ -230,7 +251,7 @@ def say_stopped(run: Run) -> None:
     job, step = run.job, run.trainer.global_step
     sentence, again = f"stopped at step {step}", None
     if (job.folder / "checkpoints" / LAST).is_file():
-        again = typed("train", resume=job.folder, **plugins(job))
+        again = typed("train", resume=job.folder, **places(job), **plugins(job))
         if job.swept:
             again = f"the same command with out={job.folder.parent}"
         sentence += f"; resume with: {again}"
