@@ -100,8 +100,9 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
-        record = keep_record(bracketed(arguments))
-        arguments = with_resumed(bracketed(arguments))
+        arguments = bracketed(arguments)
+        record = keep_record(arguments)
+        arguments = with_resumed(arguments)
         check_choices(arguments, conf)  # a resumed run's too
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]

@@ -259,10 +259,10 @@ def describe(
 
 
 def describe_tolerance(result: Result) -> dict[str, Any]:
-    """Return the probability that the verdict goes by where a tolerance is given."""
+    """Return the probability that the verdict goes by where a tolerance is given; else nothing."""
     tolerance = result.pose_tolerance
     if tolerance is None:
-        return {"pose_tolerance": None, "probability_within": None}
+        return {}
     known = result.probability is not None
     within = result.probability_within(tolerance) if known else None
     return {"pose_tolerance": asdict(tolerance), "probability_within": within}

@@ -52,11 +52,11 @@ def with_resumed(arguments: list[str]) -> list[str]:
     """Put the resumed run's own overrides ahead of the command line's, so that these may still
     change a thing.
     """
-    given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
-    if not given or given[-1] in ("", "null"):
+    given = _resumed(arguments)
+    if given is None:
         return arguments
-    folder = run_folder(given[-1])
-    last_checkpoints(given[-1])
+    folder = run_folder(given)
+    last_checkpoints(given)
     check_links(folder)
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
     kept = [o for o in overrides_of(folder) if _key(o) not in named and _key(o) not in _DROPPED]
@@ -69,10 +69,10 @@ def keep_record(arguments: list[str]) -> dict[Path, bytes]:
     """Return what a resumed run's folder says of its settings, by file: Hydra writes them anew
     before it is known whether the run can go on with them. Nothing where no run is resumed.
     """
-    given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
-    if not given or given[-1] in ("", "null"):
+    given = _resumed(arguments)
+    if given is None:
         return {}
-    files = sorted((run_folder(given[-1]) / ".hydra").glob("*.yaml"))
+    files = sorted((run_folder(given) / ".hydra").glob("*.yaml"))
     return {file: read_bytes(file, _RECORD) for file in files}
 
 
@@ -124,6 +124,12 @@ def check_override(override: str, folder: Path) -> None:
             f"resume={folder}: its {key}={value} lies outside of the working folder; if it is "
             f"right, type it as well"
         )
+
+
+def _resumed(arguments: list[str]) -> str | None:
+    """Return what is to be resumed, as typed last; None where nothing is."""
+    given = [a.removeprefix("resume=") for a in arguments if a.startswith("resume=")]
+    return None if not given or given[-1] in ("", "null") else given[-1]
 
 
 def _key(override: str) -> str:

@@ -5,6 +5,8 @@ tolerance of the user's own, such as what a gripper allows.
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from functools import reduce
+from operator import and_
 from typing import Any, NamedTuple
 
 import torch
@@ -68,11 +70,7 @@ class PoseTolerance:
             self.add_s,
         )
         pairs = zip(errors, limits, strict=True)
-        kept = [error < limit for error, limit in pairs if limit is not None]
-        out = kept[0]
-        for one in kept[1:]:
-            out = out & one
-        return out
+        return reduce(and_, (error < limit for error, limit in pairs if limit is not None))
 
     def describe(self) -> str:
         """Return it in a few words: `within 5 mm and 10 degrees`."""
