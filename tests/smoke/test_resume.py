@@ -94,7 +94,10 @@ class Sender(Lines):
         self.send("training", trainer)
 
     def on_validation_batch_end(self, trainer: Trainer, *_: object) -> None:
-        self.send("validation", trainer)
+        self.send("sanity check" if trainer.sanity_checking else "validation", trainer)
+
+    def on_sanity_check_start(self, trainer: Trainer, *_: object) -> None:
+        self.send("before the sanity check", trainer)
 
     def send(self, hook: str, trainer: Trainer) -> None:
         if (hook, trainer.global_step) == (self.hook, self.step):
@@ -160,6 +163,27 @@ def test_a_stopped_run_prints_how_to_resume_and_ends_the_same(
     one, other = (json.loads((run / "metrics.json").read_text()) for run in (whole, cut))
     assert one["iou"] == other["iou"]
     assert one["training"]["tested_step"] == other["training"]["tested_step"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hook", ["before the sanity check", "sanity check"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_first_step_stops_the_run(
+    hook: str,
+    number: int,
+    tiny_scenes: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(build, "progress", lambda console: Sender(hook, 0, number))
+    settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
+    settings += ["trainer.num_sanity_val_steps=2", f"out={tmp_path / 'run'}"]
+    before = signal.getsignal(number)
+    assert run_command("train", HOME, settings) == 128 + number
+    assert signal.getsignal(number) == before
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert told == {"event": "stopped", "step": 0, "next": None}
 
 
 def test_a_run_that_cannot_go_on_with_what_is_typed_keeps_its_settings(

@@ -55,6 +55,7 @@ from posefilter.errors import (
 from posefilter.files import write_whole
 from posefilter.locks import release, release_all
 from posefilter.paths import find_conf
+from posefilter.signals import stopped_by_sigterm
 
 Work = Callable[[Job], Any]
 EXPECTED = (
@@ -106,13 +107,15 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         check_choices(arguments, conf)  # a resumed run's too
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
-        hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
-            _task(name, begun)
-        )()
+        with stopped_by_sigterm():
+            hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
+                _task(name, begun)
+            )()
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
     except Stopped as stopped:
+        print(f"{name}: {stopped}", file=sys.stderr)
         return 128 + stopped.number
     except (Carrier, *EXPECTED) as caught:
         error = caught.args[0] if isinstance(caught, Carrier) else caught

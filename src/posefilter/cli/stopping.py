@@ -2,6 +2,8 @@
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -22,6 +24,10 @@ class Stop(Callback):
     def __init__(self) -> None:
         self.asked: int | None = None  # the signal that came
         self.agreed: int | None = None  # the one that all processes stop for
+
+    def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the signals over before the training, too."""
+        self._listen()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take the signals over from Lightning, whose own handlers save nothing.
@@ -77,6 +83,19 @@ class Stop(Callback):
     def _stop(self, number: int | None) -> None:
         if number is not None:
             raise Stopped(number)
+
+
+@contextmanager
+def stopped_by_interrupt() -> Iterator[None]:
+    """Raise Stopped where Lightning has made an exit with status 1 of a Ctrl-C, as it does before
+    `Stop` listens.
+    """
+    try:
+        yield
+    except SystemExit as ended:
+        if isinstance(ended.__context__, KeyboardInterrupt):
+            raise Stopped(signal.SIGINT) from ended
+        raise
 
 
 def asked_to_stop(trainer: Trainer) -> bool:

@@ -1,12 +1,9 @@
 """Follow objects through videos: poses, figures, and an annotated video."""
 
 import re
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -76,8 +73,7 @@ def track(job: Job) -> None:
         view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.view else None
         recorder = TrackRecorder(view, shapes)
         try:
-            with stopped_by_sigterm():
-                follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, log)
+            follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, log)
         except (UserError, KeyboardInterrupt, Stopped) as error:
             broken = error
         if view is not None:
@@ -150,23 +146,6 @@ def follow(
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
                 rows.append(make_row(video.name, frame.name, ids, result, truth))
             log.add(rows)
-
-
-@contextmanager
-def stopped_by_sigterm() -> Iterator[None]:
-    """Raise Stopped at a SIGTERM, so that it ends as Ctrl-C does: what was tracked is written."""
-
-    def stop(number: int, _: FrameType | None) -> None:
-        raise Stopped(number)
-
-    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[VideoFrame]:

@@ -24,6 +24,7 @@ from posefilter.cli.ranks import is_follower
 from posefilter.cli.results import record, show, write_json
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import finished, learned_from, start_from, take_over
+from posefilter.cli.stopping import stopped_by_interrupt
 from posefilter.cli.warm_start import read_starts, warm_start
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError
@@ -114,7 +115,8 @@ def fit(run: Run) -> dict[str, Any]:
     start, before = start_from(run.job)
     began = time.perf_counter(), time.process_time()
     try:
-        run.trainer.fit(run.method, datamodule=run.data, ckpt_path=start, weights_only=True)
+        with stopped_by_interrupt():
+            run.trainer.fit(run.method, datamodule=run.data, ckpt_path=start, weights_only=True)
     except Stopped:
         say_stopped(run)
         raise
@@ -179,7 +181,8 @@ def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:
     """Test what a checkpoint holds, built anew from it alone, as `evaluate.py` would."""
     method = method_of(checkpoint)
     try:
-        run.trainer.test(method, datamodule=run.data, verbose=False)
+        with stopped_by_interrupt():
+            run.trainer.test(method, datamodule=run.data, verbose=False)
     except Stopped:
         say_stopped(run)
         raise

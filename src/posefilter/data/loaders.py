@@ -8,6 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from posefilter.data.dataset import FrameDataset, ResumableLoader
+from posefilter.signals import leave_signals_to_parent
 from posefilter.types import Batch
 
 
@@ -46,6 +47,7 @@ def make_loader(
         batch_size=batch_size,
         num_workers=workers,
         persistent_workers=workers > 0,
+        worker_init_fn=leave_signals_to_parent,
         pin_memory=torch.cuda.is_available(),
         **options,
     )

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -16,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.progress import bars
+from posefilter.signals import end_with_parent
 from posefilter.synthetic.frame_renderer import FrameRenderer, Job
 
 FRAMES_PER_TASK = 5
@@ -85,7 +87,9 @@ _frame_renderer: FrameRenderer | None = None  # one a worker process
 
 
 def _start_worker(job: Job, out: Path) -> None:
-    """Set up a worker process."""
+    """Set up a worker process. It leaves Ctrl-C, which reaches it too, to its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     global _frame_renderer
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
