@@ -354,7 +354,7 @@ def check_ranges(settings: Mapping[str, Any], command: str) -> None:
         allowed = find_range(place) if ours else None
         shown = place if command == "data" else key
         if isinstance(value, Mapping):
-            if allowed is not None:
+            if allowed is not None and "_target_" not in value:  # a component of such a name
                 raise UserError(f"{shown}: must be {allowed}, and is a mapping")
         elif isinstance(value, list | tuple):
             if allowed is not None and (not allowed.many or key.endswith("]")):

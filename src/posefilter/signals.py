@@ -13,7 +13,7 @@ from posefilter.errors import Stopped
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """Raise Stopped at a SIGTERM, so that it ends as Ctrl-C does: files and processes are closed."""
+    """Raise Stopped at a SIGTERM, so that it ends as Ctrl-C does: what is open is closed."""
 
     def stop(number: int, _: FrameType | None) -> None:
         raise Stopped(number)

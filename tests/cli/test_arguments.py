@@ -6,7 +6,14 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli import run_command
-from posefilter.cli.arguments import bracketed, defer_settings, quoted
+from posefilter.cli.arguments import (
+    bracketed,
+    defer_settings,
+    maximized,
+    options_first,
+    quoted,
+    told_apart,
+)
 from posefilter.cli.job import Job
 
 HOME = Path(__file__).parents[2]
@@ -105,3 +112,75 @@ def test_every_command_shows_where_a_mistake_came_from(
         line
         == f"{command}: debug=smoke: only valid for train; {command} accepts only debug=traceback"
     )
+
+
+@pytest.mark.parametrize(
+    ("command", "typed"),
+    [
+        ("train", "data.root=A,B"),
+        ("train", "threads=1,2"),
+        ("evaluate", "checkpoint=A,B"),
+        ("evaluate", "data=fat,ycb_video"),
+    ],
+)
+def test_a_sweep_gives_each_job_a_folder_of_its_own(
+    command: str, typed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = []
+    monkeypatch.setattr(f"posefilter.cli.{command}.{command}", lambda job: folders.append(job))
+    monkeypatch.setattr("posefilter.cli.command.check_files", lambda name, cfg: None)
+    words = ["-m", typed, f"out={tmp_path}", "console=json"]
+    assert run_command(command, HOME, [*words, "plugins=[]"]) == 0
+    key, _, values = typed.partition("=")
+    assert [job.folder.name for job in folders] == [f"{key}={one}" for one in values.split(",")]
+
+
+def test_folders_are_not_named_after_what_is_not_swept() -> None:
+    for typed in (["-m", "data.root=A", "seed=1,2"], ["data.root=A"], ["seed=1"]):
+        assert told_apart(typed, "train", HOME / "conf") == typed
+
+
+def test_options_may_stand_anywhere() -> None:
+    typed = ["seed=1", "--config-dir", "mine", "loss=bce", "-m", "--cfg", "job", "x=2", "-cd"]
+    ordered = ["--config-dir", "mine", "-m", "--cfg", "job", "-cd", "seed=1", "loss=bce", "x=2"]
+    assert options_first(typed) == ordered
+
+
+def test_a_search_maximizes_unless_told_otherwise() -> None:
+    search, direction = ["-m", "hydra/sweeper=optuna"], "hydra.sweeper.direction="
+    assert maximized(search) == [*search, f"{direction}maximize"]
+    for typed in (["-m"], [*search, f"{direction}minimize"], [*search, f"+{direction}minimize"]):
+        assert maximized(typed) == typed
+
+
+def test_a_path_with_commas_that_is_there_is_one_value(tmp_path: Path) -> None:
+    path = tmp_path / "loss=bce,seed=1"
+    parse = OverridesParser.create().parse_override
+    assert parse(quoted([f"resume={path}"])[0]).is_sweep_override()
+    path.mkdir()
+    assert parse(quoted([f"resume={path}"])[0]).value() == str(path)
+
+
+@pytest.mark.parametrize(
+    ("typed", "built"),
+    [
+        ("logger=[csv,tensorboard]", ["csv", "tensorboard"]),
+        ("logger=csv", ["csv"]),
+        ("logger=none", []),
+    ],
+)
+def test_several_loggers_can_be_chosen(
+    typed: str, built: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs: list[Job] = []
+    monkeypatch.setattr("posefilter.cli.train.train", jobs.append)
+    assert run_command("train", HOME, [typed, f"out={tmp_path / 'run'}", "console=json"]) == 0
+    assert list(jobs[0].cfg.logger) == built
+
+
+@pytest.mark.parametrize("typed", ["logger=[]", "loss=[bce]", "logger={a: b}"])
+def test_other_groups_take_one_choice(
+    typed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, [typed, f"out={tmp_path / 'run'}"]) == 2
+    assert "takes the name of a choice, not a value" in capfd.readouterr().err

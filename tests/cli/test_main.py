@@ -14,6 +14,7 @@ from tests.cli.conftest import Cold
 import posefilter
 from posefilter.cli.command import finish_wandb
 from posefilter.cli.main import COMMANDS, main
+from posefilter.cli.ranks import is_follower
 from posefilter.errors import MISTAKE
 
 HOME = Path(__file__).parents[2]
@@ -145,9 +146,31 @@ def test_another_process_of_a_training_goes_on_with_its_command(
     monkeypatch.setenv("POSEFILTER_COMMAND", "train")
     assert main(["seed=1"]) == MISTAKE  # the first process, typed so
     monkeypatch.setenv("LOCAL_RANK", "1")
+    monkeypatch.setenv("WORLD_SIZE", "2")
     for words in (["seed=1", "out=x"], ["-m", "seed=1,2"]):
         assert main(words) == 0
     assert ran == [("train", ["seed=1", "out=x"]), ("train", ["-m", "seed=1,2"])]
+
+
+@pytest.mark.parametrize(
+    ("variables", "follower"),
+    [
+        ({}, False),
+        ({"RANK": "3"}, False),
+        ({"SLURM_PROCID": "2", "SLURM_NTASKS": "1"}, False),
+        ({"SLURM_PROCID": "2", "SLURM_NTASKS": "4"}, True),
+        ({"SLURM_PROCID": "0", "SLURM_NTASKS": "4"}, False),
+        ({"RANK": "1", "LOCAL_RANK": "0", "WORLD_SIZE": "2"}, True),
+    ],
+)
+def test_a_number_alone_makes_no_process_of_several(
+    variables: dict[str, str], follower: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE", "SLURM_PROCID", "SLURM_NTASKS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert is_follower() is follower
 
 
 def test_a_job_of_wandb_ends_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -197,9 +197,39 @@ def test_a_run_that_cannot_go_on_with_what_is_typed_keeps_its_settings(
     record.write_text("- model=cnn_patch\n- debug=smoke\n")
     before = record.read_bytes()
     typed = [f"resume={run}", f"data.root={tiny_scenes}", "console=json"]
-    assert run_command("train", HOME, [*typed, "data.object=nope"]) == 2
+    assert run_command("train", HOME, [*typed, "data.image_width=nope"]) == 2
     assert "nope" in capfd.readouterr().err
     assert record.read_bytes() == before
     # and so where what is left of the checkpoint is the reason
     assert run_command("train", HOME, [*typed, "model.net.width=8"]) == 2
     assert record.read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("optimizer.lr=1", "optimizer.lr=1: the run began with another"),
+        ("seed=1", "seed=1: the run began with another"),
+        ("data.split={test: 1.0}", "data.split={test: 1.0}: the run began with another"),
+        ("model=patch_pf", "model=patch_pf: the run began with another"),
+        ("warm_start=all", "warm_start=all: the run began with another"),
+        ("out=elsewhere", "a run that is resumed stays in its folder"),
+        ("model.net.width=8", "holds other networks than these settings"),
+    ],
+)
+def test_a_resumed_run_keeps_what_it_began_with(
+    typed: str,
+    told: str,
+    uninterrupted: tuple[list[str], Path],
+    tiny_scenes: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    _, whole = uninterrupted
+    resumed = [f"resume={whole}", f"data.root={tiny_scenes}", "seed=0", "model=cnn_patch"]
+    before = (whole / ".hydra" / "overrides.yaml").read_bytes()
+    assert run_command("train", HOME, [*resumed, "trainer.max_steps=8", typed]) == 2
+    (line,) = capfd.readouterr().err.splitlines()[-1:]
+    assert told in line
+    assert "Traceback" not in line
+    assert (whole / ".hydra" / "overrides.yaml").read_bytes() == before

@@ -41,3 +41,29 @@ def test_jobs_that_learn_the_same_are_trained_once_and_a_failed_one_is_reported(
     training = json.loads((runs[1] / "metrics.json").read_text())["training"]
     assert training["trained_as"] == first["folder"]
     assert training["steps"] == 2
+
+
+@pytest.mark.slow
+def test_what_a_sweep_found_stays_where_it_is_typed_again(
+    tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Without its data, and with data of other settings."""
+    data, sweep = tmp_path / "data", tmp_path / "sweep"
+    data.symlink_to(tiny_scenes)
+    typed = [*TINY, "-m", "model=cnn_patch", "trainer.max_steps=2", f"out={sweep}", "seed=0,1"]
+    assert run_command("train", HOME, [*typed, f"data.root={data}"]) == 0
+    files = sorted(sweep.glob("*/metrics.json"))
+    before = [file.read_bytes() for file in files]
+    assert len(files) == 2
+    data.unlink()
+    capfd.readouterr()
+    assert run_command("train", HOME, [*typed, f"data.root={data}"]) == 0
+    events = [json.loads(line)["event"] for line in capfd.readouterr().out.splitlines()]
+    assert events == ["skipped", "skipped", "swept"]
+
+    assert run_command("train", HOME, [*typed, f"data.root={tiny_scenes}"]) == 1
+    err = capfd.readouterr().err
+    assert "holds results of other settings" in err
+    assert err.splitlines()[-1].startswith("train: 2 jobs failed; what their folders held before")
+    assert [file.read_bytes() for file in files] == before
+    assert not list(sweep.rglob("failed.json"))

@@ -77,7 +77,7 @@ def test_tags_are_words(typed: str, tmp_path: Path, capfd: pytest.CaptureFixture
 @pytest.mark.slow
 def test_a_search_maximizes_the_score(tiny_scenes: Path, tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper")
-    search = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.direction=maximize"]
+    search = ["-m", "hydra/sweeper=optuna"]
     search += ["hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=1", "hydra.sweeper.sampler.seed=0"]
     typed = [*search, "filter.particles=int(interval(4,12))", f"out={tmp_path}"]
     typed += [*TINY, "model=downsized", f"data.root={tiny_scenes}", "trainer.max_steps=2"]
@@ -94,3 +94,15 @@ def test_a_search_maximizes_the_score(tiny_scenes: Path, tmp_path: Path) -> None
     best = str(found["best_params"]["filter.particles"])
     assert found["best_value"] == pytest.approx(scores[best])
     assert scores[best] == max(scores.values()) > min(scores.values())
+
+
+@pytest.mark.slow
+def test_a_callback_that_waits_for_no_metric_of_ours_is_one_line(
+    tiny_scenes: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    stopping = "+callbacks.stop={_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: x/y}"
+    typed = [*TINY, "model=cnn_patch", f"data.root={tiny_scenes}", f"out={tmp_path}", stopping]
+    assert run_command("train", HOME, [*typed, "callbacks=checkpoints"]) == 2
+    err = capfd.readouterr().err
+    assert "train: trainer or callbacks: Early stopping conditioned on metric `x/y`" in err
+    assert "Traceback" not in err

@@ -6,12 +6,36 @@ from difflib import get_close_matches
 from itertools import pairwise, product
 from pathlib import Path
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli.renamed import rename
 from posefilter.errors import UserError
 
+MULTIRUN = ("-m", "--multirun")
+# options of Hydra that a value follows
+_VALUED = (
+    *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"),
+    *("--config-dir", "-cd", "--shell-completion-for", "--experimental-rerun"),
+)
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
+_SEVERAL = ("logger",)  # groups of which several choices can be made at once
+
+
+def options_first(arguments: Sequence[str]) -> list[str]:
+    """Return a command line with its options before all settings: Hydra's parser does not find
+    settings on both sides of an option.
+    """
+    options, settings = list[str](), list[str]()
+    words = iter(arguments)
+    for word in words:
+        if not word.startswith("-"):
+            settings.append(word)
+            continue
+        options.append(word)
+        if word in _VALUED:
+            options += [value for value in [next(words, None)] if value is not None]
+    return [*options, *settings]
 
 
 def bracketed(arguments: list[str]) -> list[str]:
@@ -49,17 +73,53 @@ def without_trace(arguments: list[str], name: str) -> list[str]:
 
 def quoted(arguments: Sequence[str]) -> list[str]:
     """Return settings with quotes round values that Hydra's grammar has no place for, such as a
-    folder with an umlaut in its name; each part of a list of values by itself.
+    folder with an umlaut in its name; each part of a list of values by itself. A list that is a
+    path that there is, as of a sweep's job, is one value.
     """
     out = []
     for argument in arguments:
         key, _, value = argument.partition("=")
         odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
         if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
-            parts = (part.replace("'", "\\'") for part in value.split(","))
+            values = [value] if Path(value).exists() else value.split(",")
+            parts = (part.replace("'", "\\'") for part in values)
             argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)
         out.append(argument)
     return out
+
+
+def maximized(arguments: Sequence[str]) -> list[str]:
+    """Return a command line whose search maximizes what a training returns, as far as it does not
+    say otherwise: Optuna would minimize.
+    """
+    searched = "hydra/sweeper=optuna" in arguments
+    told = any(a.lstrip("+").startswith("hydra.sweeper.direction=") for a in arguments)
+    return [*arguments, *(["hydra.sweeper.direction=maximize"] if searched and not told else [])]
+
+
+def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
+    """Return a command line whose sweep gives each job a folder of its own, also where it is over a
+    setting that folders are not named after, such as `data.root`.
+
+    Args:
+        arguments: The command line.
+        name: The command.
+        conf: The folder of settings.
+    """
+    if not {*MULTIRUN} & {*arguments}:
+        return list(arguments)
+    settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
+    job = (settings.get("hydra") or {}).get("job") or {}
+    unnamed = ((job.get("config") or {}).get("override_dirname") or {}).get("exclude_keys") or []
+    typed = [a for a in arguments if a.partition("=")[0] in unnamed]
+    swept = {
+        own.key_or_group
+        for own in OverridesParser.create().parse_overrides(typed)
+        if own.is_sweep_override()
+    }
+    left = [key for key in unnamed if key not in swept]
+    named = f"hydra.job.config.override_dirname.exclude_keys=[{','.join(left)}]"
+    return [*arguments, *([named] if swept else [])]
 
 
 def _written(value: str) -> bool:
@@ -81,7 +141,7 @@ def check_choices(arguments: list[str], conf: Path) -> None:
         own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
         if own and group != key:
             raise UserError(f"{argument}: names a choice; type {group}={value}")
-        if own and value.startswith(("[", "{")):
+        if own and value.startswith(("[", "{")) and not _is_several(group, value):
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
@@ -91,6 +151,10 @@ def check_choices(arguments: list[str], conf: Path) -> None:
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)
+
+
+def _is_several(group: str, value: str) -> bool:
+    return group in _SEVERAL and value[0] == "[" and value != "[]"
 
 
 def check_variants(arguments: Sequence[str], conf: Path) -> None:
@@ -143,7 +207,7 @@ def defer_settings(arguments: Sequence[str], conf: Path) -> list[str]:
         arguments: The command line.
         conf: The folder of settings.
     """
-    if not any(a in ("-m", "--multirun") or a.startswith("sweep=") for a in arguments):
+    if not any(a in MULTIRUN or a.startswith("sweep=") for a in arguments):
         return list(arguments)
     typed = [a for a in arguments if "=" in a and not a.startswith("-")]
     parsed = dict(zip(typed, OverridesParser.create().parse_overrides(typed), strict=True))

@@ -77,7 +77,7 @@ def build_trainer(job: Job) -> Trainer:
             )
     callbacks.append(progress(cfg.console))
     loggers: list[Logger] = [
-        made for made in (instantiate(cfg.logger, "logger") or {}).values() if made
+        made for made in (instantiate(cfg.get("logger"), "logger") or {}).values() if made
     ]
     for logger in loggers:
         if not isinstance(logger, TensorBoardLogger):  # whose settings TensorBoardLayout logs

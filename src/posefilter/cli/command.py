@@ -21,19 +21,29 @@ from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.ablation_configs import register_ablations
 from posefilter.cli.arguments import (
+    MULTIRUN,
     bracketed,
     check_choices,
     defer_settings,
+    maximized,
     name_places,
+    options_first,
     quoted,
     spelled,
+    told_apart,
     without_trace,
 )
 from posefilter.cli.components import loosen
 from posefilter.cli.console import JSON, logging_for, say, settle_logging
-from posefilter.cli.explain import explain, explain_hydra, first_line
+from posefilter.cli.explain import explain, explain_hydra, first_line, is_launchers
 from posefilter.cli.fit import check_fit
-from posefilter.cli.folders import forget_failure, hold_folder, note_failure, remove_if_empty
+from posefilter.cli.folders import (
+    done_before,
+    forget_failure,
+    hold_folder,
+    note_failure,
+    remove_if_empty,
+)
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.preflight import check_files
@@ -67,7 +77,6 @@ EXPECTED = (
     MemoryError,
 )
 _FAILED = (FloatingPointError, ProblemsFound, NotThere)  # nothing is wrong with the command line
-_MULTIRUN = ("-m", "--multirun")
 # others write to a folder of another
 _OWN_FOLDER = ("train", "evaluate", "predict", "check_data", "track")
 
@@ -83,14 +92,12 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     arguments = sys.argv[1:] if arguments is None else arguments
     arguments = spelled(arguments) if name == "report" else arguments
     arguments = name_places(arguments) if name == "convert_bag" else arguments
-    # Hydra's parser wants it before or after all the rest
-    arguments = sorted(arguments, key=lambda a: a not in _MULTIRUN)
     trace = "debug=traceback" in arguments
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()
     show_all_signs()
-    before, begun = sys.argv, list[Job]()
+    before, begun, kept = sys.argv, list[Job](), list[Job]()
     os.environ[STARTED] = name
     record: dict[Path, bytes] = {}
     try:
@@ -99,18 +106,24 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             return 0
         arguments = without_trace(arguments, name)
         check_choices(arguments, conf)
-        if {"--cfg", "-c"} & {*arguments} and {*_MULTIRUN} & {*arguments}:
+        if {"--cfg", "-c"} & {*arguments} and {*MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
         arguments = bracketed(arguments)
         record = keep_record(arguments)
         arguments = with_resumed(arguments)
         check_choices(arguments, conf)  # a resumed run's too
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
+        arguments = told_apart(maximized(options_first(arguments)), name, conf)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
         with stopped_by_sigterm():
             hydra.main(config_path=str(conf.resolve()), config_name=name, version_base="1.3")(
-                _task(name, begun)
+                _task(name, begun, kept)
             )()
+        if kept:
+            raise ProblemsFound(
+                f"{len(kept)} jobs failed; what their folders held before stays, such as "
+                f"{kept[0].folder}"
+            )
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -126,7 +139,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return FAILURE if isinstance(error, _FAILED) else MISTAKE
     except Exception as error:
         write_record(record)
-        if begun or trace:
+        if trace or (begun and not is_launchers(error)):
             raise
         print(f"{name}: {explain_hydra(error, conf, arguments)}", file=sys.stderr)
         return MISTAKE
@@ -153,8 +166,10 @@ def show_all_signs() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
-    """Return the function that Hydra calls for each job, which it adds to those that have begun."""
+def _task(name: str, begun: list[Job], kept: list[Job]) -> Callable[[DictConfig], Any]:
+    """Return the function that Hydra calls for each job, which it adds to those that have begun; to
+    those that are kept, where a sweep's job fails whose folder holds earlier results.
+    """
 
     def task(cfg: DictConfig) -> Any:
         try:
@@ -170,7 +185,8 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
                 hold_folder(job.folder)
             forget_failure(job)
             use_plugins(cfg)
-            check_files(name, cfg)
+            if not (name == "train" and done_before(job)):
+                check_files(name, cfg)
             if name == "train":
                 check_fit(cfg, job.choices, Scope.CONFIG)
             if not job.swept:  # before torch is imported, which takes seconds
@@ -182,7 +198,8 @@ def _task(name: str, begun: list[Job]) -> Callable[[DictConfig], Any]:
                 if not isinstance(error, EXPECTED):
                     traceback.print_exception(error)
                 print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
-                note_failure(job, first_line(error))
+                if not note_failure(job, first_line(error)):
+                    kept.append(job)
                 return None  # of NaN Optuna's sweeper would make an error
             if not isinstance(error, EXPECTED):
                 raise

@@ -101,6 +101,12 @@ def explain_hydra(error: BaseException, conf: Path, arguments: list[str]) -> str
     return f"{', '.join(groups) or 'the settings'}: cannot be read ({first_line(error)})"
 
 
+def is_launchers(error: BaseException) -> bool:
+    """Tell whether a launcher or sweeper of Hydra has raised an error itself, rather than a job."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and bool({"hydra_plugins", "optuna"} & {*Path(frames[-1].filename).parts})
+
+
 def first_line(error: BaseException) -> str:
     """Return an error's first line, or its kind where it says nothing.
 

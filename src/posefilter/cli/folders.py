@@ -11,6 +11,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.cli.comparing import HANDS
 from posefilter.cli.job import Job, check_out
 from posefilter.cli.ranks import is_follower
 from posefilter.errors import Carrier, UserError
@@ -89,6 +90,46 @@ def holds_evaluation(folder: Path) -> bool:
     return file.is_file() and read_metrics(file).get("command") == "evaluate"
 
 
+def check_same(job: Job) -> None:
+    """Raise UserError where the folder of a sweep's job holds results of a job with other
+    overrides, as far as they decide a result.
+    """
+    metrics = own_metrics(job.folder) if job.swept else {}
+    others = {*deciding(metrics.get("overrides", []))} ^ {*deciding(job.overrides)}
+    if metrics and others:
+        told = ", ".join(sorted(others))
+        raise UserError(
+            f"{job.folder}: holds results of other settings ({told}); choose another out="
+        )
+
+
+def deciding(overrides: list[str]) -> list[str]:
+    """Return what was typed, in one order, less what says where and with how many hands a run is
+    done.
+    """
+    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
+
+
+def done_before(job: Job) -> bool:
+    """Tell whether a sweep's job has its results.
+
+    Raises:
+        UserError: Its folder holds the results of another.
+    """
+    check_same(job)
+    return job.swept and bool(own_metrics(job.folder))
+
+
+def own_metrics(folder: Path) -> dict[str, Any]:
+    """Return what a run's own test found, also where an evaluation has since written its own; empty
+    before the test.
+    """
+    for name in ("metrics_train.json", "metrics.json"):
+        if (folder / name).is_file():
+            return read_metrics(folder / name)
+    return {}
+
+
 def read_metrics(file: Path) -> dict[str, Any]:
     """Return what a metrics.json holds.  Raises UserError where it is damaged."""
     try:
@@ -122,10 +163,17 @@ def remove_if_empty(folder: Path, command: str) -> None:
             parent.rmdir()
 
 
-def note_failure(job: Job, cause: str) -> None:
-    """Write down why a sweep's job has no result, until it has one."""
+def note_failure(job: Job, cause: str) -> bool:
+    """Write down why a sweep's job has no result, until it has one.
+
+    Returns:
+        Whether it has none: results that were there before stay as they are, without a note.
+    """
+    if own_metrics(job.folder):
+        return False
     content = {"overrides": job.overrides, "error": cause}
     write_whole(job.folder / FAILED, json.dumps(content, indent=2) + "\n")
+    return True
 
 
 def forget_failure(job: Job) -> None:

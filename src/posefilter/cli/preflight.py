@@ -48,7 +48,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
     if command == "track":
         _check_video(cfg)
     if command == "train":
-        _check_loggers(cfg.logger)
+        _check_loggers(cfg.get("logger"))
     for key in _SWITCHES.get(command, ()):
         if not isinstance(cfg[key], bool):  # a text such as "no" would count as true
             raise UserError(f"{key}={cfg[key]}: choose true or false")

@@ -12,6 +12,9 @@ from posefilter.paths import check_links, stays_inside
 
 LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
 _DROPPED = ("resume", "out", "hydra.run.dir", "plugins")
+# by whose change a run would be another, or that a checkpoint brings with it: groups and settings
+_KEPT_GROUPS = ("model", "variant", "preset", "data", "optimizer", "experiment", "ablation")
+_KEPT = ("seed", "warm_start", "data.split", "data.split_seed", "data.object", "optimizer")
 _OVERRIDE = re.compile(r"([+~]{0,2})([A-Za-z_][\w./@]*)(?:=(.*))?", re.DOTALL)
 # that a run writes to
 _PLACES = ("cache_dir", "default_root_dir", "dirpath", "folder", "log_dir", "root_dir", "save_dir")
@@ -51,6 +54,10 @@ def last_checkpoints(resume: str | Path) -> list[Path]:
 def with_resumed(arguments: list[str]) -> list[str]:
     """Put the resumed run's own overrides ahead of the command line's, so that these may still
     change a thing.
+
+    Raises:
+        UserError: There is no such run; its record is damaged, or brings what only the user may
+            type; or what is typed cannot be changed any more.
     """
     given = _resumed(arguments)
     if given is None:
@@ -58,6 +65,8 @@ def with_resumed(arguments: list[str]) -> list[str]:
     folder = run_folder(given)
     last_checkpoints(given)
     check_links(folder)
+    for argument in arguments:
+        check_kept(argument, folder)
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
     kept = [o for o in overrides_of(folder) if _key(o) not in named and _key(o) not in _DROPPED]
     for override in kept:
@@ -124,6 +133,45 @@ def check_override(override: str, folder: Path) -> None:
             f"resume={folder}: its {key}={value} lies outside of the working folder; if it is "
             f"right, type it as well"
         )
+
+
+def check_kept(argument: str, folder: Path) -> None:
+    """Raise UserError where an argument changes a setting that a run keeps."""
+    key, _, value = argument.partition("=")
+    key = key.lstrip("+~")
+    if key == "out" and value not in ("", "null") and Path(value).resolve() != folder.resolve():
+        raise UserError(
+            f"{argument}: a run that is resumed stays in its folder; leave out= out, or type "
+            f"warm_start={folder}/checkpoints/{LAST} for a new run that begins with its weights"
+        )
+    kept = key in _KEPT_GROUPS or any(key == one or key.startswith(f"{one}.") for one in _KEPT)
+    if kept and _read_value(value) != _find_recorded(key, folder):
+        raise UserError(
+            f"{argument}: the run began with another, which a resumed run keeps; leave it out, or "
+            f"begin a new run"
+        )
+
+
+def _read_value(text: str) -> Any:
+    """Return a typed value; a text that is no YAML as it is."""
+    try:
+        return yaml.load(text, Loader=PlainLoader)
+    except yaml.YAMLError:
+        return text
+
+
+def _find_recorded(key: str, folder: Path) -> Any:
+    """Return what a run's record says of a choice or setting."""
+    choice = key in _KEPT_GROUPS
+    file = folder / ".hydra" / ("hydra.yaml" if choice else "config.yaml")
+    path = ["hydra", "runtime", "choices", key] if choice else key.split(".")
+    try:
+        node: Any = yaml.load(read_bytes(file, _RECORD).decode(), Loader=PlainLoader)
+    except (OSError, yaml.YAMLError, RecursionError, ValueError, BadData) as error:
+        raise UserError(f"{file}: cannot be read, so that {key}= cannot be compared") from error
+    for part in path:
+        node = node.get(part) if isinstance(node, dict) else None
+    return node
 
 
 def _resumed(arguments: list[str]) -> str | None:

@@ -10,10 +10,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from posefilter.cli.checkpoints import read_checkpoint, recipe
-from posefilter.cli.comparing import HANDS, differing
+from posefilter.cli.comparing import differing
 from posefilter.cli.console import say
 from posefilter.cli.files import save_whole
-from posefilter.cli.folders import read_metrics
+from posefilter.cli.folders import check_same, own_metrics
 from posefilter.cli.instantiate import locate
 from posefilter.cli.job import Job
 from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
@@ -40,19 +40,6 @@ def finished(job: Job) -> dict[str, Any] | None:
     return metrics
 
 
-def check_same(job: Job) -> None:
-    """Raise UserError where the folder of a sweep's job holds results of a job with other
-    overrides, as far as they decide a result.
-    """
-    metrics = own_metrics(job.folder) if job.swept else {}
-    others = {*deciding(metrics.get("overrides", []))} ^ {*deciding(job.overrides)}
-    if metrics and others:
-        told = ", ".join(sorted(others))
-        raise UserError(
-            f"{job.folder}: holds results of other settings ({told}); choose another out="
-        )
-
-
 def changed_since(job: Job) -> list[str]:
     """Return the settings in which a job that is done differs from what its words mean now, as
     defaults may change.
@@ -62,23 +49,6 @@ def changed_since(job: Job) -> list[str]:
     except UserError:  # what is left of a finished job need not be whole: its results are
         return []
     return differing(then, recipe(job))
-
-
-def deciding(overrides: list[str]) -> list[str]:
-    """Return what was typed, in one order, less what says where and with how many hands a run is
-    done.
-    """
-    return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
-
-
-def own_metrics(folder: Path) -> dict[str, Any]:
-    """Return what a run's own test found, also where an evaluation has since written its own; empty
-    before the test.
-    """
-    for name in ("metrics_train.json", "metrics.json"):
-        if (folder / name).is_file():
-            return read_metrics(folder / name)
-    return {}
 
 
 def learned_from(job: Job) -> str:

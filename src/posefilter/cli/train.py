@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from lightning import Trainer
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch import loops
+from lightning.pytorch import callbacks, loops
 from torch.utils.data import default_collate
 
 from posefilter.cli.best import check_kept
@@ -120,10 +120,16 @@ def fit(run: Run) -> dict[str, Any]:
     except Stopped:
         say_stopped(run)
         raise
-    except (MisconfigurationException, ValueError) as error:
-        if isinstance(error, ValueError) and not _is_lightnings(error):
+    except (MisconfigurationException, ValueError, RuntimeError) as error:
+        told = " ".join(str(error).split())
+        if start is not None and "loading state_dict" in told:
+            first = told.partition(". ")[0]
+            raise UserError(
+                f"resume={start}: holds other networks than these settings ({first})"
+            ) from error
+        if not isinstance(error, MisconfigurationException) and not _is_lightnings(error):
             raise
-        raise UserError(f"trainer or callbacks: {' '.join(str(error).split())}") from error
+        raise UserError(f"trainer or callbacks: {told}") from error
     taken = cost(run.trainer.global_step, before, *began)
     return {**taken, "learned_from": learned_from(run.job)}
 
@@ -172,9 +178,12 @@ def _check_epochs(trainer: Trainer, batches: int) -> None:
 
 
 def _is_lightnings(error: Exception) -> bool:
-    """Tell whether Lightning's trainer has raised an error itself, rather than passed it on."""
+    """Tell whether Lightning's trainer or a callback of its own has raised an error itself, rather
+    than passed it on.
+    """
     frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and Path(frames[-1].filename).is_relative_to(Path(loops.__file__).parent)
+    places = [Path(one.__file__).parent for one in (loops, callbacks)]
+    return bool(frames) and any(Path(frames[-1].filename).is_relative_to(p) for p in places)
 
 
 def test(run: Run, checkpoint: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import flatten
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 
-SILENT = ("out", "resume", "console", "threads")
+SILENT = ("out", "resume", "console")
 COLUMNS = {  # of summary.csv, and the metrics that they hold
     key.replace("/", "_"): key
     for key in (
