@@ -60,3 +60,14 @@ def test_another_unit_is_named(scale: float, advice: str, brick: Mesh) -> None:
     with pytest.raises(UserError, match=f"mesh_scale={advice}"):
         check_size(facts, "drill.obj")
     check_size(inspect_mesh(brick), "drill.obj")
+
+
+def test_two_materials_of_one_color_each_are_more_than_one_color(brick: Mesh) -> None:
+    """Their coordinates are points, which have no extent in the texture."""
+    uv = np.full((len(brick.faces), 3, 2), 0.25, dtype=np.float32)
+    uv[::2, :, 1] = 0.75
+    texture = np.array([[[200, 0, 0]], [[0, 0, 200]]], dtype=np.uint8)
+    two = replace(brick, corner_uv=uv, texture=texture)
+    assert inspect_mesh(two).texture_px_per_mm == 0
+    assert inspect_mesh(two).colored
+    assert not inspect_mesh(replace(two, corner_uv=uv[:1].repeat(len(uv), axis=0))).colored

@@ -179,6 +179,67 @@ def test_ply_of_bop_reads_its_texture(tmp_path: Path) -> None:
     _rejects(tmp_path / "obj_000001.ply", "obj_000001.png", "missing texture")
 
 
+_PLAIN_PLY = """ply
+format ascii 1.0
+{comments}element vertex 3
+property float x
+property float y
+property float z
+{properties}element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 {first}
+1 0 0 {second}
+0 1 0 {third}
+3 0 1 2
+"""
+_COLORS = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+_MAPPED = "property float s\nproperty float t\n"
+
+
+def _write_ply(path: Path, comments: str, properties: str, *values: str) -> Path:
+    first, second, third = values
+    text = _PLAIN_PLY.format(
+        comments=comments, properties=properties, first=first, second=second, third=third
+    )
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("named", ["red", "diffuse_red"])
+def test_ply_has_its_colors_where_coordinates_have_no_picture(tmp_path: Path, named: str) -> None:
+    colors = _COLORS if named == "red" else _COLORS.replace("uchar ", "uchar diffuse_")
+    values = ["255 0 0 0 0", "0 255 0 1 0", "0 0 255 0 1"]
+    path = _write_ply(tmp_path / "a.ply", "", colors + _MAPPED, *values)
+    mesh = read_mesh(path, "a")
+    assert mesh.corner_uv is None
+    assert mesh.corner_colors is not None
+    assert np.array_equal(mesh.corner_colors[0], np.eye(3))
+
+
+def test_ply_with_picture_and_colors_has_its_picture(tmp_path: Path) -> None:
+    picture = _picture(tmp_path / "p.png")
+    values = ["9 9 9 0 0", "9 9 9 1 0", "9 9 9 0 1"]
+    comments = "comment made by hand\n" * 400 + "comment TextureFile p.png\n"  # a long header
+    mesh = read_mesh(_write_ply(tmp_path / "a.ply", comments, _COLORS + _MAPPED, *values), "a")
+    assert np.array_equal(mesh.texture, picture)
+    assert mesh.corner_colors is None
+    (tmp_path / "p.png").unlink()
+    _rejects(tmp_path / "a.ply", "p.png", "missing texture", "a.ply")
+
+
+def test_ply_whose_picture_has_no_place_is_refused(tmp_path: Path) -> None:
+    _picture(tmp_path / "p.png")
+    _picture(tmp_path / "q.png")
+    one, two = (f"comment TextureFile {name}.png\n" for name in "pq")
+    path = _write_ply(tmp_path / "a.ply", one, "", "", "", "")
+    _rejects(path, "a.ply", "names a texture (p.png), but no texture coordinates")
+    path = _write_ply(tmp_path / "b.ply", one + two, _MAPPED, "0 0", "1 0", "0 1")
+    _rejects(path, "b.ply", "names 2 textures (p.png, q.png)")
+    path = _write_ply(tmp_path / "c.ply", one + one, _MAPPED, "0 0", "1 0", "0 1")
+    assert read_mesh(path, "c").corner_uv is not None
+
+
 def _rejects(path: Path, *words: str) -> None:
     with pytest.raises(UserError) as caught:
         read_mesh(path, "x")

@@ -182,7 +182,7 @@ def _is_lightnings(error: Exception) -> bool:
     than passed it on.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    places = [Path(one.__file__).parent for one in (loops, callbacks)]
+    places = [Path(str(one.__file__)).parent for one in (loops, callbacks)]
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(p) for p in places)
 
 

@@ -2,16 +2,17 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
 
 from posefilter.errors import UserError
-from posefilter.limits import read_bytes
 from posefilter.meshes.glb import check_glb
 from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.meshes.obj import MOST_TEXELS, PLAIN, Material, RawMesh, read_image, read_obj
+from posefilter.meshes.ply import open_ply
 
 SUFFIXES = (".obj", ".ply", ".glb")
 _FARTHEST = 1e6  # [m]
@@ -116,10 +117,10 @@ def _picture(material: Material) -> np.ndarray:
 def _read_other(path: Path) -> RawMesh:
     """Read PLY and GLB with trimesh; the parts of a scene become one mesh."""
     if path.suffix.lower() == ".ply":
-        _check_ply_texture(path)
+        loaded = _load_ply(path)
     else:
         check_glb(path)
-    loaded = trimesh.load(path, process=False)
+        loaded = trimesh.load(path, process=False)
     parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
     raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
     if not raws:
@@ -144,14 +145,15 @@ def _read_other(path: Path) -> RawMesh:
     )
 
 
-def _check_ply_texture(path: Path) -> None:
-    """Raise UserError unless the texture that a PLY's header names can be read: trimesh ignores
-    it.
+def _load_ply(path: Path) -> Any:
+    """Load a PLY file. Raises UserError unless the picture that it names can be read: trimesh would
+    ignore that.
     """
-    header = read_bytes(path)[:4096].partition(b"end_header")[0].decode(errors="replace")
-    for line in header.splitlines():
-        if line.lower().startswith("comment texturefile "):
-            read_image(path.parent / line.split(maxsplit=2)[2].strip(), path)
+    file, textures = open_ply(path)
+    for name in textures:
+        read_image(path.parent / name, path)
+    resolver = trimesh.resolvers.FilePathResolver(str(path))
+    return trimesh.load(file, file_type="ply", process=False, resolver=resolver)
 
 
 def _from_trimesh(mesh: trimesh.Trimesh, path: Path) -> RawMesh:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.errors import UserError
-from posefilter.meshes.mesh import Mesh, diameter, face_areas
+from posefilter.meshes.mesh import Mesh, diameter, face_areas, surface_colors
 
 # [m] across: what is larger or smaller is likely in another unit than meters
 LARGEST, SMALLEST = 2.0, 0.01
@@ -57,7 +57,10 @@ def inspect_mesh(mesh: Mesh) -> MeshFacts:
         area = face_areas(mesh.vertices, mesh.faces).sum()
         resolution = math.sqrt(pixels / max(area, 1e-12)) / 1000
     printed = resolution > 0 and float(mesh.texture.reshape(-1, 3).std(0).max()) > 2
+    everywhere = np.arange(len(mesh.faces))
+    centers = surface_colors(mesh, everywhere, np.full((len(everywhere), 3), 1 / 3))
     painted = mesh.corner_colors is not None and float(mesh.corner_colors.std()) > 0.01
+    several = float(centers.std(0).max()) > 0.01  # materials of one color each
     x, y, z = (1000 * (high - low)).tolist()
     return MeshFacts(
         1000 * diameter(mesh.vertices),
@@ -66,7 +69,7 @@ def inspect_mesh(mesh: Mesh) -> MeshFacts:
         float((count != 2).mean()),
         1e6 * volume,
         resolution,
-        printed or painted,
+        printed or painted or several,
     )
 
 

@@ -1,0 +1,55 @@
+"""What the header of a PLY file says of colors and texture, put so that trimesh reads it."""
+
+import io
+import re
+from pathlib import Path
+
+from posefilter.errors import UserError
+from posefilter.limits import read_bytes
+
+_END = b"end_header"
+_LONGEST = 1 << 20  # of a header [bytes]
+_TEXTURE = re.compile(r"comment\s+texturefile\s+(.+)", re.IGNORECASE)
+_PROPERTY = re.compile(r"^(\s*property\s+.*\s)(\w+)(\s*)$", re.MULTILINE)
+_COORDINATES = ("texture_u", "texture_v", "u", "v", "s", "t", "texcoord")
+
+
+def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
+    """Open a PLY file for trimesh, which looks for colors under one name alone, and not at all
+    where there are texture coordinates.
+
+    A mesh with both a texture and colors has its texture, as BOP's models of YCB-Video have both.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The file, its header changed; and the picture that it names, if any.
+
+    Raises:
+        UserError: It names several pictures, of which trimesh would put one on all faces; or one,
+            and has neither texture coordinates nor colors.
+    """
+    data = read_bytes(path)
+    end = data.find(_END, 0, _LONGEST)
+    if end < 0:  # trimesh says what is wrong
+        return io.BytesIO(data), []
+    header = data[:end].decode("latin-1")
+    lines = map(_TEXTURE.fullmatch, map(str.strip, header.splitlines()))
+    textures = list(dict.fromkeys(found[1].strip() for found in lines if found))
+    if len(textures) > 1:
+        raise UserError(
+            f"{path}: names {len(textures)} textures ({', '.join(textures[:4])}), of which a PLY "
+            "can have one here; convert it to .obj or .glb"
+        )
+    header = _PROPERTY.sub(lambda m: m[1] + m[2].removeprefix("diffuse_") + m[3], header)
+    names = {found[2] for found in _PROPERTY.finditer(header)}
+    colored, mapped = "red" in names, bool(names & {*_COORDINATES})
+    if textures and not mapped and not colored:
+        raise UserError(f"{path}: names a texture ({textures[0]}), but no texture coordinates")
+    if not textures:  # coordinates of no picture would hide the colors
+        header = _PROPERTY.sub(
+            lambda m: m[1] + ("unused_" if m[2] in _COORDINATES else "") + m[2] + m[3], header
+        )
+    textures = textures if mapped else []
+    return io.BytesIO(header.encode("latin-1") + data[end:]), textures
