@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.data.dataset_trees import bop_scene, pose, write_mesh
 
 from posefilter.cli.command import run_command
+from posefilter.cli.evaluate import warn_of_several
+from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.registry import open_reader
 from posefilter.meshes.store import MeshStore
 from posefilter.metrics.bop_results import PoseRow, to_native, write_poses_csv
@@ -97,3 +100,50 @@ def test_a_file_of_targets_says_how_many_count(scenes: Path, tmp_path: Path) -> 
     wrong = [only[0]._replace(camera_from_native=shifted), only[1]]
     half = evaluate(wrong, scenes, tmp_path / "half", str(path))
     assert half["bop"]["ar"] == pytest.approx(50)
+
+
+def test_an_instance_of_which_nothing_is_seen_is_no_target(tmp_path: Path) -> None:
+    """And without `data.object=`, the targets' objects are meant."""
+    truths, hidden = pose(), pose(position=(0.0, 0.0, 2.0))
+    bop_scene(tmp_path / "bop" / "000003", [[(5, hidden), (5, truths)]])
+    write_mesh(tmp_path / "meshes", "obj_000005")
+    targets = tmp_path / "targets.json"
+    targets.write_text(json.dumps([{"scene_id": 3, "im_id": 0, "obj_id": 5, "inst_count": 1}]))
+    write_poses_csv(tmp_path / "poses.csv", [PoseRow(3, 0, 5, 1.0, truths, 1.0)])
+    typed = [f"estimates={tmp_path / 'poses.csv'}", f"targets={targets}", "console=json"]
+    typed += ["data=bop", f"data.root={tmp_path / 'bop'}", f"data.meshes={tmp_path / 'meshes'}"]
+    typed += ["data.mesh_scale=1", "data.on_error=skip", f"out={tmp_path / 'out'}"]
+    assert run_command("evaluate", arguments=typed) == 0
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())["bop"]
+    assert found["targets"] == 1
+    assert found["ar"] > 99
+
+
+def test_a_target_of_an_object_that_was_left_out_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bop_scene(tmp_path / "bop" / "000003", [[(5, pose()), (6, pose(position=(0.1, 0.0, 0.5)))]])
+    targets = tmp_path / "targets.json"
+    targets.write_text(json.dumps([{"scene_id": 3, "im_id": 0, "obj_id": 6, "inst_count": 1}]))
+    write_poses_csv(tmp_path / "poses.csv", [PoseRow(3, 0, 5, 1.0, pose(), 1.0)])
+    write_mesh(tmp_path / "meshes", "obj_000005")
+    typed = [f"estimates={tmp_path / 'poses.csv'}", f"targets={targets}", "console=json"]
+    typed += ["data=bop", f"data.root={tmp_path / 'bop'}", f"data.meshes={tmp_path / 'meshes'}"]
+    typed += ["data.mesh_scale=1", "data.object=obj_000005", f"out={tmp_path / 'out'}"]
+    assert run_command("evaluate", arguments=typed) == 2
+    assert "data.object=null takes all objects" in capfd.readouterr().err
+
+
+def test_an_estimate_an_image_is_not_compared_with_several_instances_without_a_word(
+    scenes: Path,
+) -> None:
+    data = PoseDataModule("fat", scenes, "carton", split={"test": 1.0}, workers=0, progress=False)
+    data.setup("test")
+    said: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "posefilter.cli.evaluate.say", lambda console, event, text, **_: said.append(text)
+        )
+        warn_of_several(data, "json")
+    (line,) = said
+    assert "2 of 2 images show several instances of the object" in line

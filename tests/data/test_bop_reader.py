@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from dataset_trees import K, bop_scene, pose, scene, truth, write_png
@@ -125,3 +126,34 @@ def test_broken_masks_and_folders(tmp_path):
         BopReader(tmp_path / "000001" / "rgb")
     with pytest.raises(UserError, match="unknown class 'obj_000003'"):
         BopReader(tmp_path, "obj_000003")
+
+
+def test_gray_images_and_depth_may_be_tiff(tmp_path):
+    """As ITODD's are."""
+    folder = tmp_path / "test" / "000001"
+    bop_scene(folder, [[(5, pose())]])
+    expected = BopReader(tmp_path, part="test").read(0)
+    for old, new in (("rgb/000000.png", "gray/000000.tif"), ("depth/000000.png",) * 2):
+        image = cv2.imread(str(folder / old), cv2.IMREAD_UNCHANGED)
+        image = image[..., 0] if image.ndim == 3 else image
+        (folder / new).parent.mkdir(exist_ok=True)
+        (folder / old).unlink()
+        assert cv2.imwrite(str((folder / new).with_suffix(".tif")), image)
+    sample = BopReader(tmp_path, part="test").read(0)
+    np.testing.assert_array_equal(sample.depth, expected.depth)
+    np.testing.assert_array_equal(sample.rgb, expected.rgb[..., 2:].repeat(3, axis=-1))
+
+
+def test_a_ycb_name_in_a_dataset_without_it_is_told_by_the_datasets_own(tmp_path):
+    bop_scene(tmp_path / "000001", [[(1, pose()), (5, FRONT)]])
+    with pytest.raises(UserError, match=r"no '003_cracker_box' .*have obj_000001, obj_000005; .*"):
+        BopReader(tmp_path, "003_cracker_box")
+
+
+def test_broken_frames_can_be_left_out_and_the_error_says_how(tmp_path):
+    bop_scene(tmp_path / "000001", [[(5, pose())]])
+    bop_scene(tmp_path / "000002", [[(5, pose())]])
+    (tmp_path / "000002" / "scene_gt.json").unlink()
+    with pytest.raises(BadData, match=r"scene_gt.json: missing file .*data.on_error=skip leaves"):
+        BopReader(tmp_path)
+    assert len(BopReader(tmp_path, on_error="skip").records()) == 1

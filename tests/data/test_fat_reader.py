@@ -254,7 +254,7 @@ BROKEN = {
     "no class": (spoil_json("class"), "000007.left.json", "missing key 'objects\\[0\\].class'"),
     "nan location": (nan_location, "000007.left.json", "holds NaN"),
     "huge quaternion": (huge_quaternion, "000007.left.json", "not a unit quaternion .norm 1e.308"),
-    "nan depth": (nan_depth, "000007.left.depth.png", "NaN"),
+    "nan depth": (nan_depth, "000007.left.depth.png", "unknown everywhere"),
     "wrong size": (
         lambda f: write_png(f / "000007.left.seg.png", np.full((60, 80), 255, np.uint8)),
         "seg.png",

@@ -116,3 +116,10 @@ def test_real_meshes_are_read_well(store: MeshStore, name: str) -> None:
     assert (reach[0] - reach[1]).max() < 1e-3
     box = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
     assert 0.6 * box < diameter(mesh.vertices) <= box
+
+
+def test_results_have_numbers_that_differ() -> None:
+    names = ["mine", "003_cracker_box", "obj_000012", "other", "obj_000001"]
+    assert ycb.number_objects(names) == {
+        "mine": 3, "003_cracker_box": 2, "obj_000012": 12, "other": 4, "obj_000001": 1,
+    }  # fmt: skip

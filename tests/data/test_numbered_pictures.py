@@ -47,3 +47,20 @@ def test_pictures_of_which_some_have_no_partner_are_named(tmp_path: Path) -> Non
             cv2.imwrite(str(tmp_path / folder / f"{number:06d}.png"), picture)
     with pytest.raises(UserError, match=r"rgb/000001\.png has no picture of its name in depth/"):
         FolderVideo(tmp_path, np.eye(3), 1000.0)
+
+
+@pytest.mark.parametrize("shift", [0.004, -0.012])
+def test_pictures_named_by_times_are_paired_by_order_where_that_is_nearest(
+    shift: float, tmp_path: Path
+) -> None:
+    for folder, late in (("rgb", 0.0), ("depth", shift)):
+        (tmp_path / folder).mkdir()
+        for number in range(5):
+            picture = np.ones((4, 4), np.uint16 if folder == "depth" else np.uint8)
+            cv2.imwrite(str(tmp_path / folder / f"{1700.5 + number / 30 + late:.6f}.png"), picture)
+    assert len(FolderVideo(tmp_path, np.eye(3), 1000.0)) == 5
+    (tmp_path / "depth" / f"{1700.5 + shift:.6f}.png").rename(
+        tmp_path / "depth" / "1712.000000.png"
+    )
+    with pytest.raises(UserError, match=r"rgb/1700\.5.* is paired by order .* is nearer in time"):
+        FolderVideo(tmp_path, np.eye(3), 1000.0)

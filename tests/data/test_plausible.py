@@ -13,7 +13,7 @@ from dataset_trees import K, bop_scene, fat_tree, pose, write_mesh, ycb_frame
 from posefilter.data.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
-from posefilter.data.readers.decode import read_depth, read_json
+from posefilter.data.readers.decode import holds_meters, read_depth, read_json
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import BadData, UserError
@@ -249,11 +249,20 @@ def test_depth_is_read_from_arrays(tmp_path):
     read = read_depth(tmp_path / "u.npy", 1000.0)
     assert read[0, 0] == 0
     np.testing.assert_allclose(read[1:], meters[1:], atol=6e-4)
+    holes = meters.astype(np.float32)
+    holes[0, 0], holes[0, 1] = np.nan, np.inf
+    np.save(tmp_path / "h.npy", holes)
+    assert cv2.imwrite(str(tmp_path / "h.tif"), holes)
+    for name in ("h.npy", "h.tif"):  # unknown there, meters elsewhere, whatever the units
+        read = read_depth(tmp_path / name, 1000.0)
+        assert read[0, :2].tolist() == [0, 0]
+        assert np.array_equal(read[1:], holes[1:])
+        assert holds_meters(tmp_path / name)
+    assert not holds_meters(tmp_path / "u.npy")
     for name, array, words in (
-        ("nan", np.full((2, 2), np.nan), "NaN"),
         ("negative", np.full((2, 2), -1.0), "negative"),
         ("flat", np.ones(4), "one channel"),
-        ("text", np.array([["a"]]), "one channel"),
+        ("text", np.array([["a"]]), "not numbers"),
         ("objects", np.array([[{}]], dtype=object), "not readable as a NumPy array"),
     ):
         np.save(tmp_path / f"{name}.npy", array)

@@ -74,14 +74,14 @@ def make_image(pixels: np.ndarray, encoding: str, time: int = 0, **fields: Any) 
     return make_message(IMAGE, **{**given, **fields})
 
 
-def make_info(K: np.ndarray) -> Any:
+def make_info(K: np.ndarray, width: int = 0, height: int = 0) -> Any:
     region = make_message(
         "sensor_msgs/msg/RegionOfInterest",
         x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
     )  # fmt: skip
     P = np.concatenate([K, np.zeros((3, 1))], axis=1)
     return make_message(
-        CAMERA_INFO, header=make_header(0), height=1, width=1, distortion_model="plumb_bob",
+        CAMERA_INFO, header=make_header(0), height=height, width=width, distortion_model="plumb_bob",
         d=np.zeros(5), k=K.reshape(9), r=np.eye(3).reshape(9), p=P.reshape(12),
         binning_x=0, binning_y=0, roi=region,
     )  # fmt: skip
@@ -317,3 +317,20 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     assert not (tmp_path / "new.mcap").exists()
     assert [one.name for one in tmp_path.glob(".*")] == []
     assert (tmp_path / "there.mcap").read_text() == "mine"
+
+
+def test_a_camera_of_another_image_is_named_and_early_images_are_counted(tmp_path: Path) -> None:
+    rgb, depth, K = read_scene()
+    color, z = make_image(rgb, "rgb8"), make_image(depth, "16UC1")
+    height, width = depth.shape
+    images = [("/rgb", IMAGE, 2, color), ("/depth", IMAGE, 3, z)]
+    early = [("/rgb", IMAGE, 0, color), ("/info", CAMERA_INFO, 1, make_info(K, width, height))]
+    with BagReader(write_bag(tmp_path / "a", [*early, *images]), TOPICS, 0.1) as reader:
+        assert len([*reader.frames()]) == 1
+        assert (reader.early, reader.unpaired) == (1, 0)
+    other = [("/info", CAMERA_INFO, 1, make_info(K, 2 * width, 2 * height))]
+    with (
+        BagReader(write_bag(tmp_path / "b", [*other, *images]), TOPICS, 0.1) as reader,
+        pytest.raises(UserError, match=rf"/info: is of images of {2 * width}x{2 * height} pixels"),
+    ):
+        list(reader.frames())

@@ -3,6 +3,7 @@ them.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.frames import FrameRecord, NotShown, Reader, Sample
 from posefilter.data.module import PoseDataModule
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, hull_vertices
@@ -79,6 +80,7 @@ def score_targets(
         UserError: A target is not in the data, or an object has no mesh.
     """
     groups = _group(data.reader.records() if selection != ALL else records)
+    classes = {record.obj_id for record in data.reader.records()}
     targets = read_targets(Path(selection)) if selection != ALL else None
     counts = None if targets is None else {one[:3]: one.inst_count for one in targets}
     place = {record.key: i for i, record in enumerate(data.reader.records())}
@@ -88,8 +90,9 @@ def score_targets(
     for key in groups if counts is None else counts:
         if key not in groups:
             names = dict(zip(Target._fields, key, strict=False))
-            raise UserError(f"targets={selection}: the data have no instance of {names}")
-        samples = [data.reader.read(place[record.key]) for record in groups[key]]
+            left_out = "" if key[2] in classes else " (data.object=null takes all objects)"
+            raise UserError(f"targets={selection}: the data have no instance of {names}{left_out}")
+        samples = _read_shown([place[record.key] for record in groups[key]], data.reader)
         shares = [data.reader.visible_share(sample) for sample in samples]
         order = np.argsort(-np.nan_to_num(shares, nan=1.0), kind="stable").tolist()
         if counts is None:
@@ -102,6 +105,15 @@ def score_targets(
             scored.append(judge.score([samples[i] for i in order], known))
     count = sum(one.mssd.shape[1] for one in scored)
     return {**compute_average_recall(scored), "targets": count, "estimates": used}
+
+
+def _read_shown(places: Sequence[int], reader: Reader) -> list[Sample]:
+    """Return the instances of which a pixel is seen; the others are no targets."""
+    samples = []
+    for place in places:
+        with suppress(NotShown):
+            samples.append(reader.read(place))
+    return samples
 
 
 class _Judge:

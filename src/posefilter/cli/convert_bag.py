@@ -57,12 +57,13 @@ def convert_bag(job: Job) -> None:
             "warning: the camera has a lens distortion, and images are taken as rectified ones",
         )
     if cfg.console != JSON:
-        print(f"{images} images, {reader.unpaired} without depth")
+        early = f", {reader.early} before the first camera_info" if reader.early else ""
+        print(f"{images} images, {reader.unpaired} without depth{early}")
         for name, count in found.items():
             print(f"{name}: in {count}")
     ended(
         cfg.console, "converted", {"bag": out}, [],
-        images=images, unpaired=reader.unpaired, found=dict(found),
+        images=images, unpaired=reader.unpaired, early=reader.early, found=dict(found),
     )  # fmt: skip
 
 

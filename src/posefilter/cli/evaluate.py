@@ -1,6 +1,7 @@
 """Test a checkpoint, or poses of any other method, on a dataset."""
 
 import shutil
+from collections import Counter
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     )
     data.setup("test")
     method.set_object(object_to_judge(data, method.model))
+    warn_of_several(data, job.cfg.console)
     records = Records(beliefs=True)
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
@@ -116,6 +118,19 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return record(
         method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
     ), files
+
+
+def warn_of_several(data: PoseDataModule, console: str) -> None:
+    """Say where images show several instances of the object: a method gives one pose an image."""
+    counts = Counter((r.scene_id, r.im_id, r.obj_id) for r in data.records("test"))
+    several = sum(count > 1 for count in counts.values())
+    if several:
+        sentence = (
+            f"warning: {several} of {len(counts)} images show several instances of the object; the "
+            "one pose of an image is compared with each of them, so that most count as wrong "
+            "(predict.py instances=N finds several)"
+        )
+        say(console, "warning", sentence, several=several, images=len(counts))
 
 
 def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> None:
@@ -146,7 +161,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             "and data.root=DIR"
         )
     rows = read_poses_csv(Path(str(job.cfg.estimates)))
-    data = build_data(data_settings(job, {}, None), job.cfg.console)
+    settings = data_settings(job, {}, None)
+    if job.cfg.targets is not None and not any("data.object=" in o for o in job.overrides):
+        settings.object = None  # the targets say which objects are meant
+    data = build_data(settings, job.cfg.console)
     data.setup("test")
     best = {}
     for row in sorted(rows, key=lambda row: row.score):
@@ -272,6 +290,11 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
     """
     if not data.meshes.has(own.name):
         return own
+    if data.objects != (own.name,):
+        raise UserError(
+            f"data.object={', '.join(data.objects)}: the checkpoint was trained on {own.name}; "
+            "leave data.object out"
+        )
     theirs = data.object_model(0)
     shift = float((theirs.center - own.center).norm())
     if shift > _SAME_OBJECT or abs(theirs.radius - own.radius) > _SAME_OBJECT:

@@ -19,7 +19,7 @@ from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
 from posefilter.confidence.tolerance import PoseTolerance, read_pose_tolerance
 from posefilter.confidence.verdicts import Costs
-from posefilter.data.readers.decode import read_color, read_depth
+from posefilter.data.readers.decode import holds_meters, read_color, read_depth
 from posefilter.errors import NotThere, UserError
 from posefilter.estimator import Estimator
 from posefilter.figures.canvas import save_image
@@ -28,7 +28,7 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import record
 from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
-from posefilter.meshes.ycb import CLASSES, ycbvideo_index
+from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
 from posefilter.result import Result, Run, collect_results
 from posefilter.weights import expand_weights, is_several
@@ -153,13 +153,12 @@ def predict_several(job: Job) -> list[Result]:
 
 def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow]:
     """Return results as lines of a BOP results file: of scene 0 and image 0, in the frame of the
-    mesh files; an object has its number among YCB-Video's, or else its place among those asked for.
+    mesh files, and with the objects' numbers of `number_objects`.
     """
     seconds = sum(one.seconds for one in results)  # the challenge's time is that of an image
-    rows = []
+    rows, numbers = [], number_objects(objects)
     for one in results:
-        known = one.object in CLASSES
-        number = ycbvideo_index(one.object) if known else objects.index(one.object) + 1
+        number = numbers[one.object]
         score = choose_score(one.probability, one.score)
         rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
     return rows
@@ -339,11 +338,18 @@ def read_photograph(rgb: str, depth: str, depth_scale: float) -> tuple[np.ndarra
         )
     if not (z > 0).any():
         raise UserError(f"depth={depth}: no pixel has depth")
-    if np.median(z[z > 0]) > 30 or np.median(z[z > 0]) < 0.05:
-        raise UserError(
-            f"depth_scale={depth_scale}: the median depth would be {np.median(z[z > 0]):.3g} m; "
-            f"is it 1000 or 10000?"
+    median = float(np.median(z[z > 0]))
+    if not 0.05 <= median <= 30:
+        cause = (
+            f"depth_scale={depth_scale}: the median depth would be {median:.3g} m; is it 1000 or "
+            "10000?"
         )
+        if holds_meters(Path(depth)):
+            cause = (
+                f"depth={depth}: its floats should be meters, which depth_scale does not change, "
+                f"and their median is {median:.3g}"
+            )
+        raise UserError(cause)
     return color, z
 
 

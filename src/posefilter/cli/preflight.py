@@ -100,7 +100,7 @@ def _check_bag(cfg: DictConfig) -> None:
     _find_all(cfg.checkpoint)
     if find_spec("rosbags") is None:
         raise UserError(
-            "convert_bag: the package rosbags is missing; pip install 'posefilter[bags]' (in a "
+            "the package rosbags is missing; pip install 'posefilter[bags]' (in a "
             "clone: pip install -e '.[bags]')"
         )
 

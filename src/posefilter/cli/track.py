@@ -28,6 +28,7 @@ from posefilter.figures.overlay import Shape
 from posefilter.figures.recording import check_viewer
 from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
+from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import write_poses_csv
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.records import (
@@ -128,6 +129,7 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
+    numbers = number_objects(estimator.objects) | video.ids
     doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     with closing(tracker), writer, recorder:
         for frame in read_frames(video, tracker, cfg):
@@ -135,8 +137,8 @@ def follow(
             writer.add(draw_frame(frame, results, shapes))
             recorder.add(frame.rgb, frame.depth, frame.intrinsics, list_seen(results))
             rows = []
-            for number, result in enumerate(results):
-                ids = (video.scene_id, frame.im_id, video.ids.get(result.object, number + 1))
+            for result in results:
+                ids = (video.scene_id, frame.im_id, numbers[result.object])
                 truth = frame.truth.get(result.object)
                 doubt = result.blank or (result.object if result.wrong_size else "")
                 if doubt and doubt not in doubted:  # once is enough

@@ -56,7 +56,9 @@ class Video(ABC):
 
 
 class FolderVideo(Video):
-    """A folder with `rgb/` and `depth/`: pictures of the same names, or as many of each.
+    """A folder with `rgb/` and `depth/`: pictures of the same names, or as many of each, in order.
+
+    Where the names are times, each color picture must be nearest to its own depth picture.
 
     Where the color pictures' names differ in one number alone (`000123.png`, `frame_7_rgb.png`),
     the frames are in its order, and it is their `im_id`. Otherwise they are in the order of the
@@ -96,6 +98,8 @@ class FolderVideo(Video):
                 f"frames={folder}: {len(color)} pictures in rgb/ and {len(depth)} in depth/, of "
                 f"other names; name both alike"
             )
+        else:
+            _check_times(folder, color, depth)
         self._frames = [*zip(numbers, color, depth, strict=True)][::stride]
 
     def __len__(self) -> int:
@@ -170,6 +174,25 @@ def number_names(names: Sequence[str]) -> list[int] | None:
     numbers = [number for _, number, _ in found]
     alike = len({(before, after) for before, _, after in found}) == 1
     return numbers if alike and len({*numbers}) == len(names) else None
+
+
+def _check_times(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> None:
+    """Raise UserError where pictures are named by times, and those that are paired by order are not
+    the nearest in time.
+    """
+    try:
+        own, other = (np.array([float(path.stem) for path in paths]) for paths in (color, depth))
+    except ValueError:  # other names
+        return
+    nearest = np.abs(own[:, None] - other).argmin(axis=1)
+    wrong = np.flatnonzero(np.abs(own - other) > np.abs(own - other[nearest]))
+    if len(wrong):
+        first = wrong[0]
+        raise UserError(
+            f"frames={folder}: rgb/{color[first].name} is paired by order with "
+            f"depth/{depth[first].name}, but depth/{depth[nearest[first]].name} is nearer in "
+            f"time ({len(wrong)} of {len(color)}); name both alike"
+        )
 
 
 def _list_pictures(folder: Path, name: str, endings: Sequence[str]) -> tuple[list[Path], list[int]]:

@@ -3,6 +3,10 @@
 Numbers were measured on the public files (YCB's google_16k meshes, YCB-Video's model points).
 """
 
+import re
+from collections.abc import Sequence
+from itertools import count
+
 import numpy as np
 
 from posefilter.meshes.mesh import Mesh
@@ -115,6 +119,23 @@ def parts(name: str, mesh: Mesh) -> dict[str, np.ndarray]:
         along = mesh.vertices[mesh.faces][..., axis].mean(axis=1)
         out[part] = (along >= low) & (along < high)
     return {part: faces for part, faces in out.items() if faces.any()}
+
+
+def number_objects(names: Sequence[str]) -> dict[str, int]:
+    """Return the number of each object in results: of one of YCB-Video's its number there, of
+    `obj_000012` 12, of any other the first that is free, from 1.
+    """
+    numbers: dict[str, int] = {}
+    for name in names:
+        numbered = re.fullmatch(r"obj_(\d{1,9})", name)
+        if name in CLASSES:
+            numbers[name] = ycbvideo_index(name)
+        elif numbered:
+            numbers[name] = int(numbered[1])
+    for name in names:
+        free = (n for n in count(1) if n not in numbers.values())
+        numbers.setdefault(name, next(free))
+    return numbers
 
 
 def ycbvideo_index(name: str) -> int:

@@ -63,6 +63,7 @@ class BagReader:
         self.path, self.topics, self.tolerance = path, topics, int(tolerance * 1e9)
         self.distorted = False  # whether a camera had a lens distortion that is not undone
         self.unpaired = 0  # color images without depth
+        self.early = 0  # color images before the camera is known
         try:
             self.reader = Reader(path)
             self.reader.open()
@@ -116,7 +117,7 @@ class BagReader:
         """Yield each color image with the depth of its moment, once the camera is known.
 
         Raises:
-            UserError: A message is damaged, or color and depth are not of one size.
+            UserError: A message is damaged, or color, depth and camera are not of one size.
         """
         colors: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
         depths: deque[tuple[int, int, Any]] = deque(maxlen=_WAITING)
@@ -129,12 +130,15 @@ class BagReader:
                 camera = message
                 self.distorted |= is_distorted(message)
                 continue
+            if camera is None:
+                self.early += connection.topic == self.topics.color
+                continue
             own, other = (
                 (colors, depths) if connection.topic == self.topics.color else (depths, colors)
             )
             stamp = stamp_of(message)
             near = min(other, key=lambda one: abs(one[0] - stamp), default=None)
-            if near is None or abs(near[0] - stamp) > self.tolerance or camera is None:
+            if near is None or abs(near[0] - stamp) > self.tolerance:
                 self.unpaired += own is colors and len(own) == _WAITING
                 own.append((stamp, time, message))
                 continue
@@ -159,6 +163,13 @@ class BagReader:
             raise UserError(
                 f"depth={self.topics.depth}: {z.shape[1]}x{z.shape[0]} pixels, but the color image "
                 f"has {rgb.shape[1]}x{rgb.shape[0]}; name a topic of depth aligned to color"
+            )
+        size = (int(camera.height), int(camera.width))
+        if all(size) and size != rgb.shape[:2]:  # zeros where it is not told
+            raise UserError(
+                f"camera_info={self.topics.camera_info}: is of images of {size[1]}x{size[0]} "
+                f"pixels, but those of {self.topics.color} have {rgb.shape[1]}x{rgb.shape[0]}; name "
+                "the topic of this camera's own"
             )
         return BagFrame(rgb, z, decode_intrinsics(camera), color[2].header, color[1])
 

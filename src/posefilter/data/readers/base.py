@@ -53,7 +53,9 @@ class BaseReader:
     def _leave_out(self, error: BadData) -> None:
         """Count a broken frame, or raise its error."""
         if self.on_error != "skip":
-            raise error
+            told = [error.detail] if error.detail else []
+            advice = "data.on_error=skip leaves such frames out"
+            raise BadData(error.path, error.cause, "; ".join([*told, advice])) from error
         self.skipped[error.cause] += 1
         self.examples.setdefault(error.cause, str(error))
 

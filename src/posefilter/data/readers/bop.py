@@ -1,7 +1,7 @@
 """Read datasets in BOP's format: millimeters, objects by number, one mask an instance."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside
 
 MM = 0.001  # meters a millimeter
+_ENDINGS = ("png", "jpg", "tif")  # ITODD's images are TIFF
 _IMAGE = _SCENE = re.compile(r"[0-9]{1,9}")
 # Center of the bounding box of YCB-Video's models [m]: the origin of BOP's YCB-V models, which are
 # not turned.
@@ -122,9 +123,17 @@ class BopReader(BaseReader):
         numbers_seen = {
             int(one["obj_id"]) for _, scene in scenes for gt in scene[0].values() for one in gt
         }
-        self.objects = choose_objects(
-            wanted, sorted(self._name(n) for n in numbers_seen if n > 0), base
-        )
+        known = sorted(self._name(n) for n in numbers_seen if n > 0)
+        try:
+            self.objects = choose_objects(wanted, known, base)
+        except UserError as error:
+            if not self._by_ycb_name:
+                raise
+            own = ", ".join(f"obj_{n:06d}" for n in sorted(numbers_seen) if n > 0)
+            raise UserError(
+                f"{base}: its scenes have no '{', '.join(map(str, wanted or []))}' (data.object), "
+                f"YCB-V's name of a number; they have {own}; data.object=null takes all"
+            ) from error
         self._distrust_builtin()
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
         self._entries = [
@@ -244,7 +253,7 @@ class BopReader(BaseReader):
             camera_from_object = np.linalg.inv(pose) if self._inverted else pose
             files = (
                 _color(folder, stem),
-                folder / "depth" / f"{stem}.png",
+                _first(folder / "depth" / f"{stem}.{end}" for end in ("png", "tif")),
                 masks[k],
                 gt_path,
                 camera_path,
@@ -263,10 +272,13 @@ class BopReader(BaseReader):
 
 def _color(folder: Path, stem: str) -> Path:
     """Return where an image's color is: `rgb`, or `gray` where a sensor has no color."""
-    candidates = [
-        folder / sub / f"{stem}.{ending}" for sub in ("rgb", "gray") for ending in ("png", "jpg")
-    ]
-    return next((path for path in candidates if path.is_file()), candidates[0])
+    return _first(folder / sub / f"{stem}.{end}" for sub in ("rgb", "gray") for end in _ENDINGS)
+
+
+def _first(candidates: Iterable[Path]) -> Path:
+    """Return the first path that is there; the first of all where none is."""
+    listed = [*candidates]
+    return next((path for path in listed if path.is_file()), listed[0])
 
 
 def _scene_folders(base: Path) -> Iterator[Path]:

@@ -34,22 +34,22 @@ def read_depth(path: Path, units: float) -> np.ndarray:
     """Read a depth image, or an array of depths (`.npy`).
 
     Args:
-        path: A 16-bit image, or an array (H, W) of whole numbers in the same units or of floats in
-            meters.
+        path: A 16-bit image, or an array (H, W) of whole numbers, in `units`; or an image (TIFF) or
+            array of floats, in meters.
         units: Units of whole numbers a meter.
 
     Returns:
-        Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that.
+        Depth (H, W) float32 [m], 0 where unknown: saturated pixels count as that, and floats that
+        are NaN or infinite.
 
     Raises:
-        BadData: The file is not such, or holds NaN, infinity or negative depth.
+        BadData: The file is not such, or holds negative depth.
     """
     image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
-    if image.dtype.kind == "f" and not np.isfinite(image).all():
-        raise BadData(
-            path, "depth holds NaN or infinity", "expected a 16-bit image, 0 where unknown"
-        )
-    if path.suffix == ".npy" and image.ndim == 2 and image.dtype.kind in "fui":
+    if image.ndim == 2 and (image.dtype.kind == "f" or path.suffix == ".npy"):
+        if image.dtype.kind not in "fui":
+            raise BadData(path, "depth is not numbers", f"found {image.dtype}")
+        image = np.where(np.isfinite(image), image, 0) if image.dtype.kind == "f" else image
         if (image < 0).any():
             raise BadData(path, "depth is negative", f"{image.min()}")
         if (image > np.finfo(np.float32).max).any():
@@ -63,6 +63,12 @@ def read_depth(path: Path, units: float) -> np.ndarray:
     if not (np.isfinite(units) and units > 0):
         raise BadData(path, "depth scale is not a positive number", f"{units} units a meter")
     return np.where(image == SATURATED, 0, image / np.float32(units)).astype(np.float32)
+
+
+def holds_meters(path: Path) -> bool:
+    """Tell whether a depth file that can be read holds floats, which are meters."""
+    image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
+    return image.dtype.kind == "f"
 
 
 def read_label(path: Path) -> np.ndarray:
