@@ -39,6 +39,9 @@ class PoseFilter:
         """
         s, rng = self.settings, np.random.default_rng(seed)
         names = [output.name for output in self.encode.get_outputs()]
+        size = (s["camera"][1], s["camera"][0])
+        if rgb.shape[:2] != size or depth.shape != size:
+            sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
         image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
         encoding = dict(zip(names, self.encode.run(names, image), strict=True))
         poses = draw_poses(*(encoding[name] for name in ("point", "weight", "share", "position")),
@@ -329,10 +332,15 @@ def read_arguments():
     """Folder, RGB (H, W, 3) uint8, depth (H, W) [m] and camera matrix of the command line."""
     import cv2
 
+    if len(sys.argv) != 6:
+        sys.exit("usage: poses.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
     folder, rgb, depth, intrinsics, scale = sys.argv[1:]
     fx, fy, cx, cy = map(float, intrinsics.split(","))
-    color = cv2.cvtColor(cv2.imread(rgb), cv2.COLOR_BGR2RGB)
-    z = cv2.imread(depth, cv2.IMREAD_UNCHANGED) / float(scale)
+    color, z = cv2.imread(rgb), cv2.imread(depth, cv2.IMREAD_UNCHANGED)
+    for name, image in ((rgb, color), (depth, z)):
+        if image is None:
+            sys.exit(f"{name}: no image that OpenCV reads")
+    color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / float(scale)
     return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 

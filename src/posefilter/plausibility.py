@@ -8,6 +8,7 @@ _SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be t
 _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
 _BEYOND = 1.5  # times the depths of training
+_NEAREST = 0.2  # [m] the median depth; few depth cameras measure nearer
 _OFF = 0.24  # of the image's size: principal points farther from its middle are those of a part
 
 
@@ -39,6 +40,13 @@ def find_warnings(
     known = float((depth > 0).mean())
     if known < _FEWEST:
         found.append(f"only {100 * known:.1f} % of the pixels have depth")
+    some = depth[::4, ::4]
+    median = float(np.median(some[some > 0])) if (some > 0).any() else np.inf
+    if median < _NEAREST:
+        found.append(
+            f"the median depth is {median:.2g} m, nearer than most depth cameras measure: is the "
+            "depth in the right units (depth_scale)?"
+        )
     off = np.abs(intrinsics[:2, 2] / (width, height) - 0.5)
     if off.max() > _OFF:
         found.append(

@@ -75,6 +75,7 @@ RANGES: dict[str, Range] = {
     "seed": SEED,
     "threads": _whole(1, 256),
     "mesh_scale": Range(0, 1e6, above=True),
+    "clutter_scale": Range(0, 1e6, above=True),
     # data
     "split_seed": LONG_SEED,
     "min_visibility": SHARE,

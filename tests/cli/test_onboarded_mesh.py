@@ -18,7 +18,10 @@ from posefilter.meshes.write import write_obj
 
 
 def settings(mesh: Path | str, **more: object) -> DictConfig:
-    given = {"mesh": str(mesh), "name": None, "mesh_scale": None, "clutter": "builtin", "seed": 0}
+    given = {
+        "mesh": str(mesh), "name": None, "mesh_scale": None, "clutter": "builtin",
+        "clutter_scale": None, "seed": 0,
+    }  # fmt: skip
     return OmegaConf.create({**given, **more})
 
 
@@ -110,3 +113,26 @@ def test_a_unit_that_makes_an_object_too_small_is_named(tmp_path: Path) -> None:
         read_onboarded(settings(file, mesh_scale=0.001))
     # what is large and meant to be is let through by a unit, as the refusal without one advises
     assert diameter(read_onboarded(settings(file, mesh_scale=30)).vertices) > 3
+
+
+def test_clutter_may_be_in_another_unit(tmp_path: Path) -> None:
+    brick = catalog.build("brick")
+    write_obj(replace(brick, vertices=1000 * brick.vertices), tmp_path / "around" / "other")
+    cfg = settings("brick", clutter=tmp_path / "around")
+    told = r"probably in millimeters; give clutter_scale=0\.001$"
+    with pytest.raises(UserError, match=told):
+        write_meshes(brick, cfg, tmp_path / "meshes")
+    cfg.clutter_scale = 0.001
+    write_meshes(brick, cfg, tmp_path / "meshes")
+    found = MeshStore(tmp_path / "meshes").load("other")
+    np.testing.assert_allclose(found.bounds, brick.bounds, atol=1e-6)
+
+
+def test_symmetries_that_are_declared_beside_a_mesh_are_found(tmp_path: Path) -> None:
+    mesh = tmp_path / "obj_000003.ply"
+    assert find_declared(mesh, 0.001) is None
+    file = tmp_path / "models_info.json"
+    half = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    file.write_text(json.dumps({"3": {"symmetries_discrete": [half]}, "4": {"diameter": 1}}))
+    assert find_declared(mesh, 0.001) == (file, 2)
+    assert find_declared(tmp_path / "obj_000004.ply", 0.001) is None

@@ -180,3 +180,24 @@ def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):
     assert missing["objects"][0]["silhouette_iou"] is None
     with pytest.raises(UserError, match="limit=0"):
         check_dataset(reader, meshes, limit=0)
+
+
+def test_what_stands_in_front_where_depth_is_unknown_is_no_error_of_the_pose(tmp_path, meshes):
+    """An occluder that is not labeled, and of which the sensor has no depth."""
+    root = tree(tmp_path)
+    for file in sorted((root / "0001").glob("*-label.png")):
+        label = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        depth_file = file.with_name(file.name.replace("label", "depth"))
+        depth = cv2.imread(str(depth_file), cv2.IMREAD_UNCHANGED)
+        rows, columns = np.nonzero(label == 2)
+        hidden = (label == 2) & (np.arange(label.shape[1]) < np.median(columns))
+        label[hidden], depth[hidden] = 0, 0
+        cv2.imwrite(str(file), label)
+        cv2.imwrite(str(depth_file), depth)
+    assert check(root, meshes)["problems"] == []
+    # where the depth is known, and behind the mesh, the same label is wrong
+    for file in sorted((root / "0001").glob("*-depth.png")):
+        depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        depth[depth == 0] = depth.max()
+        cv2.imwrite(str(file), depth)
+    assert check(root, meshes)["problems"]

@@ -83,6 +83,8 @@ def test_units_are_not_guessed(tmp_path: Path) -> None:
     assert "data.mesh_scale=1000" in _fails(store, "tiny")
     twice = MeshStore(tmp_path, scale=1e-6)
     assert "data.mesh_scale=0.001 " in _fails(twice, "mm")
+    assert "in kilometers" in _fails(store, "tiny")
+    assert "in meters, and taken as 1e-06 m a unit" in _fails(twice, "mm")
     for scale in (0, -1, float("nan"), "x"):
         with pytest.raises(UserError, match="mesh_scale="):
             MeshStore(tmp_path, scale=scale)
@@ -132,6 +134,7 @@ def test_bad_symmetries_are_named(tmp_path: Path) -> None:
         '{"a": {"symmetries_discrete": [[1, 2]]}}',
         "{",
         '{"a": {"symmetries_continuous": [{}]}}',
+        '{"a": {"symmetries_continuous": [{"axis": [0, 0, 0]}]}}',
     ):
         (tmp_path / "symmetries.json").write_text(text)
         assert "symmetries.json" in _fails(MeshStore(tmp_path), "a")

@@ -81,9 +81,9 @@ def make_info(K: np.ndarray, width: int = 0, height: int = 0) -> Any:
     )  # fmt: skip
     P = np.concatenate([K, np.zeros((3, 1))], axis=1)
     return make_message(
-        CAMERA_INFO, header=make_header(0), height=height, width=width, distortion_model="plumb_bob",
-        d=np.zeros(5), k=K.reshape(9), r=np.eye(3).reshape(9), p=P.reshape(12),
-        binning_x=0, binning_y=0, roi=region,
+        CAMERA_INFO, header=make_header(0), height=height, width=width,
+        distortion_model="plumb_bob", d=np.zeros(5), k=K.reshape(9), r=np.eye(3).reshape(9),
+        p=P.reshape(12), binning_x=0, binning_y=0, roi=region,
     )  # fmt: skip
 
 

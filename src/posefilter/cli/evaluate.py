@@ -28,8 +28,10 @@ from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
+from posefilter.data.readers.decode import need, numbers, read_json
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
+from posefilter.meshes.ycb import CLASSES, ycbvideo_index
 from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
@@ -43,6 +45,7 @@ from posefilter.types import Batch, ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
 _BATCH = 8  # images without the object
+_SAME_DIAMETER = 0.05  # share by which BOP's models of YCB-V may differ from YCB's own
 _SAME_OBJECT = 0.003  # [m] by which the center and radius of two meshes of one object may differ
 
 
@@ -288,6 +291,7 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
 
     Raises UserError where its mesh there is another one: poses of the two could not be compared.
     """
+    check_bop_model(data, own)
     if not data.meshes.has(own.name):
         return own
     if data.objects != (own.name,):
@@ -310,6 +314,30 @@ def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:
         symmetries=theirs.symmetries,
         parts=theirs.parts,
     )
+
+
+def check_bop_model(data: PoseDataModule, own: ObjectModel) -> None:
+    """Raise UserError where a dataset in BOP's format has another object by the number that one of
+    YCB's has in YCB-V, as the diameter in its `models_info.json` tells.
+    """
+    if data.source != "bop" or own.name not in CLASSES:
+        return
+    roots = [Path(str(data.root)), Path(str(data.root)).parent]
+    folders = [Path(str(data.meshes.root)), *(root / "models" for root in roots)]
+    file = next(
+        (f / "models_info.json" for f in folders if (f / "models_info.json").is_file()), None
+    )
+    if file is None:
+        return
+    number = ycbvideo_index(own.name)
+    entry = need(read_json(file), str(number), file)
+    theirs = 0.001 * float(numbers(entry, "diameter", file, (), f"{number}."))
+    if abs(theirs - own.diameter) > _SAME_DIAMETER * own.diameter:
+        raise UserError(
+            f"{file}: object {number} has a diameter of {1000 * theirs:.0f} mm, and {own.name}, "
+            f"which has this number in YCB-V, {1000 * own.diameter:.0f} mm: the dataset has no "
+            f"{own.name} by it"
+        )
 
 
 def keep_training_results(folder: Path) -> None:

@@ -26,7 +26,7 @@ from posefilter.cli.folders import hold_folder
 from posefilter.cli.job import Job, write_job
 from posefilter.cli.machine import settle
 from posefilter.cli.measure_speed import Speed, measure_speed
-from posefilter.cli.onboarded_mesh import find_and_draw, read_onboarded, write_meshes
+from posefilter.cli.onboarded_mesh import find_and_draw, find_declared, read_onboarded, write_meshes
 from posefilter.cli.report import compared
 from posefilter.cli.resume import LAST
 from posefilter.cli.reuse import step_of
@@ -242,6 +242,10 @@ def use_symmetries(work: Onboarding) -> None:
     work.stages.keep(symmetries=found)
     picture = work.out / "symmetries.png"
     sentence = f"{found}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
+    declared = find_declared(Path(str(work.cfg.mesh)), work.cfg.mesh_scale)
+    if declared is not None and str(work.cfg.symmetries) == "found":
+        file, count = declared
+        sentence += f" ({file} declares {count}: symmetries={file})"
     say(work.cfg.console, "symmetries", sentence, found=found, picture=str(picture))
 
 
@@ -379,7 +383,7 @@ def _plain(value: Any) -> Any:
 
 _TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "settings", "seed")
 STAGES = (
-    Stage("mesh", "checking the mesh", ("mesh", "name", "clutter"), store_meshes),
+    Stage("mesh", "checking the mesh", ("mesh", "name", "clutter", "clutter_scale"), store_meshes),
     Stage("symmetries", "finding symmetries", ("mesh", "symmetries"), use_symmetries),
     Stage("render", "rendering", ("mesh", "name", "clutter", "seed", "frames"), render, True),
     Stage("train", "training", ("mesh", *_TRAINED), train, True),

@@ -19,7 +19,7 @@ from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
 from posefilter.meshes.mesh import Mesh, diameter
 from posefilter.meshes.similarity import are_alike
-from posefilter.meshes.store import BUILTIN, LARGEST, SMALLEST, MeshStore
+from posefilter.meshes.store import BUILTIN, LARGEST, SMALLEST, MeshStore, WrongUnit
 from posefilter.meshes.symmetries import read_symmetries
 from posefilter.meshes.turns import describe_symmetries, make_group, select
 from posefilter.meshes.write import write_obj
@@ -79,15 +79,30 @@ def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> tuple[MeshFacts, 
         shutil.rmtree(folder)
     write_obj(mesh, folder / mesh.name)
     clutter = str(cfg.clutter)
-    scale = 1.0 if cfg.mesh_scale is None or clutter == BUILTIN else float(cfg.mesh_scale)
+    given = cfg.mesh_scale if cfg.clutter_scale is None else cfg.clutter_scale
+    scale = 1.0 if given is None or clutter == BUILTIN else float(given)
     store = MeshStore(clutter, scale=scale)
     names = [name for name in store.names() if name != mesh.name]
     like = [name for name in names if clutter == BUILTIN and are_alike(store.load(name), mesh)]
     names = [name for name in names if name not in like]
     order = np.random.default_rng(cfg.seed).permutation(len(names))[:_MOST_CLUTTER]
     for index in sorted(order.tolist()):
-        write_obj(store.load(names[index]), folder / names[index])
+        try:
+            write_obj(store.load(names[index]), folder / names[index])
+        except WrongUnit as error:
+            raise UserError(f"{error.finding}; give clutter_scale={error.scale:g}") from error
     return inspect_mesh(mesh), like
+
+
+def find_declared(mesh: Path, scale: float | None) -> tuple[Path, int] | None:
+    """Return a file beside a mesh that declares symmetries of it, and how many; None without."""
+    for name in ("symmetries.json", "models_info.json"):
+        file = mesh.parent / name
+        if file.is_file():
+            group = read_symmetries(file, mesh.stem, scale or 1.0, _STEPS)
+            if len(group) > 1:
+                return file, len(group)
+    return None
 
 
 def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> str:

@@ -129,6 +129,12 @@ def follow(
         return
     tracker = Tracker(Estimator(methods), settings, cfg.seed, threads)
     say(cfg.console, "video", f"{video.name}: {len(video)} frames", video=video.name)
+    for name in video.several:
+        sentence = (
+            f"warning: {video.name}: frames show several of {name}; one is tracked, and compared "
+            "with the first that is listed"
+        )
+        say(cfg.console, "warning", sentence, video=video.name, object=name)
     numbers = number_objects(estimator.objects) | video.ids
     doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
     with closing(tracker), writer, recorder:

@@ -305,6 +305,7 @@ class PoseDataModule(LightningDataModule):
         for name, dataset in self._datasets.items():
             splits[name] = {
                 "frames": len(dataset),
+                "images": len({record.files[0] for record in dataset.records}),
                 "scenes": len({record.group for record in dataset.records}),
                 "left_out": dict(self._left_out[name]),
             }
@@ -322,7 +323,12 @@ class PoseDataModule(LightningDataModule):
         """Return a sentence about a split."""
         own = self.describe()["splits"][split]
         left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
-        return f"{split}: {own['frames']} frames of {own['scenes']} scenes" + (
+        shown = (
+            f"{own['frames']} frames"
+            if own["frames"] == own["images"]
+            else f"{own['frames']} instances in {own['images']} images"
+        )
+        return f"{split}: {shown} of {own['scenes']} scenes" + (
             f"; left out: {left}" if left else ""
         )
 

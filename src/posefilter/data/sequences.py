@@ -2,6 +2,7 @@
 
 import re
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ class Video(ABC):
     scene_id: int
     objects: tuple[str, ...] | None  # that are known to be in it; None: that is not known
     ids: dict[str, int]  # their numbers in the dataset
+    several: tuple[str, ...] = ()  # objects that a frame shows more than once
 
     @abstractmethod
     def __len__(self) -> int:
@@ -136,6 +138,8 @@ class SceneVideo(Video):
             name for name in objects if any(r.object == name for r in own)
         )
         self.ids = {record.object: record.obj_id for record in own}
+        counts = Counter((record.im_id, record.object) for record in own)
+        self.several = tuple(sorted({name for (_, name), count in counts.items() if count > 1}))
         self.scene_id = self._frames[0][0][1].scene_id
 
     def __len__(self) -> int:

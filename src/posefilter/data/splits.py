@@ -106,6 +106,11 @@ def _divide_images(
     """Return the split of each image: blocks of neighbors, since neighbors are alike."""
     images = sorted({_image(record) for record in records if record.group in scenes})
     parts = ", ".join(fractions)
+    if not images:
+        raise UserError(
+            f"data.split: nothing is left for {parts}, since lists name all scenes; a list alone "
+            "is typed in braces, such as 'data.split={test: FILE}'"
+        )
     if len(images) < len(fractions):
         raise UserError(
             f"data.split: {len(images)} images in {root} cannot be divided into {parts}; use more, "

@@ -23,6 +23,24 @@ LARGEST, SMALLEST = 10.0, 1e-3
 BUILTIN = "builtin"
 
 
+class WrongUnit(UserError):  # noqa: N818
+    """A mesh has an impossible size.
+
+    Args:
+        path: Its file.
+        across: Its size [m].
+        guess: What is probably wrong.
+        scale: Meters in the file's unit, which are probably right.
+    """
+
+    def __init__(self, path: Path, across: float, guess: str, scale: float) -> None:
+        self.finding, self.scale = f"{path}: {across:.3g} m across: {guess}", scale
+        super().__init__(
+            f"{self.finding}; give data.mesh_scale={scale:g} (generate, check_data, predict, "
+            f"track: mesh_scale={scale:g})"
+        )
+
+
 class MeshStore:
     """Meshes by name, each read once.
 
@@ -191,14 +209,9 @@ def _mesh_in(folder: Path) -> Path | str | None:
 def _check_unit(mesh: Mesh, path: Path, scale: float) -> None:
     """Raise UserError, naming the setting to change, where an object has an impossible size."""
     across = diameter(mesh.vertices)
-    if across > LARGEST:
-        factor, unit = 0.001, "millimeters"
-    elif across < SMALLEST:
-        factor, unit = 1000.0, "kilometers, or scaled twice"
-    else:
+    if SMALLEST <= across <= LARGEST:
         return
-    value = f"{scale * factor:g}"
-    raise UserError(
-        f"{path}: {across:.3g} m across: the mesh is probably in {unit}; give "
-        f"data.mesh_scale={value} (generate, check_data, predict, track: mesh_scale={value})"
-    )
+    if across > LARGEST:
+        raise WrongUnit(path, across, "the mesh is probably in millimeters", 0.001 * scale)
+    guess = "in kilometers" if scale == 1 else f"in meters, and taken as {scale:g} m a unit"
+    raise WrongUnit(path, across, f"the mesh is probably {guess}", 1000 * scale)

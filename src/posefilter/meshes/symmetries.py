@@ -26,13 +26,16 @@ def symmetry_group(
     on it [m]) each, cut into `steps` equal turns.
 
     Raises:
-        ValueError: They are more than `MOST`.
+        ValueError: They are more than `MOST`, or an axis has no direction.
     """
     group = [np.eye(4), *(discrete or [])]
     if len(group) * steps ** len(continuous or []) > MOST:
         raise ValueError(f"more than {MOST:,} symmetries")
     for axis, offset in continuous or []:
-        unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+        length = float(np.linalg.norm(axis))
+        if not (np.isfinite(length) and length > 0):
+            raise ValueError(f"an axis of length {length:g}")
+        unit = np.asarray(axis, dtype=np.float64) / length
         turns = [rotation_about(unit, 2 * np.pi * k / steps, offset) for k in range(steps)]
         group = [a @ b for a in group for b in turns]
     return np.stack(group)

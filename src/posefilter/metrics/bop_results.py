@@ -130,6 +130,6 @@ def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
         raise UserError(
             f"{where}: {name} has {len(numbers)} numbers, expected {count} separated by blanks"
         )
-    if name in "Rt" and not all(number.is_finite() for number in numbers):
+    if name in ("R", "t", "score") and not all(number.is_finite() for number in numbers):
         raise UserError(f"{where}: {name} is not finite: {cell!r}")
     return numbers

@@ -168,8 +168,8 @@ class BagReader:
         if all(size) and size != rgb.shape[:2]:  # zeros where it is not told
             raise UserError(
                 f"camera_info={self.topics.camera_info}: is of images of {size[1]}x{size[0]} "
-                f"pixels, but those of {self.topics.color} have {rgb.shape[1]}x{rgb.shape[0]}; name "
-                "the topic of this camera's own"
+                f"pixels, but those of {self.topics.color} have {rgb.shape[1]}x{rgb.shape[0]}; "
+                "name the camera's own topic"
             )
         return BagFrame(rgb, z, decode_intrinsics(camera), color[2].header, color[1])
 

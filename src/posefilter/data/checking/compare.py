@@ -60,8 +60,8 @@ def compare(
     depth.
 
     Silhouettes are compared where the label can tell: not where another object is labeled, nor
-    where the measured depth lies clearly in front of the mesh (provided that depth is to scale at
-    all).
+    where the measured depth lies clearly in front of the mesh or is unknown (provided that depth is
+    to scale at all).
     """
     sample = view.sample
     pose = sample.camera_from_object if pose is None else pose
@@ -79,7 +79,8 @@ def compare(
         error = float(np.median(np.abs(sample.depth[both] - depth[both]))) * 1000
     hidden = view.others & ~sample.mask
     if abs(ratio - 1) < _RATIO_TOLERANCE:
-        hidden |= ~sample.mask & (sample.depth > 0) & (sample.depth < depth - IN_FRONT)
+        # unknown depth (0) may be of what stands in front
+        hidden |= ~sample.mask & (sample.depth < depth - IN_FRONT)
     union = (silhouette | sample.mask) & ~hidden
     common = silhouette & sample.mask
     iou = float(common.sum() / union.sum()) if union.any() else 0.0

@@ -1,5 +1,6 @@
 """Judge single frames: medians over a dataset hide one that is wrong."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -28,8 +29,9 @@ def is_suspect(view: View, fit: Fit) -> bool:
     """Tell whether one frame's silhouette or depth disagrees with its mesh beyond doubt."""
     silhouette = fit.rendered > 0
     pixels = max(int(silhouette.sum()), int(view.sample.mask.sum()))
-    if pixels < _FEWEST:
-        return False
+    overlap = bool((silhouette & view.sample.mask).any())
+    if pixels < _FEWEST or (overlap and math.isnan(fit.depth_error_mm)):
+        return False  # too little is seen, or without depth that would tell what stands in front
     distance = float(np.median(fit.rendered[silhouette])) if silhouette.any() else 1.0
     off = fit.depth_error_mm > max(_DEPTH_MM, 1000 * _DEPTH_SHARE * distance)
     return fit.iou < LEAST_FRAME_IOU or off

@@ -46,6 +46,7 @@ def read_depth(path: Path, units: float) -> np.ndarray:
         BadData: The file is not such, or holds negative depth.
     """
     image = _read_array(path) if path.suffix == ".npy" else _read_image(path)
+    image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     if image.ndim == 2 and (image.dtype.kind == "f" or path.suffix == ".npy"):
         if image.dtype.kind not in "fui":
             raise BadData(path, "depth is not numbers", f"found {image.dtype}")
