@@ -15,7 +15,7 @@ class UserError(Exception):
     """
 
 
-def find_reason(error: Exception) -> str:
+def find_reason(error: BaseException) -> str:
     """Return what an error says in one line: its message's first, or its class where there is
     none.
     """

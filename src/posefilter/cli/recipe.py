@@ -14,6 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from posefilter.cli.plain import resolve
 from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
@@ -66,10 +67,7 @@ def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
         if isinstance(node, list):
             return [walk(value, f"{path}[{i}]") for i, value in enumerate(node)]
         if isinstance(node, str) and "${" in _REFERENCE.sub("", node):
-            found = OmegaConf.select(tree, path)
-            return (
-                OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
-            )
+            return resolve(OmegaConf.select(tree, path))
         return node
 
     out: dict[str, Any] = walk(settings, "")
