@@ -23,6 +23,20 @@ def find_reason(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
+def missing_package(what: str, package: str, extra: str) -> UserError:
+    """Return the error of a package that is not installed.
+
+    Args:
+        what: What needs it, as it was typed.
+        package: Its name.
+        extra: The extra of ours that it belongs to.
+    """
+    return UserError(
+        f"{what}: the package {package} is missing; pip install 'posefilter[{extra}]' (in a clone: "
+        f"pip install -e '.[{extra}]')"
+    )
+
+
 class ProblemsFound(UserError):  # noqa: N818
     """A check was done, and something is wrong with what it checked: the commands exit with 1."""
 

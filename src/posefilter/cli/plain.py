@@ -1,5 +1,6 @@
 """Settings as plain data."""
 
+from collections.abc import Callable
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -10,6 +11,24 @@ def to_plain(cfg: DictConfig) -> dict[str, Any]:
     plain = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(plain, dict)
     return {str(key): value for key, value in plain.items()}
+
+
+def map_values(node: Any, change: Callable[[Any, str], Any], place: str = "") -> Any:
+    """Return plain settings with other values.
+
+    Args:
+        node: The settings.
+        change: Given a value that is no mapping or list, and its place; returns the new value.
+        place: The node's, such as `filter.refine.components[0]`.
+    """
+    if isinstance(node, dict):
+        return {
+            key: map_values(value, change, f"{place}.{key}" if place else str(key))
+            for key, value in node.items()
+        }
+    if isinstance(node, list):
+        return [map_values(value, change, f"{place}[{i}]") for i, value in enumerate(node)]
+    return change(node, place)
 
 
 def resolve(node: Any) -> Any:
