@@ -15,12 +15,26 @@ class UserError(Exception):
     """
 
 
-def find_reason(error: Exception) -> str:
+def find_reason(error: BaseException) -> str:
     """Return what an error says in one line: its message's first, or its class where there is
     none.
     """
     lines = str(error).splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+def missing_package(what: str, package: str, extra: str) -> UserError:
+    """Return the error of a package that is not installed.
+
+    Args:
+        what: What needs it, as it was typed.
+        package: Its name.
+        extra: The extra of ours that it belongs to.
+    """
+    return UserError(
+        f"{what}: the package {package} is missing; pip install 'posefilter[{extra}]' (in a clone: "
+        f"pip install -e '.[{extra}]')"
+    )
 
 
 class ProblemsFound(UserError):  # noqa: N818

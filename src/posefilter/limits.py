@@ -1,8 +1,10 @@
 """How large files of others may be: what is larger is refused before it is read or decoded."""
 
 import io
+import json
 import struct
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +53,25 @@ def read_lines(path: Path, most: int = 1 << 22) -> list[str]:
     except UnicodeDecodeError as error:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
     return [line.strip() for line in lines if line.strip()]
+
+
+def read_json(
+    path: Path, most: int = MOST_BYTES, parse: Callable[[bytes], Any] = json.loads
+) -> Any:
+    """Read a JSON file.
+
+    Args:
+        path: The file.
+        most: Bytes that such a file may have.
+        parse: Makes content of its bytes; raises ValueError or RecursionError where it cannot.
+
+    Raises:
+        BadData: The file is missing, larger, may not be read, or cannot be parsed.
+    """
+    try:
+        return parse(read_bytes(path, most))
+    except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
+        raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
 
 
 class PlainLoader(yaml.SafeLoader):

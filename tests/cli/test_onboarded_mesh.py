@@ -9,7 +9,13 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.cli import onboarded_mesh
-from posefilter.cli.onboarded_mesh import find_and_draw, name_of, read_onboarded, write_meshes
+from posefilter.cli.onboarded_mesh import (
+    find_and_draw,
+    find_declared,
+    name_of,
+    read_onboarded,
+    write_meshes,
+)
 from posefilter.errors import UserError
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.mesh import Mesh, diameter

@@ -7,10 +7,12 @@ import json
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
-from posefilter.cli.sweeps import read_rows, summarize
+from posefilter.cli.sweeps import list_rows, summarize
 from posefilter.metrics.registry import PERCENT
 from posefilter.report.summary import draw_summary
+from posefilter.report.sweeps import Job, Sweep, read_sweep
 
 
 def sweep(folder: Path, key: str, words: list[str]) -> Path:
@@ -30,12 +32,24 @@ def sweep(folder: Path, key: str, words: list[str]) -> Path:
     return folder
 
 
+def draw(sweep: Sweep) -> Figure:
+    """Draw a sweep of several values."""
+    figure = draw_summary(sweep)
+    assert figure is not None
+    return figure
+
+
+def title(figure: Figure) -> str:
+    """Return the figure's title."""
+    return str(figure.get_suptitle())
+
+
 def test_ablations_are_in_the_order_of_the_table(tmp_path: Path) -> None:
     ablations = ["paper", "s1_glimpse", "c1_normalization", "c10_resample", "working"]
     summarize(sweep(tmp_path, "ablation", ablations))
     with (tmp_path / "summary.csv").open() as file:
         assert [row["ablation"] for row in csv.DictReader(file)] == ablations
-    panel = draw_summary(*read_rows(tmp_path)).axes[0]
+    panel = draw(read_sweep(tmp_path)).axes[0]
     assert [text.get_text() for text in panel.get_yticklabels()] == ablations
     assert panel.yaxis_inverted(), "from the top"
     assert panel.lines[0].get_xdata() == pytest.approx([10 * place for place in range(5)])  # [%]
@@ -43,15 +57,15 @@ def test_ablations_are_in_the_order_of_the_table(tmp_path: Path) -> None:
 
 def test_numbers_are_read_by_size(tmp_path: Path) -> None:
     summarize(sweep(tmp_path, "filter.particles", ["1000", "50", "100"]))
-    rows, _ = read_rows(tmp_path)
+    rows = list_rows(read_sweep(tmp_path))
     assert [row["filter.particles"] for row in rows] == [50, 100, 1000]
-    assert draw_summary(*read_rows(tmp_path)).axes[0].get_xscale() == "log"
+    assert draw(read_sweep(tmp_path)).axes[0].get_xscale() == "log"
 
 
 def test_an_axis_has_the_tried_values_and_a_share_its_whole_range(tmp_path: Path) -> None:
     """So that figures of several sweeps can be compared, and a value is read where it was tried."""
     summarize(sweep(tmp_path, "filter.steps", ["3", "10", "7"]))
-    panel = draw_summary(*read_rows(tmp_path)).axes[0]
+    panel = draw(read_sweep(tmp_path)).axes[0]
     assert [text.get_text() for text in panel.get_xticklabels()] == ["3", "7", "10"]
     assert panel.get_ylim() == pytest.approx(PERCENT)
     assert panel.get_title(loc="left") == "particles on the object [%]"
@@ -60,22 +74,23 @@ def test_an_axis_has_the_tried_values_and_a_share_its_whole_range(tmp_path: Path
 @pytest.mark.parametrize("words", [["1", "2"], ["a", "b"]])
 def test_one_seed_is_no_trend(tmp_path: Path, words: list[str]) -> None:
     """Nothing is joined, and the title says why; with two seeds the means are."""
-    rows = [
-        {"folder": word, "filter": float(word) if word in "12" else word, "add_auc": 50.0}
-        for word in words
+    values = [float(word) if word in "12" else word for word in words]
+    jobs = [
+        Job({"filter": x}, {"add/auc": 50.0}, word) for x, word in zip(values, words, strict=True)
     ]
-    once = draw_summary(rows, ["filter"])
-    assert "one seed each" in once.get_suptitle()
+    once = draw(Sweep(tmp_path, ["filter"], jobs, []))
+    assert "one seed each" in title(once)
     assert [line.get_linestyle() for line in once.axes[0].lines] == ["None"]
-    assert not once.axes[0].patches
-    twice = draw_summary(
-        [*rows, *({**row, "seed": 1, "add_auc": 70.0} for row in rows)], ["filter", "seed"]
-    )
-    assert "one seed" not in twice.get_suptitle()
+    assert not once.axes[0].collections
+    first = [job._replace(place={**job.place, "seed": 0}) for job in jobs]
+    second = [Job({**job.place, "seed": 1}, {"add/auc": 70.0}, job.folder) for job in jobs]
+    twice = draw(Sweep(tmp_path, ["filter", "seed"], [*first, *second], []))
+    assert "one seed" not in title(twice)
     panel = twice.axes[0]
-    means = (
-        [bar.get_width() for bar in panel.patches]
-        if words == ["a", "b"]
-        else panel.lines[0].get_ydata()
-    )
+    assert panel.collections, "the range over seeds"
+    means = panel.lines[-1].get_xdata() if words == ["a", "b"] else panel.lines[0].get_ydata()
     assert means == pytest.approx([60.0, 60.0])
+
+
+def test_nothing_to_compare_is_no_figure(tmp_path: Path) -> None:
+    assert draw_summary(Sweep(tmp_path, [], [Job({}, {"add/auc": 50.0}, "a")], [])) is None

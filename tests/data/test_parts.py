@@ -71,7 +71,7 @@ def test_a_face_belongs_to_the_first_part_that_has_it(meshes: MeshStore) -> None
     ("content", "said"),
     [
         ("[1, 2]", "should map names to parts"),
-        ("{", "cannot be read as JSON"),
+        ("{", "not readable as JSON"),
         ('{"head": {"box": [[0, 0, 0]]}}', "head: cannot be read"),
         ('{"head": {"box": [[0, 0, NaN], [1, 1, 1]]}}', "not finite"),
         ('{"head": {"vertices": [99]}}', "the mesh has vertices 0 to 15"),

@@ -140,7 +140,7 @@ def test_mistakes_are_one_line(run: Path, sweep: Path, tmp_path: Path) -> None:
         assert str(folder) in str(caught.value)
         assert "\n" not in str(caught.value)
     (run / "metrics.json").write_text('{"add": ')
-    with pytest.raises(UserError, match=r"metrics\.json: is no JSON"):
+    with pytest.raises(UserError, match=r"metrics\.json: not readable as JSON"):
         read_run(run)
 
 

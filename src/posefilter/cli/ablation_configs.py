@@ -19,6 +19,7 @@ from posefilter.cli.ablations import (
     list_pose_ablations,
     list_pose_space_ablations,
 )
+from posefilter.cli.plain import to_plain
 
 
 def resolve_overrides(ablation: Ablation) -> tuple[str, dict[str, str]]:
@@ -38,11 +39,9 @@ def make_node(ablation: Ablation) -> dict[str, Any]:
     variant, overrides = resolve_overrides(ablation)
     groups = {"variant": variant} | {k: v for k, v in overrides.items() if "." not in k}
     settings = OmegaConf.from_dotlist([f"{k}={v}" for k, v in overrides.items() if "." in k])
-    plain = OmegaConf.to_container(settings)
-    assert isinstance(plain, dict)
     return {
         "defaults": [{f"override /{group}": choice} for group, choice in groups.items()],
-        **{str(key): value for key, value in plain.items()},
+        **to_plain(settings),
     }
 
 

@@ -2,13 +2,13 @@
 
 import re
 from collections.abc import Sequence
-from difflib import get_close_matches
 from itertools import pairwise, product
 from pathlib import Path
 
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from posefilter.cli.instantiate import hint
 from posefilter.cli.renamed import rename
 from posefilter.errors import UserError
 
@@ -185,9 +185,10 @@ def check_preset(name: str, folders: Sequence[Path]) -> None:
         if folder.is_dir() and folder.name != "size"
         for choice in list_choices(folder)
     ]
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f"; did you mean '{near[0]}'" if near else ""
-    raise UserError(f"preset={name}: there is no such choice{hint}; there are {', '.join(known)}")
+    raise UserError(
+        f"preset={name}: there is no such choice{hint(name, known).rstrip('?')}; there are "
+        f"{', '.join(known)}"
+    )
 
 
 def config_folders(arguments: Sequence[str]) -> list[Path]:

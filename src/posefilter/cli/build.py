@@ -14,6 +14,7 @@ from posefilter.cli.console import JSON
 from posefilter.cli.files import WholeCheckpoints
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
+from posefilter.cli.plain import resolve
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.stopping import Stop
 from posefilter.data.module import PoseDataModule
@@ -40,7 +41,7 @@ def build_data(node: DictConfig, console: str) -> PoseDataModule:
 
 def without_bars(node: DictConfig) -> DictConfig:
     """Return the settings of the data with every bar switched off."""
-    out = OmegaConf.create(OmegaConf.to_container(node, resolve=True))
+    out = OmegaConf.create(resolve(node))
     assert isinstance(out, DictConfig)
     for section in (out, out.get("generate")):
         if section and "progress" in section:

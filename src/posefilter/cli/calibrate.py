@@ -13,7 +13,7 @@ import torch
 from posefilter.cli.build import build_data
 from posefilter.cli.checkpoints import find_checkpoint, method_of, read_checkpoint
 from posefilter.cli.components import changes
-from posefilter.cli.console import JSON, ended, show_table, typed
+from posefilter.cli.console import JSON, ended, show_table, typed, typed_prediction
 from posefilter.cli.evaluate import data_settings
 from posefilter.cli.files import save_whole
 from posefilter.cli.job import Job
@@ -192,9 +192,6 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
     if job.cfg.console != JSON:
         show_table(f"{method.model.name}: held-out parts of the calibration frames", rows)
-    following = [
-        f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
-        f"intrinsics=fx,fy,cx,cy depth_scale=10000"
-    ]
+    following = [typed_prediction(out)]
     content = {"object": method.model.name, "counts": dict(counts), "quality": dict(quality)}
     ended(job.cfg.console, "calibrated", {"weights": out}, following, **content)

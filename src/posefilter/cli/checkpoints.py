@@ -12,6 +12,7 @@ from posefilter.cli.components import changed
 from posefilter.cli.fit import check_fit, typed_key
 from posefilter.cli.instantiate import instantiate_recipe
 from posefilter.cli.job import Job
+from posefilter.cli.plain import resolve, to_plain
 from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, without_pretrained
 from posefilter.cli.trust import Scope
 from posefilter.confidence.calibration import read_calibration
@@ -30,9 +31,7 @@ def recipe(job: Job) -> dict[str, Any]:
 
     Any other interpolation is resolved here and now, since no reader of the checkpoint would.
     """
-    settings = OmegaConf.to_container(job.cfg, resolve=False)
-    assert isinstance(settings, dict)
-    kept = {str(key): value for key, value in settings.items() if key not in NOT_KEPT}
+    kept = {key: value for key, value in to_plain(job.cfg).items() if key not in NOT_KEPT}
     return {
         "choices": {
             group: choice for group, choice in job.choices.items() if not group.startswith("hydra/")
@@ -76,9 +75,7 @@ def build_method(
 def _check_references(settings: DictConfig) -> None:
     """Raise UserError where what a method is made of refers to what is not there."""
     try:
-        node = settings.get("model")
-        if OmegaConf.is_config(node):
-            OmegaConf.to_container(node, resolve=True)
+        resolve(settings.get("model"))
     except OmegaConfBaseException as error:
         reason = find_reason(error)[:200]
         raise UserError(f"model: its settings refer to what is not there ({reason})") from error

@@ -3,9 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from posefilter.cli.job import Job
+from posefilter.cli.plain import to_plain
 
 # by whose change nothing else comes out
 HANDS = ("out", "console", "tags", "threads", "data.workers", "data.generate.workers")
@@ -32,11 +31,8 @@ def comparable(job: Job) -> dict[str, bool | int | float | str]:
         for group, choice in job.choices.items()
         if group.split("/")[0] not in ("hydra", *_PASSING) and choice not in ("None", "null")
     }
-    settings = OmegaConf.to_container(job.cfg, resolve=False)
-    assert isinstance(settings, dict)
-    return chosen | dict(
-        leaves({key: value for key, value in settings.items() if key not in _PASSING})
-    )
+    settings = to_plain(job.cfg)
+    return chosen | dict(leaves({k: value for k, value in settings.items() if k not in _PASSING}))
 
 
 def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -78,6 +78,12 @@ def typed(command: str, **settings: Any) -> str:
     return " ".join([program, *(setting(k.replace("__", "."), v) for k, v in settings.items())])
 
 
+def typed_prediction(checkpoint: Path) -> str:
+    """Return a command line that estimates with a checkpoint, with an image of no dataset."""
+    image = "rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"
+    return f"{typed('predict', checkpoint=checkpoint)} {image}"
+
+
 def is_installed() -> bool:
     """Tell whether the console command `posefilter` was typed, rather than a script of a clone."""
     typed = Path(sys.argv[0])

@@ -17,7 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from posefilter.cli.instantiate import hint
+from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename, rename_argument
+from posefilter.errors import find_reason
 
 # choices that packages of others bring
 _EXTRA = ("optuna", "joblib", "submitit_local", "submitit_slurm")
@@ -112,9 +114,7 @@ def first_line(error: BaseException) -> str:
 
     What a terminal would obey rather than show is replaced: names in files of others are quoted.
     """
-    lines = str(error).splitlines()
-    line = lines[0] if lines else type(error).__name__
-    return "".join(one if one.isprintable() else "?" for one in line)
+    return "".join(one if one.isprintable() else "?" for one in find_reason(error))
 
 
 def near(wrong: str, known: list[str]) -> str:
@@ -150,8 +150,6 @@ def known_keys(cfg: DictConfig, wrong: str) -> list[str]:
             if isinstance(value, dict):
                 walk(value, f"{prefix}{key}.")
 
-    tree = OmegaConf.to_container(cfg, resolve=False)
-    assert isinstance(tree, dict)
-    walk({k: v for k, v in tree.items() if k != "hydra"}, "")
+    walk({k: v for k, v in to_plain(cfg).items() if k != "hydra"}, "")
     depth = wrong.count(".")
     return sorted({*groups, *keys}, key=lambda k: (abs(k.count(".") - depth), k))

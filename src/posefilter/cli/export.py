@@ -8,7 +8,7 @@ from typing import Any
 
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
-from posefilter.cli.console import ended, typed
+from posefilter.cli.console import ended, typed_prediction
 from posefilter.cli.evaluate import OF_THE_CHECKPOINT
 from posefilter.cli.files import pack_whole
 from posefilter.cli.job import Job
@@ -41,10 +41,7 @@ def export(job: Job) -> None:
         stripped.pop("calibration", None)
     recipe["choices"] = {**recipe["choices"], **chosen(job)}
     size = write_weights(stripped, out, job.cfg.max_mb)
-    following = [
-        f"{typed('predict', checkpoint=out)} rgb=a.png depth=a_depth.png "
-        f"intrinsics=fx,fy,cx,cy depth_scale=10000"
-    ]
+    following = [typed_prediction(out)]
     ended(job.cfg.console, "exported", {"weights": out}, following, megabytes=size)
 
 

@@ -16,6 +16,7 @@ from posefilter.cli.job import Job, check_out
 from posefilter.cli.ranks import is_follower
 from posefilter.errors import Carrier, UserError
 from posefilter.files import remove_parts, write_whole
+from posefilter.limits import read_json
 from posefilter.locks import hold
 
 FAILED = "failed.json"  # in the folder of a sweep's job
@@ -132,10 +133,7 @@ def own_metrics(folder: Path) -> dict[str, Any]:
 
 def read_metrics(file: Path) -> dict[str, Any]:
     """Return what a metrics.json holds.  Raises UserError where it is damaged."""
-    try:
-        metrics = json.loads(file.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{file}: not readable as JSON ({error}); choose another out=") from error
+    metrics = read_json(file)
     if not isinstance(metrics, dict):
         raise UserError(f"{file}: holds no metrics; choose another out=")
     return metrics

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
-
+from posefilter.cli.plain import resolve
 from posefilter.cli.renamed import rename_argument, rename_class
 from posefilter.cli.trust import (
     Scope,
@@ -75,8 +74,7 @@ def instantiate_recipe(node: Any, where: str, variant: Variant | None = None) ->
 def _build(
     node: Any, where: str, scope: Scope, given: Mapping[str, Any], variant: Variant | None = None
 ) -> Any:
-    if isinstance(node, DictConfig | ListConfig):
-        node = OmegaConf.to_container(node, resolve=True)
+    node = resolve(node)
     if isinstance(node, list):
         return [_build(item, f"{where}[{i}]", scope, {}) for i, item in enumerate(node)]
     if not isinstance(node, Mapping):

@@ -10,6 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.cli.plain import resolve, to_plain
 from posefilter.errors import UserError
 from posefilter.ranges import check_ranges
 
@@ -102,9 +103,7 @@ def _resolve(cfg: DictConfig) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for key in cfg:
         with suppress(OmegaConfBaseException):
-            value = cfg[key]
-            node = OmegaConf.is_config(value)
-            out[str(key)] = OmegaConf.to_container(value, resolve=True) if node else value
+            out[str(key)] = resolve(cfg[key])
     return out
 
 
@@ -118,9 +117,8 @@ def check_settings(cfg: DictConfig, command: str) -> None:
     Raises:
         UserError: A number is outside of its range, or another setting makes no sense.
     """
-    plain = OmegaConf.to_container(cfg, resolve=False)
-    assert isinstance(plain, dict)
-    check_ranges({str(key): value for key, value in plain.items()}, command)
+    plain = to_plain(cfg)
+    check_ranges(plain, command)
     check_out(cfg)
     for key in _NEEDED.get(command, ()):
         if plain.get(key) is None:

@@ -19,7 +19,7 @@ from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.command import compose_job
-from posefilter.cli.console import JSON, ended, say, typed
+from posefilter.cli.console import JSON, ended, say, typed, typed_prediction
 from posefilter.cli.export import strip, write_weights
 from posefilter.cli.files import save_whole
 from posefilter.cli.folders import hold_folder
@@ -358,13 +358,12 @@ def tell(work: Onboarding) -> None:
     }
     shown = ", ".join(f"{name} {m:.1f}" for name, m in minutes.items())
     say(work.cfg.console, "minutes", f"minutes: {shown}", minutes=minutes)
-    following = typed("predict", checkpoint=work.weights)
     scores = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
     ended(
         work.cfg.console,
         "onboarded",
         files,
-        [f"{following} rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=10000"],
+        [typed_prediction(work.weights)],
         object=work.mesh.name,
         **scores,
     )

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
+from posefilter.cli.plain import to_plain
 from posefilter.paths import find_conf
 
 
@@ -73,8 +73,7 @@ class Groups:
         found = self._loader.repository.load_config(f"{folder}/{name}")
         if found is None:
             return Option(group, name, {})
-        node = OmegaConf.to_container(found.config, resolve=False)
-        assert isinstance(node, dict)
+        node = to_plain(found.config)
         package = package or found.header.get("package") or "_group_"
         package = folder.replace("/", ".") if package == "_group_" else package
         settings: dict[str, Any] = {}

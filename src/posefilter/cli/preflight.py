@@ -6,7 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, missing_package
 from posefilter.weights import expand_weights, find_weights, is_several
 
 # by command: settings that name a file to be read
@@ -99,10 +99,7 @@ def _check_bag(cfg: DictConfig) -> None:
         raise UserError(f"bag={cfg.bag}: no such file")
     _find_all(cfg.checkpoint)
     if find_spec("rosbags") is None:
-        raise UserError(
-            "the package rosbags is missing; pip install 'posefilter[bags]' (in a "
-            "clone: pip install -e '.[bags]')"
-        )
+        raise missing_package(f"bag={cfg.bag}", "rosbags", "bags")
 
 
 def _check_video(cfg: DictConfig) -> None:
@@ -141,10 +138,7 @@ def _check_loggers(loggers: Any) -> None:
     for name, node in (loggers or {}).items():
         package = _LOGGERS.get(node.get("_target_", "")) if isinstance(node, DictConfig) else None
         if package is not None and find_spec(package) is None:
-            raise UserError(
-                f"logger={name}: the package {package} is missing; "
-                f"pip install 'posefilter[{package}]' (in a clone: pip install -e '.[{package}]')"
-            )
+            raise missing_package(f"logger={name}", package, package)
 
 
 def _check_view(view: Any, several: bool) -> None:

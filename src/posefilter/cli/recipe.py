@@ -14,6 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from posefilter.cli.plain import map_values, resolve
 from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
@@ -57,22 +58,11 @@ def resolve_foreign(settings: dict[str, Any]) -> dict[str, Any]:
     """
     tree = OmegaConf.create(settings)
 
-    def walk(node: Any, path: str) -> Any:
-        if isinstance(node, dict):
-            return {
-                key: walk(value, f"{path}.{key}" if path else str(key))
-                for key, value in node.items()
-            }
-        if isinstance(node, list):
-            return [walk(value, f"{path}[{i}]") for i, value in enumerate(node)]
-        if isinstance(node, str) and "${" in _REFERENCE.sub("", node):
-            found = OmegaConf.select(tree, path)
-            return (
-                OmegaConf.to_container(found, resolve=True) if OmegaConf.is_config(found) else found
-            )
-        return node
+    def resolve_value(value: Any, place: str) -> Any:
+        foreign = isinstance(value, str) and "${" in _REFERENCE.sub("", value)
+        return resolve(OmegaConf.select(tree, place)) if foreign else value
 
-    out: dict[str, Any] = walk(settings, "")
+    out: dict[str, Any] = map_values(settings, resolve_value)
     return out
 
 
@@ -111,7 +101,7 @@ def check_recipe(recipe: Any, said: str) -> dict[str, Any]:
     if not all(isinstance(choice, str) and _KEY.fullmatch(choice) for choice in choices.values()):
         raise UserError(f"{said}: its recipe's choices should be names")
     now = upgrade(recipe)
-    settings = _without_selects(now["settings"], now["settings"])
+    settings = _without_selects(now["settings"])
     _check_expansion(settings, said)
     return {"choices": now["choices"], "settings": settings}
 
@@ -215,20 +205,21 @@ def _check_value(path: str, value: Any, said: str) -> None:
         )
 
 
-def _without_selects(node: Any, settings: dict[str, Any]) -> Any:
+def _without_selects(settings: dict[str, Any]) -> dict[str, Any]:
     """Return settings with `${oc.select:a.b,0}`, of older checkpoints, as a reference to a.b, or 0
     where there is none.
     """
-    if isinstance(node, dict):
-        return {key: _without_selects(value, settings) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_without_selects(value, settings) for value in node]
-    found = _SELECT.fullmatch(node) if isinstance(node, str) else None
-    if found is None:
-        return node
-    if _at(settings, found[1]) is not None:
-        return f"${{{found[1]}}}"
-    return None if found[2] == "null" else int(found[2])
+
+    def refer(value: Any, _: str) -> Any:
+        found = _SELECT.fullmatch(value) if isinstance(value, str) else None
+        if found is None:
+            return value
+        if _at(settings, found[1]) is not None:
+            return f"${{{found[1]}}}"
+        return None if found[2] == "null" else int(found[2])
+
+    out: dict[str, Any] = map_values(settings, refer)
+    return out
 
 
 def _at(settings: Any, path: str) -> Any:

@@ -6,11 +6,11 @@ from pathlib import Path
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from posefilter.cli.console import ended
 from posefilter.cli.job import Job
+from posefilter.cli.plain import to_plain
 from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.paths import check_links
@@ -81,13 +81,9 @@ def compared(run: Run) -> list[Change] | None:
         return None
     loader = GlobalHydra.instance().config_loader()
     try:
-        default = OmegaConf.to_container(
-            loader.load_configuration("train", said, RunMode.RUN), resolve=False
-        )
+        default = to_plain(loader.load_configuration("train", said, RunMode.RUN))
     # the run is of another version, whose choices are gone
     except (HydraException, OmegaConfBaseException):
         return None
-    assert isinstance(default, dict)
-    return compare_settings(
-        run.config, {str(key): value for key, value in default.items() if key != "hydra"}
-    )
+    default.pop("hydra", None)
+    return compare_settings(run.config, default)

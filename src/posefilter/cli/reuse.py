@@ -7,8 +7,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from posefilter.cli.checkpoints import read_checkpoint, recipe
 from posefilter.cli.comparing import differing
 from posefilter.cli.console import say
@@ -16,6 +14,7 @@ from posefilter.cli.files import save_whole
 from posefilter.cli.folders import check_same, own_metrics
 from posefilter.cli.instantiate import locate
 from posefilter.cli.job import Job
+from posefilter.cli.plain import resolve
 from posefilter.cli.resume import BEFORE, LAST, last_checkpoints
 from posefilter.errors import UserError
 
@@ -60,7 +59,7 @@ def learned_from(job: Job) -> str:
     """
     cfg = job.cfg.copy()
     cfg.folder = ""
-    used: dict[str, Any] = {key: plain(cfg[key]) for key in _LEARNED_FROM}
+    used: dict[str, Any] = {key: resolve(cfg[key]) for key in _LEARNED_FROM}
     method: Any = locate(str(cfg.model._target_), "model")
     tested = {
         *method.test_only_settings,
@@ -69,11 +68,6 @@ def learned_from(job: Job) -> str:
     used["model"] = {key: value for key, value in used["model"].items() if key not in tested}
     used["data"] = {key: value for key, value in used["data"].items() if key not in _TESTED_WITH}
     return sha256(json.dumps(used, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def plain(node: Any) -> Any:
-    """Return a part of the settings as plain data."""
-    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
 
 
 def take_over(job: Job) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import Any
 from posefilter.cli.results import write_json
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, Each, Record, check_form, parse_json
-from posefilter.limits import read_bytes
+from posefilter.limits import read_json
 
 _LONGEST = 1 << 20  # of the file [bytes]
 _STAGE = Record({"settings": {}, "seconds": NUMBER})
@@ -31,9 +31,9 @@ class Stages:
         self.content: dict[str, Any] = {"stages": {}, "values": {}}
         if file.is_file():
             try:
-                found = parse_json(read_bytes(file, _LONGEST))
+                found = read_json(file, _LONGEST, parse_json)
                 check_form(found, Record({"stages": Each(_STAGE), "values": form or {}}), file)
-            except (UserError, ValueError, RecursionError) as error:
+            except UserError as error:
                 raise UserError(
                     f"{file}: is no record of an onboarding any more; choose another out= ({error})"
                 ) from error

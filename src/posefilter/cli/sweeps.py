@@ -4,7 +4,7 @@ each job ends.
 
 import csv
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
@@ -14,6 +14,9 @@ from posefilter.cli.console import JSON, ended, typed
 from posefilter.cli.folders import FAILED
 from posefilter.errors import Carrier, UserError
 from posefilter.files import open_whole, open_whole_text, write_whole
+
+if TYPE_CHECKING:
+    from posefilter.report.sweeps import Sweep
 
 Row = dict[str, Any]
 
@@ -51,11 +54,17 @@ def summarize(folder: Path) -> list[Row]:
     if not any(any(folder.glob(f"*/**/{mark}")) for mark in ("metrics.json", FAILED)):
         return []
     from posefilter.report.summary import draw_summary  # Hydra makes this callback in every run
-    from posefilter.report.sweeps import COLUMNS
+    from posefilter.report.sweeps import COLUMNS, read_sweep
 
-    rows, axes = read_rows(folder)
+    sweep = read_sweep(folder)
+    rows = list_rows(sweep)
     found = [name for name in COLUMNS if any(row.get(name) is not None for row in rows)]
-    names = [*axes, *found, *(["error"] if any("error" in row for row in rows) else []), "folder"]
+    names = [
+        *sweep.axes,
+        *found,
+        *(["error"] if any("error" in row for row in rows) else []),
+        "folder",
+    ]
     with open_whole_text(folder / "summary.csv") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
         writer.writeheader()
@@ -63,26 +72,23 @@ def summarize(folder: Path) -> list[Row]:
     lines = ["| " + " | ".join(names[:-1]) + " |", "|---" * (len(names) - 1) + "|"]
     lines += ["| " + " | ".join(_cell(row.get(name)) for name in names[:-1]) + " |" for row in rows]
     write_whole(folder / "summary.md", "\n".join(lines) + "\n")
-    ended = [row for row in rows if "error" not in row]
-    if ended:
+    figure = draw_summary(sweep)
+    if figure is not None:
         with open_whole(folder / "summary.png", sync=False) as image:
-            draw_summary(ended, axes).savefig(image, format="png", dpi=120)
+            figure.savefig(image, format="png", dpi=120)
     return rows
 
 
-def read_rows(folder: Path) -> tuple[list[Row], list[str]]:
-    """Return a row a job that has ended, those that failed last, and the settings in which the jobs
-    differ.
-    """
-    from posefilter.report.sweeps import COLUMNS, read_sweep
+def list_rows(sweep: "Sweep") -> list[Row]:
+    """Return a row a job that has ended, those that failed last."""
+    from posefilter.report.sweeps import COLUMNS
 
-    sweep = read_sweep(folder)
     rows: list[Row] = []
     for job in sweep.jobs:
         figures = {name: job.numbers.get(figure) for name, figure in COLUMNS.items()}
         rows.append({"folder": job.folder, **figures, **job.place})
     rows += [{"folder": job.folder, "error": job.error, **job.place} for job in sweep.failed]
-    return rows, sweep.axes
+    return rows
 
 
 def _cell(value: Any) -> str:

@@ -15,6 +15,7 @@ from posefilter.cli.components import changes
 from posefilter.cli.console import JSON, ended, finite, say, show_table
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
+from posefilter.cli.plain import resolve
 from posefilter.cli.predict import read_intrinsics
 from posefilter.cli.results import write_json
 from posefilter.cli.shapes import load_shape, open_shapes
@@ -236,7 +237,7 @@ def make_settings(node: DictConfig) -> TrackerSettings:
 
     Raises UserError where one is no number of its kind.
     """
-    plain: Any = OmegaConf.to_container(node, resolve=True)
+    plain: Any = resolve(node)
     try:
         return TrackerSettings(
             **{
@@ -260,8 +261,8 @@ def open_videos(cfg: DictConfig, objects: Sequence[str]) -> tuple[Sequence[Video
         return [FolderVideo(Path(str(cfg.frames)), K, scale, cfg.stride)], lambda _: np.eye(4)
     names = list(objects)
     meshes = open_meshes(data.meshes, data.mesh_scale, data.source, names)
-    options = OmegaConf.to_container(data.options, resolve=True) if data.options else {}
-    reader = open_reader(data.source, data.root, None, meshes, data.on_error, **options)  # type: ignore[arg-type]
+    options = resolve(data.options) or {}
+    reader = open_reader(data.source, data.root, None, meshes, data.on_error, **options)
     groups = list_groups(reader)
     if cfg.scene is not None:
         known, groups = groups, [one for one in groups if _is_scene(one, cfg.scene)]

@@ -3,7 +3,6 @@ anything is learned.
 """
 
 import fnmatch
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from posefilter.data.frames import FrameRecord
 from posefilter.errors import UserError
-from posefilter.limits import read_bytes, read_lines
+from posefilter.limits import read_json, read_lines
 
 log = logging.getLogger(__name__)
 
@@ -196,12 +195,12 @@ def _listed(records: Sequence[FrameRecord], file: str, root: Path) -> list[int]:
 
 
 def _json_list(path: Path) -> list[dict[str, int]]:
+    content = read_json(path)
     try:
-        content = json.loads(read_bytes(path))
         return [
             {key: int(t[key]) for key in ("scene_id", "im_id", "obj_id")}
             for t in content
             if {"scene_id", "im_id", "obj_id"} <= set(t)
         ]
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise UserError(f"{path}: not a list of BOP targets ({error})") from error

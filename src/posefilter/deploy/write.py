@@ -17,7 +17,7 @@ from posefilter.data.resize import network_size
 from posefilter.deploy.graphs import EncodeForPixels, EncodeForPoses, MeasurePixels, ScorePoses
 from posefilter.deploy.resizing import Resize
 from posefilter.deploy.settings import describe_filter
-from posefilter.errors import UserError
+from posefilter.errors import UserError, missing_package
 from posefilter.estimator import get_trained_size
 from posefilter.files import write_whole
 from posefilter.filters.initialize import FromObjectness
@@ -55,10 +55,7 @@ def check_format(kind: str) -> None:
         raise UserError(f"format={kind}: choose weights, {', '.join(FORMATS)}")
     missing = [one for one in ("onnx", "onnxscript") if kind == "onnx" and find_spec(one) is None]
     if missing:
-        raise UserError(
-            f"format=onnx: the package {missing[0]} is missing; pip install 'posefilter[export]' "
-            f"(in a clone: pip install -e '.[export]')"
-        )
+        raise missing_package("format=onnx", missing[0], "export")
 
 
 def write_filter(method: PoseEstimator, folder: Path, width: int, height: int, kind: str) -> float:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from posefilter.errors import UserError
+from posefilter.errors import missing_package
 from posefilter.figures.canvas import AXES, ESTIMATE
 from posefilter.figures.particles import choose_by_weight, color_by_weight
 from posefilter.figures.view_data import Hypothesis, Moment, ViewData
@@ -25,7 +25,7 @@ _OTHER = (120, 150, 255)
 def check_viewer() -> None:
     """Raise UserError where the library that writes the view is missing."""
     if importlib.util.find_spec("rerun") is None:
-        raise UserError("view=true: the package rerun-sdk is missing; pip install -e '.[viz]'")
+        raise missing_package("view=true", "rerun-sdk", "viz")
 
 
 def record(shown: ViewData, path: Path) -> None:

@@ -4,7 +4,6 @@ A part is a set of the mesh's faces. It is used in two ways: metrics compare eac
 with that part at the estimated pose, and a part can be an object of its own, named `OBJECT.PART`.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from posefilter.errors import UserError
-from posefilter.limits import read_bytes
+from posefilter.limits import read_json
 from posefilter.meshes.mesh import Mesh
 
 FILE = "parts.json"
@@ -48,10 +47,7 @@ def read_parts(file: Path, name: str, scale: float, mesh: Mesh) -> dict[str, np.
     Raises:
         UserError: The file cannot be read, or a part is none.
     """
-    try:
-        table = json.loads(read_bytes(file, _MOST_BYTES))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{file}: cannot be read as JSON ({error})") from error
+    table = read_json(file, _MOST_BYTES)
     if not isinstance(table, dict):
         raise UserError(f"{file}: should map names to parts; {_KINDS}")
     alone = any(isinstance(one, dict) and {"box", "vertices"} & set(one) for one in table.values())

@@ -1,6 +1,5 @@
 """Symmetries of objects: declared transforms that change nothing one can see."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 
 from posefilter.errors import UserError
 from posefilter.geometry.rotation import exp_so3
-from posefilter.limits import read_bytes
+from posefilter.limits import read_json
 
 MOST = 10_000  # symmetries of an object
 _MOST_BYTES = 1 << 24  # of a file of them
@@ -57,7 +56,7 @@ def read_symmetries(info: Path, name: str, scale: float, steps: int) -> np.ndarr
     the mesh file's unit.
     """
     try:
-        table = json.loads(read_bytes(info, _MOST_BYTES))
+        table = read_json(info, _MOST_BYTES)
         if not isinstance(table, dict):
             raise ValueError("no mapping of names")
         digits = "".join(c for c in name if c.isdigit())

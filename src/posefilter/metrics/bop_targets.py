@@ -2,12 +2,11 @@
 "obj_id", "inst_count"}`.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
-from posefilter.limits import read_bytes
+from posefilter.limits import read_json
 
 _KEYS = ("scene_id", "im_id", "obj_id", "inst_count")
 
@@ -29,10 +28,7 @@ def read_targets(path: Path) -> list[Target]:
     """
     if not path.is_file():
         raise UserError(f"targets={path}: no such file")
-    try:
-        content = json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"targets={path}: not readable as JSON ({error})") from error
+    content = read_json(path)
     if not isinstance(content, list):
         raise UserError(
             f"targets={path}: expected a list of targets, got a {type(content).__name__}"

@@ -1,5 +1,6 @@
 """Metrics in the form of metrics.json: flat names, and one score."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from posefilter.metrics.scores import overall
@@ -11,12 +12,12 @@ def compute_checkpoint_score(results: dict[str, Any]) -> float:
     return overall(auc, float(results["particles_on_object"] or 0.0), float(results["iou"]))
 
 
-def flatten(results: dict[str, Any], prefix: str = "") -> dict[str, float]:
+def flatten(results: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
     """Return nested numbers by joined names; values that are no numbers are left out."""
     out: dict[str, float] = {}
     for name, value in results.items():
-        if isinstance(value, dict):
+        if isinstance(value, Mapping):
             out |= flatten(value, f"{prefix}{name}/")
-        elif isinstance(value, int | float):
+        elif isinstance(value, int | float) and not isinstance(value, bool):
             out[prefix + name] = float(value)
     return out

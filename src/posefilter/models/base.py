@@ -31,6 +31,7 @@ from posefilter.geometry.camera import project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.results import compute_checkpoint_score, flatten
+from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import clip_submodules
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
@@ -421,8 +422,7 @@ class PoseEstimator(Module):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
-        height, width = batch.rgb.shape[-2:]
-        return box_of_pose(trace.belief.best, self.model.hull, batch.intrinsics, height, width)
+        return PoseBox()(trace, batch, self.model)
 
     def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
         """Return where particles are in the image, (B, N, 2) [px].

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, missing_package
 from posefilter.meshes.mesh import Mesh
 from posefilter.rendering.renderer import Renderer
 from posefilter.rendering.surfaces import NEAR, Instance, Plane, Surfaces
@@ -64,10 +64,7 @@ class GLRenderer(Renderer):
         try:
             moderngl: Any = importlib.import_module("moderngl")
         except ImportError as error:
-            raise UserError(
-                "renderer=opengl: the package moderngl is missing; "
-                "pip install 'posefilter[moderngl]'"
-            ) from error
+            raise missing_package("renderer=opengl", "moderngl", "moderngl") from error
         try:
             self._gl: Any = moderngl.create_context(standalone=True, backend="egl")
         except Exception as error:

@@ -84,13 +84,7 @@ def draw_chart(panel: Panel, theme: Theme) -> bytes:
     figure.set_layout_engine("constrained")
     figure.set_facecolor(theme.paper)
     axes = figure.subplots()
-    for number, line in enumerate(panel.lines):
-        color = theme.lines[number % len(theme.lines)]
-        if panel.categories:
-            draw_across(axes, line, color)
-        else:
-            draw_line(axes, line, color, panel.joined)
-    style_axes(axes, panel, theme)
+    draw_panel(axes, panel, theme)
     if len(panel.lines) > 1:
         place = (
             {"loc": "outside lower center", "ncols": count_columns(panel)}
@@ -107,6 +101,17 @@ def draw_chart(panel: Panel, theme: Theme) -> bytes:
             **place,
         )
     return to_small_png(figure)
+
+
+def draw_panel(axes: Axes, panel: Panel, theme: Theme) -> None:
+    """Draw a chart into axes, but for its legend."""
+    for number, line in enumerate(panel.lines):
+        color = theme.lines[number % len(theme.lines)]
+        if panel.categories:
+            draw_across(axes, line, color)
+        else:
+            draw_line(axes, line, color, panel.joined)
+    style_axes(axes, panel, theme)
 
 
 def needs_legend_below(panel: Panel) -> bool:

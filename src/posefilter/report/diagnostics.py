@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from posefilter.metrics.registry import MetricInfo, find_metric, read_number, rename_key
+from posefilter.metrics.results import flatten
 from posefilter.report.events import Curve
 from posefilter.report.gather import Run
 
@@ -70,7 +71,7 @@ def collect_numbers(run: Run) -> dict[str, float]:
     """Return a run's numbers by joined names: of its test, or of its last validation where there is
     none.
     """
-    out = flatten(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
+    out = list_numbers(run.metrics) if run.metrics else read_last_validation(run.curves)[1]
     for name in run.metrics.get("diagnostics") or {}:
         last = f"diagnostics/{name}/last"
         if (value := read_number(run.metrics, last)) is not None:
@@ -102,15 +103,9 @@ def read_last_validation(curves: Mapping[str, Curve]) -> tuple[int | None, dict[
     }
 
 
-def flatten(content: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
-    """Return nested numbers under joined names, those of today; what is no number is left out."""
-    out: dict[str, float] = {}
-    for name, value in content.items():
-        if isinstance(value, Mapping):
-            out |= flatten(value, f"{prefix}{name}/")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            out[rename_key(prefix + name)] = float(value)
-    return out
+def list_numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Return the numbers of a metrics.json by joined names, those of today."""
+    return {rename_key(name): value for name, value in flatten(metrics).items()}
 
 
 def collect_timings(run: Run) -> list[tuple[str, str]]:

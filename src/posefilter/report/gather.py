@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
+from posefilter import limits
 from posefilter.errors import UserError, find_reason
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
-from posefilter.limits import PlainLoader, read_bytes
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
 from posefilter.report.image_errors import read_image_errors
@@ -163,10 +163,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         return {}
-    try:
-        content = parse_json(read_bytes(path, _MOST_JSON))
-    except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
-        raise UserError(f"{path}: is no JSON ({error})") from error
+    content = limits.read_json(path, _MOST_JSON, parse_json)
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one JSON object")
     return content
@@ -210,7 +207,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         return {}
     try:
         # a SafeLoader, which makes nothing but plain data
-        content = yaml.load(read_bytes(path, _MOST_YAML).decode(), Loader=PlainLoader)
+        content = yaml.load(limits.read_bytes(path, _MOST_YAML).decode(), Loader=limits.PlainLoader)
     # YAML, UTF-8, whole numbers too long to read, days that there are not
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise UserError(f"{path}: is no YAML ({find_reason(error)})") from error

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from posefilter.errors import UserError
 from posefilter.forms import MOST
 from posefilter.metrics.scores import overall
-from posefilter.report.diagnostics import flatten
+from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 
 SILENT = ("out", "resume", "console")
@@ -122,7 +122,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
     jobs = [
         Job(
             {axis: parse_number(pairs.get(axis, "default")) for axis in axes},
-            flatten(own),
+            list_numbers(own),
             str(path.relative_to(folder)),
             str(own.get("error") or ""),
         )

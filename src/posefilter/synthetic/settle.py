@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posefilter.errors import UserError
+from posefilter.errors import missing_package
 from posefilter.synthetic.placing import Placed, Table, are_separate
 from posefilter.synthetic.solids import Solid
 
@@ -29,7 +29,7 @@ def load_mujoco() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise UserError("settle=true: mujoco is missing; pip install 'posefilter[sim]'") from error
+        raise missing_package("settle=true", "mujoco", "sim") from error
     return mujoco
 
 

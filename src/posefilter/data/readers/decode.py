@@ -1,7 +1,6 @@
 """Decode a dataset's files, and say in one line what is wrong with them."""
 
 import io
-import json
 import math
 import struct
 import zlib
@@ -14,6 +13,7 @@ import numpy as np
 from posefilter.data.frames import SATURATED
 from posefilter.errors import BadData
 from posefilter.limits import check_picture, read_bytes
+from posefilter.limits import read_json as read_json
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
@@ -82,14 +82,6 @@ def read_label(path: Path) -> np.ndarray:
             path, "label image has more than one channel", f"found {image.dtype} {image.shape}"
         )
     return image
-
-
-def read_json(path: Path) -> Any:
-    """Parse a JSON file."""
-    try:
-        return json.loads(read_bytes(path))
-    except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
-        raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
 
 
 def need(record: Any, key: str, path: Path, where: str = "") -> Any:

@@ -21,7 +21,6 @@ from posefilter.data.readers.decode import (
     numbers,
     read_color,
     read_depth,
-    read_json,
     read_label,
 )
 from posefilter.data.readers.fat_settings import (
@@ -38,6 +37,7 @@ from posefilter.data.readers.fat_settings import (
 from posefilter.data.readers.naming import choose_objects, choose_several
 from posefilter.data.readers.plausible import check_camera, check_sample, narrow
 from posefilter.errors import BadData, UserError
+from posefilter.limits import read_json
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside

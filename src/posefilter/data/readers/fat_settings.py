@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from posefilter.data.readers.decode import list_folder, need, need_list, numbers, read_json
+from posefilter.data.readers.decode import list_folder, need, need_list, numbers
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.geometry.rotation import matrix_from_quat_xyzw
-from posefilter.limits import MOST_SIDE
+from posefilter.limits import MOST_SIDE, read_json
 from posefilter.paths import is_plain_name
 
 CM = 0.01  # meters a centimeter

@@ -1,0 +1,36 @@
+"""Settings as plain data."""
+
+from collections.abc import Callable
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+
+def to_plain(cfg: DictConfig) -> dict[str, Any]:
+    """Return settings by name, their interpolations as they are written."""
+    plain = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items()}
+
+
+def map_values(node: Any, change: Callable[[Any, str], Any], place: str = "") -> Any:
+    """Return plain settings with other values.
+
+    Args:
+        node: The settings.
+        change: Given a value that is no mapping or list, and its place; returns the new value.
+        place: The node's, such as `filter.refine.components[0]`.
+    """
+    if isinstance(node, dict):
+        return {
+            key: map_values(value, change, f"{place}.{key}" if place else str(key))
+            for key, value in node.items()
+        }
+    if isinstance(node, list):
+        return [map_values(value, change, f"{place}[{i}]") for i, value in enumerate(node)]
+    return change(node, place)
+
+
+def resolve(node: Any) -> Any:
+    """Return a part of the settings with what it refers to."""
+    return OmegaConf.to_container(node, resolve=True) if OmegaConf.is_config(node) else node
