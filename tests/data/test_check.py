@@ -189,7 +189,7 @@ def test_what_stands_in_front_where_depth_is_unknown_is_no_error_of_the_pose(tmp
         label = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         depth_file = file.with_name(file.name.replace("label", "depth"))
         depth = cv2.imread(str(depth_file), cv2.IMREAD_UNCHANGED)
-        rows, columns = np.nonzero(label == 2)
+        columns = np.nonzero(label == 2)[1]
         hidden = (label == 2) & (np.arange(label.shape[1]) < np.median(columns))
         label[hidden], depth[hidden] = 0, 0
         cv2.imwrite(str(file), label)

@@ -307,6 +307,7 @@ def test_broken_frames_raise_or_are_counted(tmp_path):
     assert [r.im_id for r in dm.records("test")] == [0, 1, 3]
     assert dm.describe()["splits"]["test"] == {
         "frames": 3,
+        "images": 3,
         "scenes": 1,
         "left_out": {"truncated or corrupt image": 1},
     }

@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 from dataset_trees import K, bop_scene, fat_tree, pose, write_mesh, ycb_frame
 
+from posefilter.cli.evaluate import check_bop_model
 from posefilter.data.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
@@ -18,7 +19,10 @@ from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import BadData, UserError
 from posefilter.meshes import ycb
+from posefilter.meshes.mesh import object_model
 from posefilter.meshes.store import MeshStore
+from posefilter.metrics.bop_results import read_poses_csv
+from posefilter.plausibility import find_warnings
 
 NAME = "003_cracker_box"
 NATIVE = ycb.ycbvideo_from_original(NAME)
@@ -357,3 +361,61 @@ def test_a_single_bad_frame_is_listed(tmp_path, case):
 def test_settings_that_make_no_sense_are_named(tmp_path, name, value):
     with pytest.raises(UserError, match=rf"^data\.{name}={value}: must be a (whole )?number"):
         PoseDataModule("fat", tmp_path, **{name: value})
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1.0, False), (0.1, True)])
+def test_depth_nearer_than_cameras_measure_is_told(tmp_path, scale, told):
+    """As of millimeters that are read as tenths of them."""
+    model = object_model(MeshStore(write_mesh(tmp_path, NAME)).load(NAME))
+    depth = np.full((120, 160), 0.9 * scale, dtype=np.float32)
+    depth[:50] = 0
+    where = np.eye(4)
+    where[2, 3] = 0.8
+    found = find_warnings(where, model, depth, K)
+    assert (
+        any("the median depth is 0.09 m" in one and "depth_scale" in one for one in found) is told
+    )
+
+
+def test_a_score_that_is_no_number_is_refused(tmp_path):
+    row = "0,0,1,nan,1 0 0 0 1 0 0 0 1,0 0 500,1\n"
+    (tmp_path / "poses.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n" + row)
+    with pytest.raises(UserError, match="score is no number: 'nan'"):
+        read_poses_csv(tmp_path / "poses.csv")
+
+
+def test_a_list_beside_the_default_fractions_is_told(tmp_path):
+    bop_scene(tmp_path / "000001", [[(2, pose())], [(2, pose())]])
+    targets = tmp_path / "targets.json"
+    targets.write_text(json.dumps([{"scene_id": 1, "im_id": i, "obj_id": 2} for i in (0, 1)]))
+    split = {"train": 0.8, "val": 0.1, "test": str(targets)}
+    data = PoseDataModule("bop", tmp_path, "obj_000002", split=split, workers=0, progress=False)
+    with pytest.raises(UserError, match=r"typed in braces, such as 'data\.split=\{test: FILE\}'"):
+        data.setup("test")
+
+
+def test_a_dataset_that_is_not_ycb_v_has_no_object_of_ycb_by_its_number(tmp_path):
+    name = "003_cracker_box"
+    bop_scene(tmp_path / "test" / "000001", [[(2, pose())]])
+    write_mesh(tmp_path / "meshes", name)
+    options = {"meshes": tmp_path / "meshes", "workers": 0, "progress": False}
+    data = PoseDataModule("bop", tmp_path / "test", name, split={"test": 1.0}, **options)
+    data.setup("test")
+    own = data.object_model(0)
+    check_bop_model(data, own)  # nothing is known of the dataset's models
+    (tmp_path / "models").mkdir()
+    info = tmp_path / "models" / "models_info.json"
+    info.write_text(json.dumps({"2": {"diameter": 1000 * own.diameter + 1}}))
+    check_bop_model(data, own)
+    info.write_text(json.dumps({"2": {"diameter": 120.0}}))
+    with pytest.raises(UserError, match=rf"object 2 has a diameter of 120 mm, and {name}"):
+        check_bop_model(data, own)
+
+
+def test_instances_of_one_image_are_counted_as_such(tmp_path, caplog):
+    bop_scene(tmp_path / "000001", [[(2, pose()), (2, pose(position=(0.1, 0.05, 0.6)))]])
+    options = {"workers": 0, "progress": False}
+    data = PoseDataModule("bop", tmp_path, "obj_000002", split={"test": 1.0}, **options)
+    data.setup("test")
+    own = data.describe()["splits"]["test"]
+    assert (own["frames"], own["images"]) == (2, 1)

@@ -130,6 +130,8 @@ def _numbers(cell: str, count: int, name: str, where: str) -> list[Decimal]:
         raise UserError(
             f"{where}: {name} has {len(numbers)} numbers, expected {count} separated by blanks"
         )
-    if name in ("R", "t", "score") and not all(number.is_finite() for number in numbers):
+    if name == "score" and numbers[0].is_nan():  # which has no place in an order
+        raise UserError(f"{where}: score is no number: {cell!r}")
+    if name in ("R", "t") and not all(number.is_finite() for number in numbers):
         raise UserError(f"{where}: {name} is not finite: {cell!r}")
     return numbers
