@@ -12,9 +12,9 @@ import pytest
 from tests.cli.conftest import Cold
 
 import posefilter
-from posefilter.cli.command import finish_wandb
+from posefilter.cli.command import finish_wandb, run_command
 from posefilter.cli.main import COMMANDS, main
-from posefilter.cli.ranks import is_follower
+from posefilter.cli.ranks import STARTED, is_follower
 from posefilter.errors import MISTAKE
 
 HOME = Path(__file__).parents[2]
@@ -183,3 +183,26 @@ def test_a_job_of_wandb_ends_with_its_job(monkeypatch: pytest.MonkeyPatch) -> No
     wandb.run = "a run"
     finish_wandb()
     assert finished == [True]
+
+
+def test_a_command_leaves_the_environment_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for before in (None, "evaluate"):
+        if before is not None:
+            monkeypatch.setenv(STARTED, before)
+        assert run_command("report", HOME, [f"run={tmp_path / 'nowhere'}"]) == MISTAKE
+        assert os.environ.get(STARTED) == before
+
+
+def test_a_tolerance_without_a_probability_is_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "poses.csv").write_text("")
+    typed = [
+        f"estimates={tmp_path / 'poses.csv'}",
+        "pose_tolerance.add=0.2",
+        f"out={tmp_path / 'o'}",
+    ]
+    assert run_command("evaluate", HOME, typed) == MISTAKE
+    assert "pose_tolerance: is of a checkpoint's probability" in capfd.readouterr().err

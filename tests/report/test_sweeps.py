@@ -115,3 +115,16 @@ def test_mistakes_are_one_line(sweep: Path, run: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="none of its 12 runs has ended"):
         read_sweep(sweep)
     shutil.rmtree(sweep)
+
+
+def test_the_page_tells_why_a_run_failed(sweep: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(sweep, folder)
+    failed = folder / "filter.particles=0"
+    failed.mkdir()
+    content = {"overrides": ["filter.particles=0"], "error": "filter.particles=0: must be more"}
+    (failed / "failed.json").write_text(json.dumps(content))
+    page = make_sweep_page(read_sweep(folder), None, None, "python report.py")
+    assert "Failed: filter.particles=0: filter.particles=0: must be more" in page.notes
+    (without,) = [note for note in page.notes if note.startswith("Without a result")]
+    assert without == "Without a result: filter.particles=1000,refine=none,seed=2."

@@ -98,6 +98,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     register_resolvers()
     show_all_signs()
     before, begun, kept = sys.argv, list[Job](), list[Job]()
+    started = os.environ.get(STARTED)
     os.environ[STARTED] = name
     record: dict[Path, bytes] = {}
     try:
@@ -145,6 +146,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         return MISTAKE
     finally:
         sys.argv = before
+        os.environ.pop(STARTED)
+        os.environ.update({} if started is None else {STARTED: started})
         release_all()
     return 0
 

@@ -60,6 +60,8 @@ def evaluate(job: Job) -> float:
         raise UserError("give either checkpoint=RUN/checkpoints/best.ckpt or estimates=poses.csv")
     if job.cfg.targets is not None and not job.cfg.estimates:
         raise UserError("targets: go with estimates=poses.csv, not with a checkpoint")
+    if job.cfg.estimates and read_pose_tolerance(job.cfg.pose_tolerance) is not None:
+        raise UserError("pose_tolerance: is of a checkpoint's probability; estimates have none")
     check_same(job)
     keep_training_results(job.folder)
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
@@ -90,7 +92,13 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     method = method_of(checkpoint, changes(job.cfg))
     if job.cfg.seed is not None:
         method.seed = job.cfg.seed
-    method.pose_tolerance = read_pose_tolerance(job.cfg.pose_tolerance) or RIGHT
+    tolerance = read_pose_tolerance(job.cfg.pose_tolerance)
+    if tolerance is not None and method.calibration is None:
+        raise UserError(
+            f"pose_tolerance: checkpoint={job.cfg.checkpoint} is not calibrated, so that it has no "
+            "probability to be within one; calibrate.py calibrates it"
+        )
+    method.pose_tolerance = tolerance or RIGHT
     if method.calibration is not None:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)

@@ -397,8 +397,10 @@ class PoseEstimator(Module):
             there: Whether the object is in them; if not, the batch's poses are not used.
         """
         size = self.measure_apparent_size(trace, batch)
-        if size is not None and there:
-            self.scores["apparent_size"].update(size.scale, size.contradicts())
+        if there and "apparent_size" in self.scores:
+            unknown = torch.full((len(batch.rgb),), torch.nan)
+            known = (unknown, unknown) if size is None else (size.scale, size.contradicts())
+            self.scores["apparent_size"].update(*known)
         found = self.assess(trace, batch)
         if found is None:
             return

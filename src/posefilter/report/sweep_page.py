@@ -101,10 +101,13 @@ def head_lines(sweep: Sweep, winner: Job) -> list[Paragraph]:
 
 
 def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
-    """Return what a reader should know first: which runs have no result, and whether the runs
-    themselves are there.
+    """Return what a reader should know first: which runs have no result and why, and whether
+    the runs themselves are there.
     """
-    notes = [f"Without a result: {', '.join(sweep.unfinished)}."] if sweep.unfinished else []
+    causes = {job.folder: job.error for job in sweep.failed}
+    open_ended = [folder for folder in sweep.unfinished if folder not in causes]
+    notes = [f"Without a result: {', '.join(open_ended)}."] if open_ended else []
+    notes += [f"Failed: {folder}: {cause}" for folder, cause in causes.items()]
     return (
         notes
         if best

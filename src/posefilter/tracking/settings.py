@@ -109,7 +109,7 @@ class TrackerSettings:
     whole_image_every: int = 4
     window_side: int = 320
     window_scale: float = 1.25
-    smoothing_noise: float = 0.0008
+    smoothing_noise: float = 0.0004
     lost_below: float = 0.3
     found_above: float = 0.5
     patience: int = 2
