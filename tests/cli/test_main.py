@@ -145,8 +145,7 @@ def test_another_process_of_a_training_goes_on_with_its_command(
     )
     monkeypatch.setenv("POSEFILTER_COMMAND", "train")
     assert main(["seed=1"]) == MISTAKE  # the first process, typed so
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setattr("posefilter.cli.main.is_follower", lambda: True)
     for words in (["seed=1", "out=x"], ["-m", "seed=1,2"]):
         assert main(words) == 0
     assert ran == [("train", ["seed=1", "out=x"]), ("train", ["-m", "seed=1,2"])]
@@ -170,7 +169,7 @@ def test_a_number_alone_makes_no_process_of_several(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert is_follower() is follower
+    assert is_follower.__wrapped__() is follower
 
 
 def test_a_job_of_wandb_ends_with_its_job(monkeypatch: pytest.MonkeyPatch) -> None:
