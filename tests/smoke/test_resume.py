@@ -179,9 +179,14 @@ def test_a_signal_before_the_first_step_stops_the_run(
     monkeypatch.setattr(build, "progress", lambda console: Sender(hook, 0, number))
     settings = [*TINY, f"data.root={tiny_scenes}", "model=cnn_patch", "callbacks=checkpoints"]
     settings += ["trainer.num_sanity_val_steps=2", f"out={tmp_path / 'run'}"]
-    before = signal.getsignal(number)
-    assert run_command("train", HOME, settings) == 128 + number
-    assert signal.getsignal(number) == before
+    started = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background
+    try:
+        before = signal.getsignal(number)
+        assert run_command("train", HOME, settings) == 128 + number
+        assert signal.getsignal(number) == before
+    finally:
+        signal.signal(signal.SIGINT, started)
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert told == {"event": "stopped", "step": 0, "next": None}
 

@@ -40,6 +40,11 @@ def processes_of(group: int) -> list[int]:
     return found
 
 
+def hear_interrupts() -> None:
+    """Undo what a shell does to commands in the background: they ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextmanager
 def command(name: str, settings: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Start a command as a group of processes; none of it is left in the end."""
@@ -48,8 +53,9 @@ def command(name: str, settings: list[str], log: Path) -> Iterator[subprocess.Po
     with log.open("wb") as file:
         arguments = [sys.executable, str(HOME / f"{name}.py"), *settings]
         running = subprocess.Popen(
-            arguments, cwd=HOME, stdout=file, stderr=file, start_new_session=True
-        )
+            arguments, cwd=HOME, stdout=file, stderr=file, start_new_session=True,
+            preexec_fn=hear_interrupts,
+        )  # fmt: skip
         try:
             yield running
         finally:
