@@ -167,6 +167,7 @@ RANGES: dict[str, Range] = {
     "tracker.quadratic_fits": _whole(0, 10_000),
     "tracker.fit_pixels": COUNT,
     "tracker.icp_prior": Range(0, 1000),
+    "tracker.texture_every": COUNT_OR_NONE,
     "tracker.jump_penalty": Range(0, 1000),
     "tracker.kld_epsilon": POSITIVE,
     "tracker.kld_quantile": Range(0, 0.999_999_999, above=True),

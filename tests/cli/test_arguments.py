@@ -146,6 +146,20 @@ def test_options_may_stand_anywhere() -> None:
     assert options_first(typed) == ordered
 
 
+@pytest.mark.parametrize(
+    ("typed", "ordered"),
+    [
+        (["--info", "seed=1"], ["--info", "all", "seed=1"]),
+        (["seed=1", "-i", "plugins"], ["-i", "plugins", "seed=1"]),
+        (["seed=1", "--info"], ["--info", "all", "seed=1"]),
+    ],
+)
+def test_an_option_whose_value_is_left_out_takes_no_setting(
+    typed: list[str], ordered: list[str]
+) -> None:
+    assert options_first(typed) == ordered
+
+
 def test_a_search_maximizes_unless_told_otherwise() -> None:
     search, direction = ["-m", "hydra/sweeper=optuna"], "hydra.sweeper.direction="
     assert maximized(search) == [*search, f"{direction}maximize"]

@@ -236,6 +236,9 @@ def test_ply_whose_picture_has_no_place_is_refused(tmp_path: Path) -> None:
     _rejects(path, "a.ply", "names a texture (p.png), but no texture coordinates")
     path = _write_ply(tmp_path / "b.ply", one + two, _MAPPED, "0 0", "1 0", "0 1")
     _rejects(path, "b.ply", "names 2 textures (p.png, q.png)")
+    gone = "comment TextureFile gone.png\n"
+    path = _write_ply(tmp_path / "d.ply", gone, _COLORS, "9 9 9", "9 9 9", "9 9 9")
+    _rejects(path, "gone.png", "missing texture", "d.ply")
     path = _write_ply(tmp_path / "c.ply", one + one, _MAPPED, "0 0", "1 0", "0 1")
     assert read_mesh(path, "c").corner_uv is not None
 

@@ -128,3 +128,15 @@ def test_the_page_tells_why_a_run_failed(sweep: Path, tmp_path: Path) -> None:
     assert "Failed: filter.particles=0: filter.particles=0: must be more" in page.notes
     (without,) = [note for note in page.notes if note.startswith("Without a result")]
     assert without == "Without a result: filter.particles=1000,refine=none,seed=2."
+
+
+def test_threads_are_an_axis_where_they_are_swept_alone(tmp_path: Path) -> None:
+    for number in (1, 2):
+        run = tmp_path / f"threads={number}"
+        run.mkdir()
+        typed = ["model=patch_pf", f"threads={number}"]
+        (run / "metrics.json").write_text(json.dumps({"overrides": typed, "iou": 0.5}))
+    assert read_sweep(tmp_path).axes == []  # one was gone on with by other hands
+    asked = {"hydra": {"overrides": {"task": ["model=patch_pf", "threads=1,2"]}}}
+    (tmp_path / "multirun.yaml").write_text(json.dumps(asked))
+    assert read_sweep(tmp_path).axes == ["threads"]

@@ -13,6 +13,8 @@ from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 from posefilter.cli import build, run_command
 from posefilter.cli import train as training
 from posefilter.cli.progress_bar import Lines
+from posefilter.cli.resume import check_kept
+from posefilter.errors import UserError
 
 
 class Killed(BaseException):
@@ -238,3 +240,25 @@ def test_a_resumed_run_keeps_what_it_began_with(
     assert told in line
     assert "Traceback" not in line
     assert (whole / ".hydra" / "overrides.yaml").read_bytes() == before
+
+
+def test_what_a_run_began_with_may_be_typed_again_in_other_words(tmp_path: Path) -> None:
+    (tmp_path / ".hydra").mkdir()
+    (tmp_path / ".hydra" / "config.yaml").write_text(
+        "optimizer: {lr: 0.001}\nseed: 3\ndata: {split: {train: 0.8, val: 0.2}, object: '12'}\n"
+    )
+    choices = "hydra: {runtime: {choices: {model: patch_pf}}}\n"
+    (tmp_path / ".hydra" / "hydra.yaml").write_text(choices)
+    for typed in (
+        "optimizer.lr=1e-3", "optimizer.lr=0.001", "seed=3", "data.split={train:0.8,val: 0.2}",
+        "model=patch_pf", "data.object='12'", f"out={tmp_path}", "trainer.max_steps=7", "--cfg",
+    ):  # fmt: skip
+        check_kept(typed, tmp_path)
+    for typed in (
+        "optimizer.lr=1e-4",
+        "seed=3,4",
+        "data.split={train:0.8,val:0.1}",
+        "model=pose_pf",
+    ):
+        with pytest.raises(UserError, match="the run began with another"):
+            check_kept(typed, tmp_path)

@@ -13,9 +13,13 @@ from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import Compose
+from posefilter.filters.texture import TextureTurns
+from posefilter.geometry.rotation import random_rotation
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import TrackLossDetector
+from posefilter.tracking.turn import TurnTogether
+from posefilter.types import BeliefBatch
 
 NONE = np.zeros_like(DEPTH)
 BLACK = np.zeros_like(RGB)
@@ -71,7 +75,7 @@ def test_a_track_is_aligned_as_single_images_of_the_object_are() -> None:
         (toy.filter.refine, PointToPlaneIcp().noise),
     ):
         toy.filter.refine = refine
-        icp = track._refine(1).components[-1]
+        icp = track._refine(1, True).components[-1]
         assert isinstance(icp, PointToPlaneIcp)
         assert (icp.noise, icp.prior) == (noise, TrackerSettings().icp_prior)
         assert icp.iterations < PointToPlaneIcp().iterations
@@ -293,3 +297,50 @@ def test_impossible_filters_and_methods_are_refused(monkeypatch: pytest.MonkeyPa
     toy.__dict__.pop("capabilities", None)
     with pytest.raises(UserError, match=r"Toy provides no propose_poses; .*model/proposals=dense"):
         posefilter.Tracker(estimator)
+
+
+class PlantedTurns(TextureTurns):
+    """Say at every call that the object is a quarter turn about its axis from the estimate."""
+
+    TURN = SPACE.move(torch.eye(4), torch.tensor([0, 0, 0, 0, 0, np.pi / 2]))
+
+    def __init__(self, few: bool) -> None:
+        super().__init__()
+        self.few, self.calls = few, 0
+
+    def __call__(self, belief, encoding, method, generator):  # type: ignore[no-untyped-def]
+        self.calls += 1
+        scattered = belief.poses.flip(1)  # which a track must not take over
+        return belief._replace(best=belief.best @ self.TURN, poses=scattered)
+
+    def turn_nearby(self, best, encoding, method):  # type: ignore[no-untyped-def]
+        self.calls += not self.few
+        return None if self.few else best @ self.TURN
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_all_particles_are_turned_with_the_estimate(few: bool) -> None:
+    poses = random_rotation(6, generator=torch.Generator().manual_seed(0))
+    moved = torch.eye(4).repeat(6, 1, 1)
+    moved[:, :3, :3] = poses
+    belief = BeliefBatch(moved[None], torch.zeros(1, 6), moved[None, 2], torch.zeros(1))
+    turned = TurnTogether(PlantedTurns(few))(belief, None, None, torch.Generator())
+    torch.testing.assert_close(turned.poses, belief.poses @ PlantedTurns.TURN)
+    torch.testing.assert_close(turned.best, turned.poses[:, 2])
+    assert turned.score is belief.score
+
+
+@pytest.mark.parametrize(("every", "due"), [(0, []), (4, [1, 5, 9]), (8, [2, 10])])
+def test_the_print_decides_every_so_many_frames(every: int, due: list[int]) -> None:
+    toy, estimator = make_toy()
+    texture = PlantedTurns(few=True)
+    toy.filter.refine = Compose([texture])
+    tracker = posefilter.Tracker(estimator, TrackerSettings(texture_every=every))
+    asked = []
+    for number, pose in enumerate(walk_pose(12)):
+        toy.truth, before = pose, texture.calls
+        assert tracker.update(RGB, DEPTH, K).status == ("tracked" if number else "started")
+        if number and texture.calls > before:
+            asked.append(number)
+        texture.TURN = torch.eye(4)  # the first frame is a single image, and says nothing here
+    assert asked == due

@@ -18,6 +18,8 @@ _VALUED = (
     *("--cfg", "-c", "--package", "-p", "--config-path", "-cp", "--config-name", "-cn"),
     *("--config-dir", "-cd", "--shell-completion-for", "--experimental-rerun"),
 )
+_INFO = ("--info", "-i")
+_KINDS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")  # of information
 _FOLDERS = ("run", "runs", "sweep", "out")  # of a report
 _SEVERAL = ("logger",)  # groups of which several choices can be made at once
 
@@ -35,6 +37,11 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         options.append(word)
         if word in _VALUED:
             options += [value for value in [next(words, None)] if value is not None]
+        elif word in _INFO:  # whose value may be left out
+            value = next(words, None)
+            known = value in _KINDS
+            options.append(value if known and value is not None else _KINDS[0])
+            settings += [] if known or value is None else [value]
     return [*options, *settings]
 
 

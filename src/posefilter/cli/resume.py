@@ -5,7 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 
+from posefilter.cli.arguments import quoted
 from posefilter.errors import BadData, UserError
 from posefilter.limits import PlainLoader, read_bytes
 from posefilter.paths import check_links, stays_inside
@@ -145,19 +148,22 @@ def check_kept(argument: str, folder: Path) -> None:
             f"warm_start={folder}/checkpoints/{LAST} for a new run that begins with its weights"
         )
     kept = key in _KEPT_GROUPS or any(key == one or key.startswith(f"{one}.") for one in _KEPT)
-    if kept and _read_value(value) != _find_recorded(key, folder):
+    if kept and _read_value(argument) != _find_recorded(key, folder):
         raise UserError(
             f"{argument}: the run began with another, which a resumed run keeps; leave it out, or "
             f"begin a new run"
         )
 
 
-def _read_value(text: str) -> Any:
-    """Return a typed value; a text that is no YAML as it is."""
+def _read_value(argument: str) -> Any:
+    """Return the value of a typed setting, as Hydra reads it; the argument itself where it is none,
+    or several.
+    """
     try:
-        return yaml.load(text, Loader=PlainLoader)
-    except yaml.YAMLError:
-        return text
+        own = OverridesParser.create().parse_override(quoted([argument])[0])
+        return argument if own.is_sweep_override() else own.value()
+    except HydraException:
+        return argument
 
 
 def _find_recorded(key: str, folder: Path) -> Any:

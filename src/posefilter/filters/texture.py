@@ -230,17 +230,12 @@ class TextureTurns:
         Raises:
             UserError: The method keeps no color, or its object has no texture.
         """
-        model: ObjectModel | None = getattr(method, "model", None)
-        if not isinstance(encoding, HasColor) or model is None:
-            raise UserError(
-                f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
-                "choose filter/refine=icp or none"
-            )
-        first = belief.best
+        model, first = self._check(encoding, method), belief.best
         turns, first_tried = list_turns(model)
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
+        assert isinstance(encoding, HasColor)
         log_posterior, tried = self._score(
             first, turns, first_tried, encoding, method, model, generator
         )
@@ -250,6 +245,34 @@ class TextureTurns:
             belief, turns[first_tried], turns[tried], log_posterior, model, generator
         )
         return belief._replace(best=best, poses=poses)
+
+    @torch.no_grad()
+    def turn_nearby(self, best: Tensor, encoding: Encoding, method: Method) -> Tensor | None:
+        """Return estimates (B, 4, 4) turned by less than ten degrees, where the shape leaves any
+        angle open; None where it leaves a few turns open, or none.
+
+        It costs a fraction of a search of all turns.
+
+        Raises:
+            UserError: As when called.
+        """
+        model = self._check(encoding, method)
+        turns, first_tried = list_turns(model)
+        if len(first_tried) <= _MOST:
+            return None
+        assert isinstance(encoding, HasColor)
+        here = torch.eye(4).expand_as(best).to(best)
+        return self._turn_finely(best, here, turns.to(best), encoding, model)
+
+    @staticmethod
+    def _check(encoding: Encoding, method: Method) -> ObjectModel:
+        model: ObjectModel | None = getattr(method, "model", None)
+        if not isinstance(encoding, HasColor) or model is None:
+            raise UserError(
+                f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
+                "choose filter/refine=icp or none"
+            )
+        return model
 
     def _score(
         self,

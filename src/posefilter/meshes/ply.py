@@ -51,5 +51,4 @@ def open_ply(path: Path) -> tuple[io.BytesIO, list[str]]:
         header = _PROPERTY.sub(
             lambda m: m[1] + ("unused_" if m[2] in _COORDINATES else "") + m[2] + m[3], header
         )
-    textures = textures if mapped else []
     return io.BytesIO(header.encode("latin-1") + data[end:]), textures

@@ -17,7 +17,7 @@ from posefilter.metrics.scores import overall
 from posefilter.report.diagnostics import list_numbers
 from posefilter.report.gather import SWEEP_MARKS, read_json, read_part, read_texts, read_yaml
 
-SILENT = ("out", "resume", "console")
+SILENT = ("out", "resume", "console", "threads")  # unless they are swept
 COLUMNS = {  # of summary.csv, and the metrics that they hold
     key.replace("/", "_"): key
     for key in (
@@ -116,8 +116,12 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
         for path, own in zip(found, metrics, strict=True)
     ]
     keys = dict.fromkeys(key for pairs in settings for key in pairs)
+    declared = read_declared(folder)
     axes = [
-        key for key in keys if key not in SILENT and len({pairs.get(key) for pairs in settings}) > 1
+        key
+        for key in keys
+        if (key not in SILENT or len(declared.get(key, [])) > 1)
+        and len({pairs.get(key) for pairs in settings}) > 1
     ]
     jobs = [
         Job(

@@ -70,6 +70,9 @@ class TrackerSettings:
         fit_pixels: Image points that a pose is scored from in these fits.
         icp_prior: Standard deviation of that estimate, as the prior of ICP with the measured depth
             [m on the object's surface]; 0: no ICP. A method that keeps no depth has none.
+        texture_every: Every so many frames the estimate and the particles are turned as the print
+            says, among the turns that the shape leaves open, where single images are; 0: never. A
+            search that finds the object again always ends so.
         jump_penalty: Log odds against a jump to what the network proposes, while the object is
             tracked [nat]; so that it does not flip between faces that look alike.
         kld_epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
@@ -102,6 +105,7 @@ class TrackerSettings:
     quadratic_fits: int = 1
     fit_pixels: int = 128
     icp_prior: float = 0.004
+    texture_every: int = 8
     jump_penalty: float = 5.0
     kld_epsilon: float = 0.15
     kld_quantile: float = 0.95
@@ -120,7 +124,7 @@ class TrackerSettings:
     def __post_init__(self) -> None:
         """Check the numbers."""
         check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
-        check_whole(self, whole_image_every=0, window_side=64, search_every=0)
+        check_whole(self, whole_image_every=0, window_side=64, search_every=0, texture_every=0)
         least = min(self.move_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
         if not (least >= 0 and self.window_scale >= 1):
             raise UserError(

@@ -18,6 +18,7 @@ from posefilter.filters.refine import Compose
 from posefilter.filters.resample import Multinomial, Systematic
 from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
+from posefilter.filters.texture import TextureTurns
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images
@@ -33,6 +34,7 @@ from posefilter.tracking.predict import FromBelief
 from posefilter.tracking.scoring import FrameScorer, check_method
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import LOST, TRACKED, TrackLossDetector
+from posefilter.tracking.turn import TurnTogether
 from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, BeliefBatch, Particles, Trace
 
@@ -230,7 +232,8 @@ class Track:
         elif window is not None:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
         encoding, start = self.method.encode(batch), predicted.belief.state
-        return self._filter(batch, encoding, start, follow, settings.quadratic_fits, against)
+        fits, texture = settings.quadratic_fits, self._texture_is_due
+        return self._filter(batch, encoding, start, follow, fits, texture, against)
 
     def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
         """Probe the whole image for a lost object, and search where that is worth it."""
@@ -238,14 +241,14 @@ class Track:
         if frame.blank or not bool(batch.depth.any()):
             return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, encoding = self.settings, self.method.encode(batch)
-        probed = self._filter(batch, encoding, predicted.belief.state, settings.probe, 0)
+        probed = self._filter(batch, encoding, predicted.belief.state, settings.probe, 0, False)
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
         begun, search = begin(probed.belief).belief, settings.search
         drawn = Multinomial()(begun, search.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
-        return self._filter(batch, encoding, start, search, settings.quadratic_fits)
+        return self._filter(batch, encoding, start, search, settings.quadratic_fits, True)
 
     def _filter(
         self,
@@ -254,9 +257,12 @@ class Track:
         start: Tensor,
         filter_settings: FilterSettings,
         quadratic_fits: int,
+        texture: bool,
         against: float = 0.0,
     ) -> FrameEstimate:
-        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
+        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them; end
+        with turns by `texture`, or without.
+        """
         particles = min(start.shape[1], 2 * filter_settings.min_particles)
         filter = ParticleFilter(
             particles=particles,  # after the first step
@@ -267,23 +273,26 @@ class Track:
             resample=Systematic(),
             propagate=Gaussian(self.settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=self._refine(quadratic_fits),
+            refine=self._refine(quadratic_fits, texture),
         )
         pixels, proposals = filter_settings.pixels, filter_settings.proposals
         scorer = FrameScorer(self.method, encoding, pixels, proposals, against)
         return self._weigh(batch, filter(batch, scorer, self.generator))
 
-    def _refine(self, quadratic_fits: int) -> Refine:
-        """Return what improves a frame's estimate: the likelihood, then the measured depth."""
-        fit = QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)
-        if not self.settings.icp_prior or "depth" not in self.method.capabilities:
-            return fit
-        # of single images, whose noise was chosen for the object
-        parts = getattr(self.method.filter.refine, "components", (self.method.filter.refine,))
-        own = next((one for one in parts if isinstance(one, PointToPlaneIcp)), PointToPlaneIcp())
+    def _refine(self, quadratic_fits: int, texture: bool) -> Refine:
+        """Return what improves a frame's estimate: the likelihood, then the measured depth, then
+        the print.
+        """
+        # of single images, whose settings were chosen for the object
+        own = getattr(self.method.filter.refine, "components", (self.method.filter.refine,))
+        parts: list[Refine] = [QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)]
         prior = self.settings.icp_prior
-        icp = PointToPlaneIcp(iterations=_ICP_STEPS, prior=prior, noise=own.noise)
-        return Compose([fit, icp])
+        if prior and "depth" in self.method.capabilities:
+            aligned = [one for one in own if isinstance(one, PointToPlaneIcp)]
+            noise = (aligned or [PointToPlaneIcp()])[0].noise
+            parts.append(PointToPlaneIcp(iterations=_ICP_STEPS, prior=prior, noise=noise))
+        parts += [TurnTogether(one) for one in own if isinstance(one, TextureTurns) and texture]
+        return Compose(parts)
 
     def _correct(
         self, predicted: State | None, belief: BeliefBatch | None, status: str
@@ -337,6 +346,12 @@ class Track:
         # what a window leaves in doubt the whole image may tell
         due = every > 0 and (self.frames + self.phase) % every == 0
         return not self.loss_detector.sure or due
+
+    @property
+    def _texture_is_due(self) -> bool:
+        every = self.settings.texture_every
+        # not in the frames that see the whole image, which cost more anyway
+        return every > 0 and (self.frames + self.phase) % every == every // 4
 
     def _choose_window(self, images: Images, predicted: State) -> Window | None:
         """Return the window about the object; None where it is time for the whole image."""
