@@ -198,3 +198,30 @@ def test_other_groups_take_one_choice(
 ) -> None:
     assert run_command("train", HOME, [typed, f"out={tmp_path / 'run'}"]) == 2
     assert "takes the name of a choice, not a value" in capfd.readouterr().err
+
+
+def test_no_logger_can_be_typed_as_a_deletion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs: list[Job] = []
+    monkeypatch.setattr("posefilter.cli.train.train", jobs.append)
+    assert run_command("train", HOME, ["~logger", f"out={tmp_path / 'run'}", "console=json"]) == 0
+    assert not jobs[0].cfg.logger
+
+
+def test_an_unknown_choice_of_several_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, ["logger=[csv,tensorbord]", f"out={tmp_path / 'run'}"]) == 2
+    assert "no choice 'tensorbord'; did you mean 'tensorboard'" in capfd.readouterr().err
+
+
+def test_a_long_odd_value_is_no_path() -> None:
+    assert quoted([f"rgb={'ü' * 300}"]) == [f"rgb='{'ü' * 300}'"]
+
+
+def test_a_sweep_of_a_list_tells_its_jobs_apart_too() -> None:
+    typed = ["sweep=seeds", "data.root=A,B"]
+    (named,) = told_apart(typed, "train", HOME / "conf")[2:]
+    assert "data.root" not in named
+    assert "exclude_keys=[out,resume," in named

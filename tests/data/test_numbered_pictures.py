@@ -64,3 +64,12 @@ def test_pictures_named_by_times_are_paired_by_order_where_that_is_nearest(
     )
     with pytest.raises(UserError, match=r"rgb/1700\.5.* is paired by order .* is nearer in time"):
         FolderVideo(tmp_path, np.eye(3), 1000.0)
+
+
+def test_pictures_that_are_counted_from_other_numbers_are_paired_by_order(tmp_path: Path) -> None:
+    for folder, first in (("rgb", 0), ("depth", 10)):
+        (tmp_path / folder).mkdir()
+        for number in range(first, first + 5):
+            picture = np.ones((4, 4), np.uint16 if folder == "depth" else np.uint8)
+            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), picture)
+    assert [frame.im_id for frame in FolderVideo(tmp_path, np.eye(3), 1000.0)] == [*range(5)]

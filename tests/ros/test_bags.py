@@ -324,10 +324,16 @@ def test_a_camera_of_another_image_is_named_and_early_images_are_counted(tmp_pat
     color, z = make_image(rgb, "rgb8"), make_image(depth, "16UC1")
     height, width = depth.shape
     images = [("/rgb", IMAGE, 2, color), ("/depth", IMAGE, 3, z)]
-    early = [("/rgb", IMAGE, 0, color), ("/info", CAMERA_INFO, 1, make_info(K, width, height))]
-    with BagReader(write_bag(tmp_path / "a", [*early, *images]), TOPICS, 0.1) as reader:
-        assert len([*reader.frames()]) == 1
-        assert (reader.early, reader.unpaired) == (1, 0)
+    info = ("/info", CAMERA_INFO, 1, make_info(K, width, height))
+    early = [("/rgb", IMAGE, 0, color), ("/depth", IMAGE, 0, z)]
+    for name, messages, counts in (
+        ("a", [*early, info, *images], (1, 1, 0)),
+        ("c", [early[0], info, images[1]], (1, 0, 0)),  # its depth comes when the camera is known
+        ("d", [early[1], info, images[0]], (1, 0, 0)),
+        ("e", [early[0], info, ("/depth", IMAGE, 9, make_image(depth, "16UC1", 900))], (0, 0, 1)),
+    ):
+        with BagReader(write_bag(tmp_path / name, messages), TOPICS, 0.1) as reader:
+            assert (len([*reader.frames()]), reader.early, reader.unpaired) == counts
     other = [("/info", CAMERA_INFO, 1, make_info(K, 2 * width, 2 * height))]
     with (
         BagReader(write_bag(tmp_path / "b", [*other, *images]), TOPICS, 0.1) as reader,

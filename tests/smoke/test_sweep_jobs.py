@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from tests.smoke.conftest import HOME, SMALL_POSE_PF, TINY
 
 from posefilter.cli import run_command
+from posefilter.cli.folders import note_failure
+from posefilter.cli.job import Job
 
 
 @pytest.mark.slow
@@ -67,3 +70,12 @@ def test_what_a_sweep_found_stays_where_it_is_typed_again(
     assert err.splitlines()[-1].startswith("train: 2 jobs failed; what their folders held before")
     assert [file.read_bytes() for file in files] == before
     assert not list(sweep.rglob("failed.json"))
+
+
+def test_a_job_whose_results_are_damaged_counts_as_failed(tmp_path: Path) -> None:
+    job = Job(OmegaConf.create({}), {}, ["seed=1"], tmp_path, "train", True)
+    (tmp_path / "metrics.json").write_text("{")
+    assert note_failure(job, "damaged")
+    assert json.loads((tmp_path / "failed.json").read_text())["error"] == "damaged"
+    (tmp_path / "metrics.json").write_text('{"iou": 1}')
+    assert not note_failure(job, "another")

@@ -45,6 +45,12 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     return [*options, *settings]
 
 
+def without_deletion(arguments: Sequence[str]) -> list[str]:
+    """Return a command line with `logger=none` for `~logger`, as Hydra deletes no list."""
+    deleted = {f"~{group}": f"{group}=none" for group in _SEVERAL}
+    return [deleted.get(argument, argument) for argument in arguments]
+
+
 def bracketed(arguments: list[str]) -> list[str]:
     """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
     numbers, not a sweep.
@@ -88,11 +94,18 @@ def quoted(arguments: Sequence[str]) -> list[str]:
         key, _, value = argument.partition("=")
         odd = re.search(r"[^\x20-\x7e]|[=#&;!^`~]", value) is not None
         if odd and re.fullmatch(r"[+~]{0,2}[\w./@]+", key) and not _written(value):
-            values = [value] if Path(value).exists() else value.split(",")
+            values = [value] if _exists(value) else value.split(",")
             parts = (part.replace("'", "\\'") for part in values)
             argument = f"{key}=" + ",".join(f"'{part}'" for part in parts)
         out.append(argument)
     return out
+
+
+def _exists(path: str) -> bool:
+    try:
+        return Path(path).exists()
+    except OSError:  # too long a name
+        return False
 
 
 def maximized(arguments: Sequence[str]) -> list[str]:
@@ -113,7 +126,7 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
         name: The command.
         conf: The folder of settings.
     """
-    if not {*MULTIRUN} & {*arguments}:
+    if not any(a in MULTIRUN or a.startswith("sweep=") for a in arguments):
         return list(arguments)
     settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
     job = (settings.get("hydra") or {}).get("job") or {}
@@ -148,7 +161,9 @@ def check_choices(arguments: list[str], conf: Path) -> None:
         own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
         if own and group != key:
             raise UserError(f"{argument}: names a choice; type {group}={value}")
-        if own and value.startswith(("[", "{")) and not _is_several(group, value):
+        if own and _is_several(group, value):
+            check_several(group, value, [conf, *config_folders(arguments)])
+        elif own and value.startswith(("[", "{")):
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
@@ -158,6 +173,17 @@ def check_choices(arguments: list[str], conf: Path) -> None:
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)
+
+
+def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
+    """Raise UserError where a list of choices has one that no folder has."""
+    known = sorted({name for folder in folders for name in list_choices(folder / group)})
+    for name in (part.strip(" '\"") for part in value.strip("[]").split(",")):
+        if name not in known:
+            raise UserError(
+                f"{group}={value}: there is no choice '{name}'{hint(name, known).rstrip('?')}; "
+                f"there are {', '.join(known)}"
+            )
 
 
 def _is_several(group: str, value: str) -> bool:

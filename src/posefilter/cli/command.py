@@ -31,6 +31,7 @@ from posefilter.cli.arguments import (
     quoted,
     spelled,
     told_apart,
+    without_deletion,
     without_trace,
 )
 from posefilter.cli.components import loosen
@@ -106,6 +107,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             print(describe_command(name, conf, arguments))
             return 0
         arguments = without_trace(arguments, name)
+        arguments = without_deletion(arguments)
         check_choices(arguments, conf)
         if {"--cfg", "-c"} & {*arguments} and {*MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -167,8 +167,9 @@ def note_failure(job: Job, cause: str) -> bool:
     Returns:
         Whether it has none: results that were there before stay as they are, without a note.
     """
-    if own_metrics(job.folder):
-        return False
+    with suppress(UserError):  # damaged ones are none
+        if own_metrics(job.folder):
+            return False
     content = {"overrides": job.overrides, "error": cause}
     write_whole(job.folder / FAILED, json.dumps(content, indent=2) + "\n")
     return True

@@ -242,8 +242,11 @@ def use_symmetries(work: Onboarding) -> None:
     work.stages.keep(symmetries=found)
     picture = work.out / "symmetries.png"
     sentence = f"{found}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
-    declared = find_declared(Path(str(work.cfg.mesh)), work.cfg.mesh_scale)
-    if declared is not None and str(work.cfg.symmetries) == "found":
+    declared = None
+    if str(work.cfg.symmetries) == "found":
+        with suppress(UserError):  # a hint; the file is not asked for
+            declared = find_declared(Path(str(work.cfg.mesh)), work.cfg.mesh_scale)
+    if declared is not None:
         file, count = declared
         sentence += f" ({file} declares {count}: symmetries={file})"
     say(work.cfg.console, "symmetries", sentence, found=found, picture=str(picture))

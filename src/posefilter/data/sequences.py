@@ -13,6 +13,7 @@ from posefilter.data.frames import FrameRecord, NotShown, Reader
 from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
 from posefilter.errors import UserError
 
+_TIME = re.compile(r"\d+\.\d+|\d{10,}")
 _COLOR, _DEPTH = (".png", ".jpg", ".jpeg"), (".png", ".npy")
 
 
@@ -182,14 +183,17 @@ def number_names(names: Sequence[str]) -> list[int] | None:
 
 def _check_times(folder: Path, color: Sequence[Path], depth: Sequence[Path]) -> None:
     """Raise UserError where pictures are named by times, and those that are paired by order are not
-    the nearest in time.
+    the nearest in time. Times have a fraction or ten digits and more; other numbers may be counts.
     """
-    try:
-        own, other = (np.array([float(path.stem) for path in paths]) for paths in (color, depth))
-    except ValueError:  # other names
+    if not all(_TIME.fullmatch(path.stem) for path in (*color, *depth)):
         return
-    nearest = np.abs(own[:, None] - other).argmin(axis=1)
-    wrong = np.flatnonzero(np.abs(own - other) > np.abs(own - other[nearest]))
+    own, other = (np.array([float(path.stem) for path in paths]) for paths in (color, depth))
+    order = np.argsort(other)
+    after = np.searchsorted(other[order], own).clip(1, max(len(other) - 1, 1))
+    beside = np.stack([order[after - 1], order[after.clip(max=len(order) - 1)]])
+    distance = np.abs(own - other[beside])
+    nearest = beside[distance.argmin(0), np.arange(len(own))]
+    wrong = np.flatnonzero(np.abs(own - other) > distance.min(0))
     if len(wrong):
         first = wrong[0]
         raise UserError(

@@ -127,18 +127,17 @@ class BagReader:
                 continue
             message = self._read(connection, raw)
             if connection.topic == self.topics.camera_info:
+                if camera is None:
+                    self._drop_early(colors, depths)
                 camera = message
                 self.distorted |= is_distorted(message)
-                continue
-            if camera is None:
-                self.early += connection.topic == self.topics.color
                 continue
             own, other = (
                 (colors, depths) if connection.topic == self.topics.color else (depths, colors)
             )
             stamp = stamp_of(message)
             near = min(other, key=lambda one: abs(one[0] - stamp), default=None)
-            if near is None or abs(near[0] - stamp) > self.tolerance:
+            if near is None or abs(near[0] - stamp) > self.tolerance or camera is None:
                 self.unpaired += own is colors and len(own) == _WAITING
                 own.append((stamp, time, message))
                 continue
@@ -146,6 +145,15 @@ class BagReader:
             mine = (stamp, time, message)
             yield self._make(*((mine, near) if own is colors else (near, mine)), camera)
         self.unpaired += len(colors)
+
+    def _drop_early(self, colors: deque[Any], depths: deque[Any]) -> None:
+        """Drop the pairs that came before the camera was known, and count them."""
+        for one in [*colors]:
+            near = min(depths, key=lambda other: abs(other[0] - one[0]), default=None)
+            if near is not None and abs(near[0] - one[0]) <= self.tolerance:
+                colors.remove(one)
+                depths.remove(near)
+                self.early += 1
 
     def _read(self, connection: Any, raw: bytes) -> Any:
         try:
