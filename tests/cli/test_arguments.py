@@ -152,6 +152,7 @@ def test_options_may_stand_anywhere() -> None:
         (["--info", "seed=1"], ["--info", "all", "seed=1"]),
         (["seed=1", "-i", "plugins"], ["-i", "plugins", "seed=1"]),
         (["seed=1", "--info"], ["--info", "all", "seed=1"]),
+        (["a=1", "-i", "-cd", "D", "b=2"], ["-i", "all", "-cd", "D", "a=1", "b=2"]),
     ],
 )
 def test_an_option_whose_value_is_left_out_takes_no_setting(

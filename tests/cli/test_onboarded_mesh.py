@@ -136,9 +136,12 @@ def test_clutter_may_be_in_another_unit(tmp_path: Path) -> None:
 
 def test_symmetries_that_are_declared_beside_a_mesh_are_found(tmp_path: Path) -> None:
     mesh = tmp_path / "obj_000003.ply"
-    assert find_declared(mesh, 0.001) is None
+    write_obj(catalog.build("brick"), tmp_path).rename(mesh)
+    assert find_declared(mesh, "obj_000003", 0.001) is None
     file = tmp_path / "models_info.json"
     half = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     file.write_text(json.dumps({"3": {"symmetries_discrete": [half]}, "4": {"diameter": 1}}))
-    assert find_declared(mesh, 0.001) == (file, 2)
-    assert find_declared(tmp_path / "obj_000004.ply", 0.001) is None
+    assert find_declared(mesh, "obj_000003", 0.001) == (file, 2)
+    assert find_declared(mesh, "obj_000004", 0.001) is None
+    assert find_declared(mesh, "valve", 0.001) is None  # as symmetries=FILE would not find it
+    assert find_declared(tmp_path / "none.ply", "obj_000003", 0.001) is None

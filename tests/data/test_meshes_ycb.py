@@ -123,3 +123,9 @@ def test_results_have_numbers_that_differ() -> None:
     assert ycb.number_objects(names) == {
         "mine": 3, "003_cracker_box": 2, "obj_000012": 12, "other": 4, "obj_000001": 1,
     }  # fmt: skip
+    taken = number_objects_of("003_cracker_box", "obj_000002", "obj_000001")
+    assert taken == [2, 3, 1]
+
+
+def number_objects_of(*names: str) -> list[int]:
+    return [ycb.number_objects(names)[name] for name in names]

@@ -407,6 +407,9 @@ def test_a_dataset_that_is_not_ycb_v_has_no_object_of_ycb_by_its_number(tmp_path
     info = tmp_path / "models" / "models_info.json"
     info.write_text(json.dumps({"2": {"diameter": 1000 * own.diameter + 1}}))
     check_bop_model(data, own)
+    for content in ({name: {"symmetries_discrete": []}}, {"2": {"symmetries_discrete": []}}):
+        info.write_text(json.dumps(content))
+        check_bop_model(data, own)  # no diameter to compare
     info.write_text(json.dumps({"2": {"diameter": 120.0}}))
     with pytest.raises(UserError, match=rf"object 2 has a diameter of 120 mm, and {name}"):
         check_bop_model(data, own)

@@ -28,20 +28,17 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     """Return a command line with its options before all settings: Hydra's parser does not find
     settings on both sides of an option.
     """
-    options, settings = list[str](), list[str]()
-    words = iter(arguments)
-    for word in words:
+    options, settings, left = list[str](), list[str](), list(arguments)
+    while left:
+        word = left.pop(0)
         if not word.startswith("-"):
             settings.append(word)
             continue
         options.append(word)
-        if word in _VALUED:
-            options += [value for value in [next(words, None)] if value is not None]
-        elif word in _INFO:  # whose value may be left out
-            value = next(words, None)
-            known = value in _KINDS
-            options.append(value if known and value is not None else _KINDS[0])
-            settings += [] if known or value is None else [value]
+        if word in _INFO:  # whose value may be left out
+            options.append(left.pop(0) if left and left[0] in _KINDS else _KINDS[0])
+        elif word in _VALUED and left:
+            options.append(left.pop(0))
     return [*options, *settings]
 
 
@@ -131,7 +128,7 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
     settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
     job = (settings.get("hydra") or {}).get("job") or {}
     unnamed = ((job.get("config") or {}).get("override_dirname") or {}).get("exclude_keys") or []
-    typed = [a for a in arguments if a.partition("=")[0] in unnamed]
+    typed = [a for a in arguments if a.partition("=")[0].lstrip("+~") in unnamed]
     swept = {
         own.key_or_group
         for own in OverridesParser.create().parse_overrides(typed)

@@ -28,7 +28,7 @@ from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
-from posefilter.data.readers.decode import need, numbers, read_json
+from posefilter.data.readers.decode import numbers, read_json
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
@@ -40,7 +40,7 @@ from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
-from posefilter.paths import check_links
+from posefilter.paths import check_links, find_conf
 from posefilter.types import Batch, ObjectModel
 
 OF_THE_CHECKPOINT = ("object", "image_width", "image_height", "batch_size_test")
@@ -173,7 +173,9 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         )
     rows = read_poses_csv(Path(str(job.cfg.estimates)))
     settings = data_settings(job, {}, None)
-    if job.cfg.targets is not None and not any("data.object=" in o for o in job.overrides):
+    typed = any("data.object=" in override for override in job.overrides)
+    default = OmegaConf.load(find_conf() / "data" / "_base.yaml").object
+    if job.cfg.targets is not None and not typed and settings.object == default:
         settings.object = None  # the targets say which objects are meant
     data = build_data(settings, job.cfg.console)
     data.setup("test")
@@ -338,7 +340,10 @@ def check_bop_model(data: PoseDataModule, own: ObjectModel) -> None:
     if file is None:
         return
     number = ycbvideo_index(own.name)
-    entry = need(read_json(file), str(number), file)
+    content = read_json(file)
+    entry = content.get(str(number)) if isinstance(content, dict) else None
+    if not (isinstance(entry, dict) and "diameter" in entry):  # nothing to compare
+        return
     theirs = 0.001 * float(numbers(entry, "diameter", file, (), f"{number}."))
     if abs(theirs - own.diameter) > _SAME_DIAMETER * own.diameter:
         raise UserError(

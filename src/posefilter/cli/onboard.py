@@ -245,7 +245,8 @@ def use_symmetries(work: Onboarding) -> None:
     declared = None
     if str(work.cfg.symmetries) == "found":
         with suppress(UserError):  # a hint; the file is not asked for
-            declared = find_declared(Path(str(work.cfg.mesh)), work.cfg.mesh_scale)
+            source = Path(str(work.cfg.mesh))
+            declared = find_declared(source, work.mesh.name, work.cfg.mesh_scale)
     if declared is not None:
         file, count = declared
         sentence += f" ({file} declares {count}: symmetries={file})"
@@ -387,7 +388,13 @@ _TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "settings
 STAGES = (
     Stage("mesh", "checking the mesh", ("mesh", "name", "clutter", "clutter_scale"), store_meshes),
     Stage("symmetries", "finding symmetries", ("mesh", "symmetries"), use_symmetries),
-    Stage("render", "rendering", ("mesh", "name", "clutter", "seed", "frames"), render, True),
+    Stage(
+        "render",
+        "rendering",
+        ("mesh", "name", "clutter", "clutter_scale", "seed", "frames"),
+        render,
+        True,
+    ),
     Stage("train", "training", ("mesh", *_TRAINED), train, True),
     Stage("export", "writing the weights", ("mesh", *_TRAINED), export),
     Stage("calibrate", "calibrating the probability", ("mesh", *_TRAINED), calibrate),

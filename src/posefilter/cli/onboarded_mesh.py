@@ -94,12 +94,12 @@ def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> tuple[MeshFacts, 
     return inspect_mesh(mesh), like
 
 
-def find_declared(mesh: Path, scale: float | None) -> tuple[Path, int] | None:
-    """Return a file beside a mesh that declares symmetries of it, and how many; None without."""
+def find_declared(mesh: Path, object_name: str, scale: float | None) -> tuple[Path, int] | None:
+    """Return a file beside a mesh that declares symmetries of the object, and how many."""
     for name in ("symmetries.json", "models_info.json"):
         file = mesh.parent / name
-        if file.is_file():
-            group = read_symmetries(file, mesh.stem, scale or 1.0, _STEPS)
+        if mesh.is_file() and file.is_file():
+            group = read_symmetries(file, object_name, scale or 1.0, _STEPS)
             if len(group) > 1:
                 return file, len(group)
     return None

@@ -142,7 +142,8 @@ def check_kept(argument: str, folder: Path) -> None:
     """Raise UserError where an argument changes a setting that a run keeps."""
     key, _, value = argument.partition("=")
     key = key.lstrip("+~")
-    if key == "out" and value not in ("", "null") and Path(value).resolve() != folder.resolve():
+    out = str(_read_value(argument)) if key == "out" and value not in ("", "null") else str(folder)
+    if Path(out).resolve() != folder.resolve():
         raise UserError(
             f"{argument}: a run that is resumed stays in its folder; leave out= out, or type "
             f"warm_start={folder}/checkpoints/{LAST} for a new run that begins with its weights"

@@ -58,7 +58,7 @@ class Stages:
     def is_done(self, name: str, settings: Mapping[str, Any]) -> bool:
         """Tell whether a stage was finished with these settings."""
         one = self.content["stages"].get(name)
-        return bool(one and one.get("done") and one["settings"] == _plain(settings))
+        return bool(one and one.get("done") and not _differing(one["settings"], settings))
 
     def check(self, name: str, settings: Mapping[str, Any]) -> None:
         """Refuse settings that differ from those that a costly stage was begun with.
@@ -67,9 +67,10 @@ class Stages:
             UserError: They do.
         """
         before = self.content["stages"].get(name)
-        if before is None or before["settings"] == _plain(settings):
+        others = [] if before is None else _differing(before["settings"], settings)
+        if not others:
             return
-        other = ", ".join(_differing(before["settings"], _plain(settings)))
+        other = ", ".join(others)
         raise UserError(
             f"out={self.file.parent}: its stage '{name}' was begun with other settings "
             f"({other}); choose another out="
@@ -93,7 +94,7 @@ class Stages:
             self.check(name, settings)
         stages = self.content["stages"]
         before = stages.get(name)
-        same = before is not None and before["settings"] == _plain(settings)
+        same = before is not None and not _differing(before["settings"], settings)
         names = list(stages)
         for later in names[names.index(name) + 1 :] if before is not None else ():
             stages[later]["done"] = False
@@ -118,5 +119,7 @@ def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
-    return sorted(key for key in {*a, *b} if a.get(key) != b.get(key))
+def _differing(before: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
+    """Return the settings that are others than before; one that is null may be missing there."""
+    now = _plain(settings)
+    return sorted(key for key in {*before, *now} if before.get(key) != now.get(key))

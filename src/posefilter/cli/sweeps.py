@@ -73,6 +73,7 @@ def summarize(folder: Path) -> list[Row]:
     lines += ["| " + " | ".join(_cell(row.get(name)) for name in names[:-1]) + " |" for row in rows]
     write_whole(folder / "summary.md", "\n".join(lines) + "\n")
     figure = draw_summary(sweep)
+    (folder / "summary.png").unlink(missing_ok=True)
     if figure is not None:
         with open_whole(folder / "summary.png", sync=False) as image:
             figure.savefig(image, format="png", dpi=120)

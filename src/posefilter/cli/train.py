@@ -179,10 +179,11 @@ def _check_epochs(trainer: Trainer, batches: int) -> None:
 
 def _is_lightnings(error: Exception) -> bool:
     """Tell whether Lightning's trainer or a callback of its own has raised an error itself, rather
-    than passed it on.
+    than passed it on. A RuntimeError of the trainer may be a device's.
     """
     frames = traceback.extract_tb(error.__traceback__)
-    places = [Path(str(one.__file__)).parent for one in (loops, callbacks)]
+    places = [Path(str(one.__file__)).parent for one in (callbacks, loops)]
+    places = places[:1] if isinstance(error, RuntimeError) else places
     return bool(frames) and any(Path(frames[-1].filename).is_relative_to(p) for p in places)
 
 

@@ -123,15 +123,14 @@ def parts(name: str, mesh: Mesh) -> dict[str, np.ndarray]:
 
 def number_objects(names: Sequence[str]) -> dict[str, int]:
     """Return the number of each object in results: of one of YCB-Video's its number there, of
-    `obj_000012` 12, of any other the first that is free, from 1.
+    `obj_000012` 12, of any other, and of one whose number another has, the first that is free.
     """
     numbers: dict[str, int] = {}
     for name in names:
         numbered = re.fullmatch(r"obj_(\d{1,9})", name)
-        if name in CLASSES:
-            numbers[name] = ycbvideo_index(name)
-        elif numbered:
-            numbers[name] = int(numbered[1])
+        own = ycbvideo_index(name) if name in CLASSES else int(numbered[1]) if numbered else 0
+        if own and own not in numbers.values():
+            numbers[name] = own
     for name in names:
         free = (n for n in count(1) if n not in numbers.values())
         numbers.setdefault(name, next(free))

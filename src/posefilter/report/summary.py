@@ -24,8 +24,10 @@ def draw_summary(sweep: Sweep) -> Figure | None:
     """
     found = group_jobs(sweep)
     once = len(found) == len(sweep.jobs)
-    charts = [chart_over(axis, sweep, found, [*map(find_metric, SHOWN)]) for axis in sweep.shown]
-    rows = [[replace(panel, joined=not once) for panel in row] for row in charts if row]
+    infos = [find_metric(key) for key in SHOWN]
+    charts = {axis: chart_over(axis, sweep, found, infos) for axis in sweep.shown}
+    charts = {axis: row for axis, row in charts.items() if row}
+    rows = [[replace(panel, joined=not once) for panel in row] for row in charts.values()]
     if not rows:
         return None
     heights, columns = [measure_height(row[0]) for row in rows], len(rows[0])
@@ -41,9 +43,11 @@ def draw_summary(sweep: Sweep) -> Figure | None:
         f"Sweep over {', '.join(sweep.shown)}: {count}\n{notes}", fontsize=12, fontweight="bold"
     )
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
-    for line, row in zip(axes, rows, strict=True):
+    for axis, line, row in zip(charts, axes, rows, strict=True):
         for own, panel in zip(line, row, strict=True):
             draw_panel(own, panel, LIGHT)
+        if row[0].categories:
+            line[0].set_ylabel(axis, fontsize=8.5)
         if len(row[0].lines) > 1:
             line[0].legend(fontsize=8, frameon=False)
     return figure
