@@ -14,10 +14,11 @@ from posefilter.cli.evaluate import check_bop_model
 from posefilter.data.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
-from posefilter.data.readers.decode import holds_meters, read_depth, read_json
+from posefilter.data.readers.decode import holds_meters, read_depth
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
 from posefilter.errors import BadData, UserError
+from posefilter.limits import read_json
 from posefilter.meshes import ycb
 from posefilter.meshes.mesh import object_model
 from posefilter.meshes.store import MeshStore

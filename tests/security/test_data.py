@@ -15,9 +15,10 @@ import pytest
 
 from posefilter.data.cache import DiskCache
 from posefilter.data.points import model_points
-from posefilter.data.readers.decode import read_color, read_depth, read_json, read_label
+from posefilter.data.readers.decode import read_color, read_depth, read_label
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
+from posefilter.limits import read_json
 from posefilter.meshes.files import read_mesh
 from posefilter.report.gather import read_run
 from posefilter.report.images import encode_image

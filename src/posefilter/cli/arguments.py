@@ -105,6 +105,11 @@ def _exists(path: str) -> bool:
         return False
 
 
+def is_multirun(arguments: Sequence[str]) -> bool:
+    """Tell whether a command line is of a sweep: it says so, or names a list of runs."""
+    return any(a in MULTIRUN or a.startswith("sweep=") for a in arguments)
+
+
 def maximized(arguments: Sequence[str]) -> list[str]:
     """Return a command line whose search maximizes what a training returns, as far as it does not
     say otherwise: Optuna would minimize.
@@ -123,7 +128,7 @@ def told_apart(arguments: Sequence[str], name: str, conf: Path) -> list[str]:
         name: The command.
         conf: The folder of settings.
     """
-    if not any(a in MULTIRUN or a.startswith("sweep=") for a in arguments):
+    if not is_multirun(arguments):
         return list(arguments)
     settings = yaml.safe_load((conf / f"{name}.yaml").read_text(encoding="utf-8"))
     job = (settings.get("hydra") or {}).get("job") or {}
@@ -238,7 +243,7 @@ def defer_settings(arguments: Sequence[str], conf: Path) -> list[str]:
         arguments: The command line.
         conf: The folder of settings.
     """
-    if not any(a in MULTIRUN or a.startswith("sweep=") for a in arguments):
+    if not is_multirun(arguments):
         return list(arguments)
     typed = [a for a in arguments if "=" in a and not a.startswith("-")]
     parsed = dict(zip(typed, OverridesParser.create().parse_overrides(typed), strict=True))

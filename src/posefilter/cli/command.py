@@ -39,10 +39,10 @@ from posefilter.cli.console import JSON, logging_for, say, settle_logging
 from posefilter.cli.explain import explain, explain_hydra, first_line, is_launchers
 from posefilter.cli.fit import check_fit
 from posefilter.cli.folders import (
-    done_before,
     forget_failure,
     hold_folder,
     note_failure,
+    read_results,
     remove_if_empty,
 )
 from posefilter.cli.job import Job, check_settings, first, plain_name, run_of
@@ -190,7 +190,7 @@ def _task(name: str, begun: list[Job], kept: list[Job]) -> Callable[[DictConfig]
                 hold_folder(job.folder)
             forget_failure(job)
             use_plugins(cfg)
-            if not (name == "train" and done_before(job)):
+            if not (name == "train" and read_results(job)):
                 check_files(name, cfg)
             if name == "train":
                 check_fit(cfg, job.choices, Scope.CONFIG)

@@ -17,20 +17,20 @@ from posefilter.cli.build import build_data, make_trainer, quiet
 from posefilter.cli.checkpoints import method_of, read_checkpoint
 from posefilter.cli.components import changed, changes, chosen
 from posefilter.cli.console import say, typed
-from posefilter.cli.folders import holds_evaluation
+from posefilter.cli.folders import holds_evaluation, read_results
 from posefilter.cli.job import Job
 from posefilter.cli.machine import settle
 from posefilter.cli.progress_bar import progress
 from posefilter.cli.recipe import check_data
 from posefilter.cli.results import record, show, write_json
-from posefilter.cli.reuse import check_same
 from posefilter.confidence.tolerance import RIGHT, read_pose_tolerance
 from posefilter.data.absent import hide_annotation
 from posefilter.data.loaders import make_loader
 from posefilter.data.module import PoseDataModule
-from posefilter.data.readers.decode import numbers, read_json
+from posefilter.data.readers.decode import numbers
 from posefilter.errors import UserError
 from posefilter.geometry.boxes import box_of_pose
+from posefilter.limits import read_json
 from posefilter.meshes.ycb import CLASSES, ycbvideo_index
 from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
@@ -62,7 +62,7 @@ def evaluate(job: Job) -> float:
         raise UserError("targets: go with estimates=poses.csv, not with a checkpoint")
     if job.cfg.estimates and read_pose_tolerance(job.cfg.pose_tolerance) is not None:
         raise UserError("pose_tolerance: is of a checkpoint's probability; estimates have none")
-    check_same(job)
+    read_results(job)  # refused where they are of another
     keep_training_results(job.folder)
     metrics, files = _of_estimates(job) if job.cfg.estimates else _of_checkpoint(job)
     write_json(job.folder / "metrics.json", {**metrics, "command": "evaluate"})
@@ -173,10 +173,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         )
     rows = read_poses_csv(Path(str(job.cfg.estimates)))
     settings = data_settings(job, {}, None)
-    typed = any("data.object=" in override for override in job.overrides)
-    default = OmegaConf.load(find_conf() / "data" / "_base.yaml").object
-    if job.cfg.targets is not None and not typed and settings.object == default:
-        settings.object = None  # the targets say which objects are meant
+    if job.cfg.targets is not None and not any("data.object=" in one for one in job.overrides):
+        default = OmegaConf.load(find_conf() / "data" / "_base.yaml").object
+        if settings.object == default:
+            settings.object = None  # the targets say which objects are meant
     data = build_data(settings, job.cfg.console)
     data.setup("test")
     best = {}

@@ -91,9 +91,12 @@ def holds_evaluation(folder: Path) -> bool:
     return file.is_file() and read_metrics(file).get("command") == "evaluate"
 
 
-def check_same(job: Job) -> None:
-    """Raise UserError where the folder of a sweep's job holds results of a job with other
-    overrides, as far as they decide a result.
+def read_results(job: Job) -> dict[str, Any]:
+    """Return what a sweep's job that was done before has found; empty where there is none.
+
+    Raises:
+        UserError: Its folder holds the results of a job with other overrides, as far as they decide
+            a result.
     """
     metrics = own_metrics(job.folder) if job.swept else {}
     others = {*deciding(metrics.get("overrides", []))} ^ {*deciding(job.overrides)}
@@ -102,6 +105,7 @@ def check_same(job: Job) -> None:
         raise UserError(
             f"{job.folder}: holds results of other settings ({told}); choose another out="
         )
+    return metrics
 
 
 def deciding(overrides: list[str]) -> list[str]:
@@ -109,16 +113,6 @@ def deciding(overrides: list[str]) -> list[str]:
     done.
     """
     return sorted(typed for typed in overrides if typed.split("=", 1)[0].lstrip("+~") not in HANDS)
-
-
-def done_before(job: Job) -> bool:
-    """Tell whether a sweep's job has its results.
-
-    Raises:
-        UserError: Its folder holds the results of another.
-    """
-    check_same(job)
-    return job.swept and bool(own_metrics(job.folder))
 
 
 def own_metrics(folder: Path) -> dict[str, Any]:

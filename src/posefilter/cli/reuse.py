@@ -11,7 +11,7 @@ from posefilter.cli.checkpoints import read_checkpoint, recipe
 from posefilter.cli.comparing import differing
 from posefilter.cli.console import say
 from posefilter.cli.files import save_whole
-from posefilter.cli.folders import check_same, own_metrics
+from posefilter.cli.folders import own_metrics, read_results
 from posefilter.cli.instantiate import locate
 from posefilter.cli.job import Job
 from posefilter.cli.plain import resolve
@@ -28,10 +28,9 @@ def finished(job: Job) -> dict[str, Any] | None:
     Raises:
         UserError: Its folder holds the results of another.
     """
-    metrics = own_metrics(job.folder) if job.swept else {}
+    metrics = read_results(job)
     if not metrics:
         return None
-    check_same(job)
     changed = changed_since(job)
     other = f", with other settings than now ({', '.join(changed[:5])})" if changed else ""
     sentence = f"{job.folder}: done before{other}; delete its metrics.json to run it again"

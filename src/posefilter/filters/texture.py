@@ -230,17 +230,17 @@ class TextureTurns:
         Raises:
             UserError: The method keeps no color, or its object has no texture.
         """
-        model, first = self._check(encoding, method), belief.best
+        model, colored = self._check(encoding, method)
+        first = belief.best
         turns, first_tried = list_turns(model)
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
-        assert isinstance(encoding, HasColor)
         log_posterior, tried = self._score(
-            first, turns, first_tried, encoding, method, model, generator
+            first, turns, first_tried, colored, method, model, generator
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
-        best = self._turn_finely(first, chosen, turns, encoding, model)
+        best = self._turn_finely(first, chosen, turns, colored, model)
         poses = _turn_particles(
             belief, turns[first_tried], turns[tried], log_posterior, model, generator
         )
@@ -256,23 +256,22 @@ class TextureTurns:
         Raises:
             UserError: As when called.
         """
-        model = self._check(encoding, method)
+        model, colored = self._check(encoding, method)
         turns, first_tried = list_turns(model)
         if len(first_tried) <= _MOST:
             return None
-        assert isinstance(encoding, HasColor)
         here = torch.eye(4).expand_as(best).to(best)
-        return self._turn_finely(best, here, turns.to(best), encoding, model)
+        return self._turn_finely(best, here, turns.to(best), colored, model)
 
     @staticmethod
-    def _check(encoding: Encoding, method: Method) -> ObjectModel:
+    def _check(encoding: Encoding, method: Method) -> tuple[ObjectModel, HasColor]:
         model: ObjectModel | None = getattr(method, "model", None)
         if not isinstance(encoding, HasColor) or model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
                 "choose filter/refine=icp or none"
             )
-        return model
+        return model, encoding
 
     def _score(
         self,

@@ -19,13 +19,13 @@ from posefilter.data.readers.decode import (
     numbers,
     read_color,
     read_depth,
-    read_json,
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects, need_text
 from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
+from posefilter.limits import read_json
 from posefilter.meshes import ycb
 from posefilter.meshes.store import MeshStore
 from posefilter.paths import check_inside
@@ -238,6 +238,8 @@ class BopReader(BaseReader):
         scale = float(numbers(camera, "depth_scale", camera_path, (), f"{image}."))
         check_units(1 / (scale * MM) if scale > 0 else scale, camera_path, f"{image}.depth_scale")
         masks = [folder / "mask_visib" / f"{stem}_{k:06d}.png" for k in range(len(truth))]
+        color = _color(folder, stem)
+        depth = _first(folder / "depth" / f"{stem}.{end}" for end in ("png", "tif"))
         entries = []
         for k, one in enumerate(truth):
             where = f"{image}[{k}]."
@@ -251,13 +253,7 @@ class BopReader(BaseReader):
             if not is_rigid(torch.from_numpy(pose), tolerance=2e-3):
                 raise BadData(gt_path, f"'{where}cam_R_m2c' is no rotation")
             camera_from_object = np.linalg.inv(pose) if self._inverted else pose
-            files = (
-                _color(folder, stem),
-                _first(folder / "depth" / f"{stem}.{end}" for end in ("png", "tif")),
-                masks[k],
-                gt_path,
-                camera_path,
-            )
+            files = (color, depth, masks[k], gt_path, camera_path)
             record = FrameRecord(
                 f"{group}/{stem}", group, int(folder.name), int(image), number, name, k, files
             )

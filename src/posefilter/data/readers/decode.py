@@ -13,7 +13,6 @@ import numpy as np
 from posefilter.data.frames import SATURATED
 from posefilter.errors import BadData
 from posefilter.limits import check_picture, read_bytes
-from posefilter.limits import read_json as read_json
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
