@@ -162,6 +162,7 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         Line("patch", "model=patch_pf experiment=memorize sweep=patch seed=0"),
     ]
     lines += [*list_pose_space(), *list_paper(), *list_choices(), *list_long()]
+    lines += list_units_at_full_size()
     if meshes:
         lines += [
             Line("cracker_box", f"{FOUR} experiment=cracker_box_pixels data.meshes={meshes} seed=0")
@@ -202,6 +203,16 @@ def list_units() -> list[Line]:
         )
         lines.append(Line("unit", f"model={model} {paper} {size} {UNITS} seed=0,1,2"))
     return lines
+
+
+def list_units_at_full_size() -> list[Line]:
+    """Return the same at the paper's size, memorizing; half a frame is the table `memorize`."""
+    paper = "experiment=memorize variant=paper callbacks=checkpoints"
+    units = "model.displacement.unit=1,10,learned seed=0,1,2,3,4"
+    return [
+        Line("unit_full", f"model={model} {paper} {units}", into=model)
+        for model in ("downsized", "cnn_patch", "pixel_pf", "patch_pf")
+    ]
 
 
 def list_end_to_end() -> list[Line]:
