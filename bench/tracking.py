@@ -2,21 +2,22 @@
 
     python bench/tracking.py --frames DIR --meshes DIR [--only 003_cracker_box] [--losses]
 
-    python bench/tracking.py --sequences DIR [DIR ...] --meshes DIR --only 003_cracker_box
+    python bench/tracking.py --sequences DIR=OBJECT [DIR=OBJECT ...] --meshes DIR
 
     python bench/tracking.py (--frames DIR | --sequences DIR) --meshes DIR --together 1 --together 4
 
 For each of YCB-Video's objects whose weights ship and that is in the scenes: every frame by itself,
-then the same frames tracked, in one process. Times are the processor's of this process, so that
-other work on the machine changes them little; the ratio of the two is what to go by. Then the
-frames once more, of which six are replaced by those of another scene: how many are said to show the
-object, and after how many frames it is recovered. Sequences are folders of generate.py with
-moving= and covered_frames=: there the losses are in the frames. With --together so many objects of
-a scene are tracked at once by one thread, by two that torch shares an operation's work out to, and
-by two processes that have an object each: in turn, by the clock, on an idle machine if the figures
-are to mean anything. Of the processor's time it is the first process' share. Objects that a scene
-lacks are taken where it has too few, and are searched for in every frame. Writes the tables of
-docs/results/tracking.md.
+then the same frames tracked, in one process. Figures are means over seeds, of single images over
+the first four, and ± is the standard error of such a mean. Times are the processor's of this
+process, so that other work on the machine changes them little; the ratio of the two is what to go
+by. Then the frames once more, of which six are replaced by those of another scene: how many are
+said to show the object, and after how many frames it is recovered. Sequences are folders of
+generate.py with moving= and covered_frames=: there the losses are in the frames. With
+--together so many objects of a scene are tracked at once by one thread, by two that torch shares an
+operation's work out to, and by two processes that have an object each: in turn, by the clock, on an
+idle machine if the figures are to mean anything. Of the processor's time it is the first process'
+share. Objects that a scene lacks are taken where it has too few, and are searched for in every
+frame. Writes the tables of docs/results/tracking.md.
 """
 
 import argparse
@@ -44,6 +45,7 @@ HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "tracking.md"
 MARK, END = "<!-- table: {} -->", "<!-- end -->"
 AWAY = range(7, 13)  # frames that are replaced
+SINGLE_SEEDS = 4
 HEAD = (
     "object", "scene", "stride", "frames", "single: ADD AUC", "ADD-S AUC", "jitter mm", "degrees",
     "tracked: ADD AUC", "ADD-S AUC", "jitter mm", "degrees", "lost", "single s", "tracked ms",
@@ -53,13 +55,11 @@ LOSSES = (
     "object", "scene", "away", "said to be there", "of these in the first", "recovered after",
     "presence with it", "without",
 )  # fmt: skip
-
-
 SEQUENCES = (
     "object", "sequence", "step mm", "step degrees", "frames", "covered", "single: ADD AUC",
-    "tracked", "by seed", "random walk", "lost", "covered: said to be there", "recovered after",
+    "tracked: ADD AUC", "random walk", "single: ADD-S AUC", "tracked: ADD-S AUC", "lost",
+    "covered: said to be there", "recovered after",
 )  # fmt: skip
-SEEDS = (0, 1)  # of the filter, on sequences
 RANDOM_WALK = ConstantVelocity(velocity_gain=0, max_noise_scale=1)
 TOGETHER = (
     "scene", "objects", "of these away", "frames", "threads", "frame ms", "mean", "slowest",
@@ -97,13 +97,13 @@ def judge(
 
 
 def run_single(
-    estimator: posefilter.Estimator, frames: Sequence[VideoFrame]
+    estimator: posefilter.Estimator, frames: Sequence[VideoFrame], seed: int = 0
 ) -> tuple[list[Any], list[float]]:
     """Estimate every frame by itself; return the results and the processor's seconds."""
     results, seconds = [], []
     for frame in frames:
         start = time.process_time()
-        results.append(estimator.predict(frame.rgb, frame.depth, frame.intrinsics))
+        results.append(estimator.predict(frame.rgb, frame.depth, frame.intrinsics, seed=seed))
         seconds.append(time.process_time() - start)
     return results, seconds
 
@@ -124,71 +124,134 @@ def run_tracked(
 
 
 def measure_loss(
-    estimator: posefilter.Estimator, frames: Sequence[VideoFrame], other: Sequence[VideoFrame]
-) -> list[str]:
-    """Replace some frames by another scene's, and return the row of what became of the track."""
-    name = estimator.objects[0]
+    estimator: posefilter.Estimator,
+    frames: Sequence[VideoFrame],
+    other: Sequence[VideoFrame],
+    seed: int,
+) -> tuple[int, int, int | None, float, float]:
+    """Replace some frames by another scene's, and track.
+
+    Returns:
+        In how many of these the object was said to be there, and how many of them are the delay of
+        a loss; in which of its own that came back it is found, or None; the least presence of a
+        frame with it, and the greatest of one without.
+    """
     mixed = [other[n] if n in AWAY else frame for n, frame in enumerate(frames)]
-    results, _ = run_tracked(estimator, mixed)
+    results, _ = run_tracked(estimator, mixed, seed=seed)
     said = [results[n].is_tracked for n in AWAY]
-    model = estimator.object_models[0]
-    back = "not again"
+    model, back = estimator.object_models[0], None
     for n in range(AWAY.stop, len(frames)):
-        truth = torch.from_numpy(frames[n].truth[name])[None]
-        error = float(add_s(torch.from_numpy(results[n].pose)[None], truth, model.points))
-        if results[n].is_tracked and error < 0.1 * model.diameter:
-            back = str(n - AWAY.stop + 1)
+        if results[n].is_tracked and _error(results[n], frames[n]) < 0.1 * model.diameter:
+            back = n - AWAY.stop + 1
             break
     early = sum(said[: posefilter.TrackerSettings().patience - 1])
     there = min(r.presence for n, r in enumerate(results) if r.is_tracked and n not in AWAY)
-    away = max(results[n].presence for n in AWAY)
-    row = [str(len(AWAY)), str(sum(said)), str(early), back, f"{there:.2f}", f"{away:.2f}"]
-    return [name, "", *row]
+    return sum(said), early, back, there, max(results[n].presence for n in AWAY)
+
+
+def measure_losses(
+    estimator: posefilter.Estimator,
+    scene: str,
+    frames: Sequence[VideoFrame],
+    other: Sequence[VideoFrame],
+    seeds: int,
+) -> str:
+    """Return the row of what became of the tracks of all seeds."""
+    found = [measure_loss(estimator, frames, other, seed) for seed in range(seeds)]
+    said, early, back, there, away = zip(*found, strict=True)
+    cells = [estimator.objects[0], scene, str(len(AWAY)), f"{np.mean(said):.1f}"]
+    cells += [f"{np.mean(early):.1f}", describe_recovery(back), f"{min(there):.2f}"]
+    return f"| {' | '.join([*cells, f'{max(away):.2f}'])} |"
+
+
+def describe_recovery(back: Sequence[int | None]) -> str:
+    """Return after how many frames objects were found again, and how many were not."""
+    counts = [count for count in back if count is not None]
+    slowest = f"{np.mean(counts):.1f}, at most {max(counts)}" if counts else "–"
+    missed = len(back) - len(counts)
+    return f"{slowest}; not again: {missed}" if missed else slowest
+
+
+def average(outcomes: Sequence[Outcome], name: str, digits: int = 1) -> str:
+    """Return the mean of a figure over seeds, and its standard error."""
+    values = [getattr(one, name) for one in outcomes]
+    if len(values) == 1:
+        return f"{values[0]:.{digits}f}"
+    error = np.std(values, ddof=1) / math.sqrt(len(values))
+    return f"{np.mean(values):.{digits}f} ± {error:.{digits}f}"
 
 
 def compare(
-    estimator: posefilter.Estimator, scene: str, frames: Sequence[VideoFrame], strides: list[int]
+    estimator: posefilter.Estimator,
+    scene: str,
+    frames: Sequence[VideoFrame],
+    strides: Sequence[int],
+    seeds: int,
 ) -> Iterator[str]:
     """Yield the row of single images against tracks at each stride."""
     name = estimator.objects[0]
     estimator.predict(frames[0].rgb, frames[0].depth, frames[0].intrinsics)  # warm
-    results, seconds = run_single(estimator, frames)
+    alone = [run_single(estimator, frames, seed) for seed in range(min(seeds, SINGLE_SEEDS))]
     for stride in strides:
-        single = judge(results[::stride], frames[::stride], seconds[::stride])
-        tracked = judge(*_with(frames[::stride], run_tracked(estimator, frames[::stride]), first=1))
-        yield make_row(name, scene, stride, single, tracked, len(frames[::stride]))
+        some = frames[::stride]
+        single = [judge(found[::stride], some, times[::stride]) for found, times in alone]
+        tracked = [
+            judge(*_with(some, run_tracked(estimator, some, seed=seed), first=1))
+            for seed in range(seeds)
+        ]
+        yield make_row(name, scene, stride, single, tracked, len(some))
 
 
-def make_row(name: str, scene: str, stride: int, single: Outcome, tracked: Outcome, n: int) -> str:
+def make_row(
+    name: str,
+    scene: str,
+    stride: int,
+    single: Sequence[Outcome],
+    tracked: Sequence[Outcome],
+    n: int,
+) -> str:
     """Return a line of the table."""
     both = [
-        f"{x:.{digits}f}"
-        for one in (single, tracked)
-        for x, digits in ((one.add, 1), (one.add_s, 1), (one.jitter[0], 1), (one.jitter[1], 2))
+        text
+        for some in (single, tracked)
+        for text in (
+            average(some, "add"),
+            average(some, "add_s"),
+            *(
+                f"{np.mean([one.jitter[k] for one in some]):.{digits}f}"
+                for k, digits in ((0, 1), (1, 2))
+            ),
+        )
     ]
-    cells = [name, scene, str(stride), str(n), *both, str(tracked.lost), f"{single.seconds:.2f}"]
-    cells += [f"{1000 * tracked.seconds:.0f}", f"{single.seconds / tracked.seconds:.0f}"]
+    lost = f"{np.mean([one.lost for one in tracked]):.2g}"
+    once, again = (float(np.median([one.seconds for one in some])) for some in (single, tracked))
+    cells = [name, scene, str(stride), str(n), *both, lost, f"{once:.2f}"]
+    cells += [f"{1000 * again:.0f}", f"{once / again:.0f}"]
     return f"| {' | '.join(cells)} |"
 
 
 def measure_sequence(
-    estimator: posefilter.Estimator, sequence: str, frames: Sequence[VideoFrame]
+    estimator: posefilter.Estimator, sequence: str, frames: Sequence[VideoFrame], seeds: int
 ) -> str:
     """Return the row of a rendered sequence, in whose middle the object is covered.
 
-    Tracks are of the default settings, and of a random walk; each the mean over `SEEDS`.
+    Tracks are of the default settings, and of a random walk.
     """
     name, model = estimator.objects[0], estimator.object_models[0]
     shown = [n for n, frame in enumerate(frames) if name in frame.truth]
     covered = [n for n in range(shown[0], shown[-1]) if n not in shown]
+    after = [n for n in shown if n > max(covered, default=len(frames))]
     own = [frames[n] for n in shown]
-    single = judge(*_with(own, run_single(estimator, own)))
+    single = [
+        judge(*_with(own, run_single(estimator, own, seed)))
+        for seed in range(min(seeds, SINGLE_SEEDS))
+    ]
     fixed = posefilter.TrackerSettings(motion=RANDOM_WALK)
     tracks, others = (
-        [run_tracked(estimator, frames, settings, seed)[0] for seed in SEEDS]
+        [run_tracked(estimator, frames, settings, seed)[0] for seed in range(seeds)]
         for settings in (None, fixed)
     )
-    scores, before = (
+    scores, walks = (
         [judge([one[n] for n in shown], own, [0.0]) for one in results]
         for results in (tracks, others)
     )
@@ -197,21 +260,20 @@ def measure_sequence(
     back = [
         next(
             (
-                str(count)
-                for count, n in enumerate((n for n in shown if n > max(covered)), start=1)
+                count
+                for count, n in enumerate(after, start=1)
                 if one[n].is_tracked and _error(one[n], frames[n]) < 0.1 * model.diameter
             ),
-            "not again",
+            None,
         )
         for one in tracks
     ]
-    by_seed = ", ".join(f"{one.add:.1f}" for one in scores)
     cells = [name, sequence, *(f"{x:.1f}" for x in steps), str(len(frames)), str(len(covered))]
-    cells += [f"{single.add:.1f}", f"{np.mean([one.add for one in scores]):.1f}", by_seed]
-    cells += [f"{np.mean([one.add for one in before]):.1f}"]
-    cells += [", ".join(str(one.lost) for one in scores)]
-    cells += [", ".join(str(sum(one[n].is_tracked for n in covered)) for one in tracks)]
-    return f"| {' | '.join([*cells, ', '.join(back)])} |"
+    cells += [average(single, "add"), average(scores, "add"), average(walks, "add")]
+    cells += [average(single, "add_s"), average(scores, "add_s")]
+    cells += [f"{np.mean([one.lost for one in scores]):.1f}"]
+    cells += [f"{np.mean([sum(one[n].is_tracked for n in covered) for one in tracks]):.1f}"]
+    return f"| {' | '.join([*cells, describe_recovery(back)])} |"
 
 
 def _with(
@@ -300,14 +362,15 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
     write_table("together", TOGETHER, lines)
 
 
-def run_sequences(folders: Sequence[str], meshes: str, name: str) -> None:
-    """Measure rendered sequences, print and write."""
-    estimator, lines = posefilter.load(name, device="cpu"), []
-    for folder in folders:
+def run_sequences(folders: Sequence[str], meshes: str, seeds: int) -> None:
+    """Measure rendered sequences, a folder and its object each, print and write."""
+    lines = []
+    for folder, name in (pair.rsplit("=", 1) for pair in folders):
+        estimator = posefilter.load(name, device="cpu")
         reader = open_reader("fat", folder, None, open_meshes(meshes, None, "fat", [name]))
         for group in list_groups(reader):
             frames = list(SceneVideo(reader, group, [name]))
-            lines.append(measure_sequence(estimator, Path(folder).name, frames))
+            lines.append(measure_sequence(estimator, Path(folder).name, frames, seeds))
             print(lines[-1], flush=True)
     write_table("sequences", SEQUENCES, lines)
 
@@ -327,7 +390,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--frames", help="a folder of YCB-Video")
-    parser.add_argument("--sequences", nargs="+", help="folders that generate.py wrote")
+    parser.add_argument("--sequences", nargs="+", help="folders that generate.py wrote, =OBJECT")
+    parser.add_argument("--seeds", type=int, default=16, help="of tracks; --together has one")
     parser.add_argument("--meshes", required=True, help="a folder of YCB's meshes")
     parser.add_argument("--only", action="append", help="an object; can be repeated")
     parser.add_argument("--stride", type=int, action="append", help="1, and 4 of the tracks")
@@ -344,7 +408,7 @@ def main() -> None:
         run_together(options, names)
         return
     if options.sequences:
-        run_sequences(options.sequences, options.meshes, names[0])
+        run_sequences(options.sequences, options.meshes, options.seeds)
         return
     reader = open_reader(
         "ycb_video",
@@ -362,13 +426,13 @@ def main() -> None:
         for name in video.objects or ():
             estimator = posefilter.load(name, device="cpu")
             if not options.losses:
-                for row in compare(estimator, group, frames, options.stride or [1, 4]):
+                for row in compare(
+                    estimator, group, frames, options.stride or [1, 4], options.seeds
+                ):
                     rows.append(row)
                     print(row, flush=True)
             if other:
-                cells = measure_loss(estimator, frames, other)
-                cells[1] = group
-                losses.append(f"| {' | '.join(cells)} |")
+                losses.append(measure_losses(estimator, group, frames, other, options.seeds))
                 print(losses[-1], flush=True)
     if rows:
         write_table("tracks", HEAD, rows)

@@ -75,7 +75,7 @@ def test_a_track_is_aligned_as_single_images_of_the_object_are() -> None:
         (toy.filter.refine, PointToPlaneIcp().noise),
     ):
         toy.filter.refine = refine
-        icp = track._refine(1, True).components[-1]
+        icp = track._refine(1).components[-1]
         assert isinstance(icp, PointToPlaneIcp)
         assert (icp.noise, icp.prior) == (noise, TrackerSettings().icp_prior)
         assert icp.iterations < PointToPlaneIcp().iterations
@@ -306,7 +306,7 @@ class PlantedTurns(TextureTurns):
 
     def __init__(self, few: bool) -> None:
         super().__init__()
-        self.few, self.calls = few, 0
+        self.few, self.calls, self.nearby = few, 0, 0
 
     def __call__(self, belief, encoding, method, generator):  # type: ignore[no-untyped-def]
         self.calls += 1
@@ -314,6 +314,7 @@ class PlantedTurns(TextureTurns):
         return belief._replace(best=belief.best @ self.TURN, poses=scattered)
 
     def turn_nearby(self, best, encoding, method):  # type: ignore[no-untyped-def]
+        self.nearby += 1
         self.calls += not self.few
         return None if self.few else best @ self.TURN
 
@@ -344,3 +345,21 @@ def test_the_print_decides_every_so_many_frames(every: int, due: list[int]) -> N
             asked.append(number)
         texture.TURN = torch.eye(4)  # the first frame is a single image, and says nothing here
     assert asked == due
+
+
+def test_after_a_loss_the_print_decides_among_all_turns() -> None:
+    """The frame before tells nothing of them, so that those nearby are not asked for."""
+    toy, estimator = make_toy()
+    texture = PlantedTurns(few=False)
+    toy.filter.refine = Compose([texture])
+    tracker = posefilter.Tracker(estimator, TrackerSettings(texture_every=0))
+    pose, recovered = walk_pose(1)[0], []
+    for number in range(12):
+        toy.truth = None if 2 <= number < 6 else pose
+        texture.TURN = PlantedTurns.TURN if number >= 6 else torch.eye(4)
+        result = tracker.update(RGB, DEPTH, K)
+        if result.status == "recovered":
+            recovered.append(number)
+            assert off(result, pose @ PlantedTurns.TURN) < 0.01
+    assert len(recovered) == 1
+    assert texture.nearby == 0

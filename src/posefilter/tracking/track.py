@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -232,8 +233,9 @@ class Track:
         elif window is not None:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
         encoding, start = self.method.encode(batch), predicted.belief.state
-        fits, texture = settings.quadratic_fits, self._texture_is_due
-        return self._filter(batch, encoding, start, follow, fits, texture, against)
+        turns = [TurnTogether(one) for one in self._texture_turns if self._texture_is_due]
+        refine = self._refine(settings.quadratic_fits, turns)
+        return self._filter(batch, encoding, start, follow, refine, against)
 
     def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
         """Probe the whole image for a lost object, and search where that is worth it."""
@@ -241,14 +243,17 @@ class Track:
         if frame.blank or not bool(batch.depth.any()):
             return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, encoding = self.settings, self.method.encode(batch)
-        probed = self._filter(batch, encoding, predicted.belief.state, settings.probe, 0, False)
+        start = predicted.belief.state
+        probed = self._filter(batch, encoding, start, settings.probe, self._refine(0))
         if probed.presence < settings.search_above and not self._search_is_due:
             return probed
         assert probed.belief is not None
         begun, search = begin(probed.belief).belief, settings.search
         drawn = Multinomial()(begun, search.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
-        return self._filter(batch, encoding, start, search, settings.quadratic_fits, True)
+        # as in a single image: the frame before does not tell how the object is turned
+        refine = self._refine(settings.quadratic_fits, self._texture_turns)
+        return self._filter(batch, encoding, start, search, refine)
 
     def _filter(
         self,
@@ -256,13 +261,10 @@ class Track:
         encoding: Any,
         start: Tensor,
         filter_settings: FilterSettings,
-        quadratic_fits: int,
-        texture: bool,
+        refine: Refine,
         against: float = 0.0,
     ) -> FrameEstimate:
-        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them; end
-        with turns by `texture`, or without.
-        """
+        """Run a filter from poses (1, N, 4, 4), and proposals with log odds `against` them."""
         particles = min(start.shape[1], 2 * filter_settings.min_particles)
         filter = ParticleFilter(
             particles=particles,  # after the first step
@@ -273,26 +275,33 @@ class Track:
             resample=Systematic(),
             propagate=Gaussian(self.settings.move_scale),
             estimate=ModeMean(_MODE),
-            refine=self._refine(quadratic_fits, texture),
+            refine=refine,
         )
         pixels, proposals = filter_settings.pixels, filter_settings.proposals
         scorer = FrameScorer(self.method, encoding, pixels, proposals, against)
         return self._weigh(batch, filter(batch, scorer, self.generator))
 
-    def _refine(self, quadratic_fits: int, texture: bool) -> Refine:
+    def _refine(self, quadratic_fits: int, turns: Sequence[Refine] = ()) -> Refine:
         """Return what improves a frame's estimate: the likelihood, then the measured depth, then
-        the print.
+        `turns` by the print.
         """
-        # of single images, whose settings were chosen for the object
-        own = getattr(self.method.filter.refine, "components", (self.method.filter.refine,))
         parts: list[Refine] = [QuadraticFit(quadratic_fits, pixels=self.settings.fit_pixels)]
         prior = self.settings.icp_prior
         if prior and "depth" in self.method.capabilities:
-            aligned = [one for one in own if isinstance(one, PointToPlaneIcp)]
+            aligned = [one for one in self._own_refine if isinstance(one, PointToPlaneIcp)]
             noise = (aligned or [PointToPlaneIcp()])[0].noise
             parts.append(PointToPlaneIcp(iterations=_ICP_STEPS, prior=prior, noise=noise))
-        parts += [TurnTogether(one) for one in own if isinstance(one, TextureTurns) and texture]
-        return Compose(parts)
+        return Compose([*parts, *turns])
+
+    @property
+    def _own_refine(self) -> Sequence[Refine]:
+        """What refines estimates of single images: its settings were chosen for the object."""
+        own = self.method.filter.refine
+        return getattr(own, "components", (own,))
+
+    @property
+    def _texture_turns(self) -> list[TextureTurns]:
+        return [one for one in self._own_refine if isinstance(one, TextureTurns)]
 
     def _correct(
         self, predicted: State | None, belief: BeliefBatch | None, status: str
