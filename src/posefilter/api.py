@@ -100,7 +100,8 @@ def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig
     Args:
         overrides: What would be typed after the command, such as `model=patch_pf` or
             `filter.particles=100`.
-        command: One of train, evaluate, predict, generate, check_data, report and export.
+        command: One of calibrate, check_data, convert_bag, evaluate, export, generate, onboard,
+            predict, report, track and train.
 
     Returns:
         The configuration; `folder` is missing in it, since no run has begun.

@@ -1,5 +1,7 @@
 """Figures and health of a real validation, run by a filter that is told the truth."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -250,7 +252,7 @@ def test_every_second_validation_only(tmp_path: Path, monkeypatch: pytest.Monkey
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     drawn: list[int] = []
     now = [0]
-    monkeypatch.setattr(Figures, "draw", lambda self, trainer, method: drawn.append(now[0]))
+    monkeypatch.setattr(Figures, "_draw", lambda *given: drawn.append(now[0]))
     for validation in range(5):
         now[0] = validation
         figures.on_validation_epoch_start(trainer, method)
@@ -269,12 +271,15 @@ def test_drawing_that_costs_too_much_is_put_off_until_the_end(
     drawn: list[int] = []
     now = [0]
 
-    def draw(self: Figures, trainer: Trainer, method: PoseEstimator) -> None:
-        drawn.append(now[0])
-        figures.budget.last = 1.0
-        figures.budget.drawn += 1.0
+    @contextmanager
+    def spend(self: Budget) -> Iterator[None]:
+        yield
+        self.last = 1.0
+        self.drawn += 1.0
 
-    monkeypatch.setattr(Figures, "draw", draw)
+    monkeypatch.setattr(Budget, "spend", spend)
+    monkeypatch.setattr(Figures, "_draw", lambda *given: drawn.append(int(given[-1].split()[1])))
+    monkeypatch.setattr(Trainer, "global_step", property(lambda self: now[0]))
     batch = torch.utils.data.default_collate(scenes()[:2])
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
     for validation in range(11):

@@ -13,6 +13,7 @@ from posefilter.cli.arguments import (
     options_first,
     quoted,
     told_apart,
+    with_home,
 )
 from posefilter.cli.job import Job
 
@@ -226,3 +227,24 @@ def test_a_sweep_of_a_list_tells_its_jobs_apart_too() -> None:
     (named,) = told_apart(typed, "train", HOME / "conf")[2:]
     assert "data.root" not in named
     assert "exclude_keys=[out,resume," in named
+
+
+@pytest.mark.parametrize(
+    ("typed", "passed"),
+    [
+        ("out=~/runs/a", "out=/home/u/runs/a"),
+        ("'rgb=~/a b.png'".strip("'"), "rgb=/home/u/a b.png"),
+        ("checkpoint=[~/a.ckpt,~/b.ckpt]", "checkpoint=[/home/u/a.ckpt,/home/u/b.ckpt]"),
+        ("data.root=~/a,~/b", "data.root=/home/u/a,/home/u/b"),
+        ("out='~/c d'", "out='/home/u/c d'"),
+        ("~logger", "~logger"),
+        ("out=a~/b", "out=a~/b"),
+        ("name=~x", "name=~x"),
+        ("--config-dir=~/c", "--config-dir=~/c"),  # the shell's own
+    ],
+)
+def test_the_home_folder_is_written_out(
+    monkeypatch: pytest.MonkeyPatch, typed: str, passed: str
+) -> None:
+    monkeypatch.setenv("HOME", "/home/u")
+    assert with_home([typed]) == [passed]

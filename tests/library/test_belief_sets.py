@@ -206,3 +206,11 @@ def test_a_file_is_found_by_the_name_that_it_was_saved_by(tmp_path: Path) -> Non
         assert Belief.load(tmp_path / name).object == "duck"
     with pytest.raises(UserError, match="no such file"):
         Belief.load(tmp_path / "other")
+
+
+def test_what_is_no_level_and_no_camera_is_refused() -> None:
+    belief = belief_of(draw(50, 0))
+    with pytest.raises(UserError, match="quantile q is between 0 and 1"):
+        belief.marginal("x").quantile([0.1, 0.5])  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"intrinsics: have shape \(4, 4\); expected \(3, 3\)"):
+        belief.project(np.eye(4))

@@ -45,7 +45,7 @@ def test_levels_are_every_twentieth_between_none_and_all() -> None:
 def test_numbers_by_hand() -> None:
     found = collect([0.1, 0.6, 0.85, 0.99], [0.1, 0.25, 0.75, 1.0], [1.0, 2.0, 4.0, 9.0])
     assert found["log_density"] == 4
-    assert found["log_density_p50"] == 2  # of an even number the lower: half have it or more
+    assert found["log_density_p50"] == 3
     shown = [found[f"coverage_{percent}"] for percent in (50, 80, 90, 95)]
     assert shown == [25, 50, 75, 75]
     assert found["levels"] == list(LEVELS)

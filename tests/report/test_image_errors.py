@@ -13,8 +13,10 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.image_errors import FILE, ImageError, write_errors
+from posefilter.report.blocks import Text
 from posefilter.report.comparison_page import (
     judge,
+    list_settings,
     make_comparison_page,
     match_images,
     read_two_runs,
@@ -187,3 +189,20 @@ def test_what_cannot_be_compared_is_refused(pair: tuple[Path, Path], tmp_path: P
     with pytest.raises(UserError, match=r"has no errors\.csv"):
         read_two_runs(f"{pair[0]},{pair[1]}")
     assert b.errors
+
+
+def test_of_two_evaluations_what_was_typed_is_compared(pair: tuple[Path, Path]) -> None:
+    """They have no configuration of their own."""
+    for folder, particles in zip(pair, (20, 50), strict=True):
+        metrics = json.loads((folder / "metrics.json").read_text())
+        typed = [f"++filter.particles={particles}", "data.limit_test=4"]
+        metrics |= {"overrides": typed, "checkpoint": "a.ckpt"}
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+        shutil.rmtree(folder / ".hydra", ignore_errors=True)
+    a, b = read_two_runs(f"{pair[0]},{pair[1]}")
+    (note, table) = list_settings(a, b, ("A", "B"))
+    assert [[str(cell) for cell in row] for row in table.rows] == [
+        [str(Text(cell, "code")) for cell in ("filter.particles", "20", "50")]
+    ]
+    assert "what was typed" in str(note)
+    assert a.missing[0].startswith("An evaluation")

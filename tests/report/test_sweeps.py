@@ -8,6 +8,7 @@ import pytest
 
 from posefilter.errors import UserError
 from posefilter.metrics.registry import find_metric
+from posefilter.report.gather import read_run
 from posefilter.report.sweep_charts import chart_over
 from posefilter.report.sweep_page import (
     format_mean,
@@ -60,9 +61,9 @@ def test_panels_hold_means_and_ranges(sweep: Path) -> None:
 
 
 def test_cells() -> None:
-    """Means with half the range; extremes with the standard deviation."""
+    """Means and extremes with the sample's standard deviation."""
     auc, share = find_metric("add/auc"), find_metric("particles_on_object")
-    assert format_mean([1.0, 2.0, 6.0], auc) == "3.0 ± 2.5"
+    assert format_mean([1.0, 2.0, 6.0], auc) == "3.0 ± 2.6"
     assert format_mean([0.02], share) == "2.0"  # in the unit of its column
     assert format_mean([], auc) == "–"
     assert format_spread([0.01, 0.03], share) == "1.0 to 3.0 (sd 1.4)"
@@ -82,8 +83,33 @@ def test_where_scores_tie_the_median_names_the_best(sweep: Path) -> None:
         assert find_best_job(found).place["seed"] == seed
         assert find_ties(found) == ties
         head, _ = head_lines(found, find_best_job(found))
-        assert any("least median ADD" in str(part) for part in head.parts) == (ties > 1)
+        assert any("mean of 3 seeds" in str(part) for part in head.parts)
     assert first["add"]["auc"] == 83.0
+
+
+@pytest.mark.parametrize(("auc", "ties"), [(80.46, 2), (80.4, 1)])
+def test_ties_of_single_runs_are_said(tmp_path: Path, auc: float, ties: int) -> None:
+    rows = f"filter.particles,add_auc,seconds_per_image,folder\n1000,80.5,2,b\n50,{auc},1,a\n"
+    (tmp_path / "summary.csv").write_text(rows)
+    found = read_sweep(tmp_path)
+    assert find_ties(found) == ties
+    head, _ = head_lines(found, find_best_job(found))
+    assert any("least median ADD" in str(part) for part in head.parts) == (ties > 1)
+
+
+def test_one_lucky_seed_makes_no_setting_the_best(sweep: Path) -> None:
+    """The seed with the highest score of all is of a setting whose mean is lower."""
+    lucky = sweep / "filter.particles=50,refine=none,seed=0" / "metrics.json"
+    numbers = json.loads(lucky.read_text())
+    numbers["add"]["auc"] = 99.0
+    lucky.write_text(json.dumps(numbers))
+    found = read_sweep(sweep)
+    winner = find_best_job(found)
+    assert winner.place == {"filter.particles": 1000, "refine": "gradient", "seed": 2}
+    page = make_sweep_page(found, read_run(sweep / winner.folder), None, "x")
+    assert not page.tiles  # they would be of one seed
+    head, _ = head_lines(found, winner)
+    assert "seed=" not in "".join(str(part) for part in head.parts)
 
 
 def test_summary_alone_is_enough(tmp_path: Path) -> None:

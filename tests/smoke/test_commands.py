@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tests.smoke.conftest import SMALL_POSE_PF
 
 from posefilter.cli import run_command
@@ -72,6 +73,20 @@ def trained(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     ]
     assert run_command("train", HOME, typed) == 0
     return run
+
+
+def test_a_validation_is_at_the_step_that_the_model_had_come_to(trained: Path) -> None:
+    """Metrics, and what callbacks draw and log of the same validation."""
+    logged = EventAccumulator(str(trained), size_guidance={"images": 0}).Reload()
+    tags = logged.Tags()
+    validations = {event.step for event in logged.Scalars("val/add/auc")}
+    filters = [tag for tag in tags["scalars"] if tag.startswith("filter/")]
+    assert filters
+    assert {event.step for event in logged.Scalars(filters[0])} == validations
+    assert max(validations) == 8
+    assert {event.step for event in logged.Scalars("test/add/auc")} == {8}
+    for tag in tags["images"]:
+        assert max(event.step for event in logged.Images(tag)) == 8, tag  # none stays behind
 
 
 def test_a_run_leaves_what_was_promised(trained: Path) -> None:

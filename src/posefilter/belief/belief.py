@@ -252,13 +252,15 @@ class Belief:
             level: Share of the weight within the radius.
 
         Raises:
-            UserError: The points have another shape, or the level is not in [0, 1].
+            UserError: The intrinsics or points have another shape, or the level is not in [0, 1].
         """
         at = self.center if points is None else np.asarray(points, dtype=np.float64)
         if at.ndim > 2 or at.shape[-1] != 3:
             raise UserError(f"points: have shape {at.shape}; expected (P, 3)")
         at = np.atleast_2d(at)
         K = torch.from_numpy(np.asarray(intrinsics, dtype=np.float64))
+        if K.shape != (3, 3):
+            raise UserError(f"intrinsics: have shape {tuple(K.shape)}; expected (3, 3)")
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
 
     def save(self, path: str | Path) -> None:

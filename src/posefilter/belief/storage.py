@@ -43,6 +43,11 @@ def read_arrays(path: str | Path) -> dict[str, Any]:
                 raise UserError(f"{path}: is larger than a belief can be")
         with np.load(file, allow_pickle=False) as stored:
             read: dict[str, Any] = {name: stored[name] for name in stored.files}
+        if "center" not in read and "im_id" in read:
+            raise UserError(
+                f"{path}: holds the beliefs of many images, as evaluate.py writes them; read its "
+                "arrays by numpy.load (Belief.save writes one with what its methods need)"
+            )
         weights = read["weights"].astype(np.float64)
         poses = np.ascontiguousarray(read["poses"], dtype=np.float64)
         if weights.ndim != 1 or poses.shape != (len(weights), 4, 4):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -150,7 +151,7 @@ def find_quantile(values: np.ndarray, weights: np.ndarray, q: float) -> float:
 
 def check_probability(name: str, value: float) -> None:
     """Raise UserError unless a quantile or level, which the message names, is in [0, 1]."""
-    if not 0 <= value <= 1:
+    if not isinstance(value, Real | np.generic) or not 0 <= value <= 1:
         raise UserError(f"belief: the {name} is between 0 and 1, and {value} is not")
 
 

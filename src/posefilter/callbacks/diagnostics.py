@@ -70,10 +70,14 @@ class Diagnostics(TraceCallback):
             logger.log_metrics(
                 {f"diagnostics/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
             )
-        if self.budget.allows():
-            with self.budget.spend():
-                title = f"Diagnostics\nstep {trainer.global_step}"
-                post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
+        title = f"Diagnostics\nstep {trainer.global_step}"
+        self.budget.draw(
+            lambda: post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
+        )
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the last validation, if that was put off."""
+        self.budget.finish()
 
     def on_test_trace(
         self, trainer: Trainer, method: PoseEstimator, trace: Trace, batch: Batch, number: int

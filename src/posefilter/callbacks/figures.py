@@ -75,7 +75,6 @@ class Figures(TraceCallback):
         self._validations = 0
         self._selection = ImageSelection(**self.counts)
         self._example: tuple[KeptImage, Trace, Batch] | None = None
-        self._put_off = False
         self._points: Tensor | None = None
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -111,28 +110,28 @@ class Figures(TraceCallback):
         self._validations += 1
         if self._example is None:
             return
-        self._put_off = not self.budget.allows()
-        if not self._put_off:
-            self.draw(trainer, _method(pl_module))
+        if trainer.is_global_zero:
+            kept, when = self._selection.kept, f"step {trainer.global_step}"
+            method = _method(pl_module)
+            self.budget.draw(partial(self._draw, trainer, method, self._example, kept, when))
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""
-        if self._put_off:
-            self.draw(trainer, _method(pl_module))
-            self._put_off = False
+        self.budget.finish()
 
-    def draw(self, trainer: Trainer, method: PoseEstimator) -> None:
-        """Draw what was kept."""
-        if self._example is None or not trainer.is_global_zero:
-            return
-        one, trace, batch = self._example
-        with self.budget.spend(), evaluate_quietly(method):
+    def _draw(
+        self,
+        trainer: Trainer,
+        method: PoseEstimator,
+        example: tuple[KeptImage, Trace, Batch],
+        kept: dict[str, list[KeptImage]],
+        when: str,
+    ) -> None:
+        one, trace, batch = example
+        with evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
             shape, encoding = find_shape(trainer, method), method.encode(batch)
-            when = f"step {trainer.global_step}"
-            occasion = Occasion(
-                method, shape, self._selection.kept, one, trace, batch, encoding, when
-            )
+            occasion = Occasion(method, shape, kept, one, trace, batch, encoding, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)
                 if drawn is not None:

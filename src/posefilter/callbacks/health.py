@@ -61,14 +61,14 @@ class FilterHealth(TraceCallback):
             return
         for logger in trainer.loggers:
             logger.log_metrics(name_scalars(curves, self.max_iterations), trainer.global_step)
-        if self.budget.allows():
-            with self.budget.spend():
-                picture = draw_health(
-                    curves,
-                    self._images,
-                    f"Filter health\nstep {trainer.global_step}",
-                )
-                post_image(trainer, "health", picture, self.folder)
+        images, title = self._images, f"Filter health\nstep {trainer.global_step}"
+        self.budget.draw(
+            lambda: post_image(trainer, "health", draw_health(curves, images, title), self.folder)
+        )
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the last validation, if that was put off."""
+        self.budget.finish()
 
     def curves(self) -> dict[str, list[float]]:
         """Return the means over the images by name, one number an iteration."""

@@ -2,7 +2,7 @@
 
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -94,6 +94,7 @@ class Budget:
         self.max_fraction = max_fraction
         self.validated, self.drawn, self.last = 0.0, 0.0, 0.0
         self._start = 0.0
+        self._put_off: Callable[[], None] | None = None
 
     def start(self) -> None:
         """Start the clock of a validation."""
@@ -110,6 +111,19 @@ class Budget:
             or self.last == 0
             or self.drawn + self.last <= self.max_fraction * self.validated
         )
+
+    def draw(self, draw: Callable[[], None]) -> None:
+        """Draw, or put it off: until a later drawing takes its place, or to `finish`."""
+        self._put_off = draw
+        if self.allows():
+            self.finish()
+
+    def finish(self) -> None:
+        """Draw what was put off."""
+        draw, self._put_off = self._put_off, None
+        if draw is not None:
+            with self.spend():
+                draw()
 
     @contextmanager
     def spend(self) -> Iterator[None]:

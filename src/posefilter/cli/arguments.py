@@ -48,6 +48,17 @@ def without_deletion(arguments: Sequence[str]) -> list[str]:
     return [deleted.get(argument, argument) for argument in arguments]
 
 
+def with_home(arguments: Sequence[str]) -> list[str]:
+    """Return settings with the home folder for `~` before the first `/` of a path: a shell leaves
+    it where a setting is in quotes, and some shells where it is not.
+    """
+    home = str(Path.home()).replace("\\", "\\\\")
+    return [
+        a if a.startswith("-") else re.sub(r"(?<=[=,\[])(['\"]?)~(?=/)", rf"\1{home}", a)
+        for a in arguments
+    ]
+
+
 def bracketed(arguments: list[str]) -> list[str]:
     """Put brackets round the plain lists that some settings take: intrinsics=1,2,3,4 is four
     numbers, not a sweep.

@@ -63,8 +63,8 @@ def predict(job: Job) -> None:
 
 
 def predict_one(job: Job) -> list[Result]:
-    """Write pose.json, overlay.png, band.png, belief.png, belief.npz, and where asked for
-    view.rrd.
+    """Write pose.json, overlay.png, belief.png, belief.npz, band.png of an object that is there,
+    and where asked for view.rrd.
     """
     cfg, folder = job.cfg, job.folder
     costs, tolerance = read_costs(cfg), read_pose_tolerance(cfg.pose_tolerance)
@@ -78,7 +78,11 @@ def predict_one(job: Job) -> list[Result]:
     ((result,),) = collect_results([run], costs, tolerance)
     folder.mkdir(parents=True, exist_ok=True)
     save_image(result.draw_overlay(rgb, K, shape), folder / "overlay.png")
-    save_image(result.draw_band(rgb, K, shape), folder / "band.png")
+    band = folder / "band.png"
+    if result.verdict == "absent":
+        band.unlink(missing_ok=True)  # of an earlier answer
+    else:
+        save_image(result.draw_band(rgb, K, shape), band)
     save_image(result.draw_belief(rgb, K), folder / "belief.png")
     belief_file = folder / "belief.npz"
     result.belief.save(belief_file)
@@ -91,10 +95,10 @@ def predict_one(job: Job) -> list[Result]:
     files = {
         "pose": "pose.json",
         "overlay": "overlay.png",
-        "band": "band.png",
         "belief": "belief.png",
         "numbers": "belief.npz",
     }
+    files |= {"band": "band.png"} if band.is_file() else {}
     files |= {"view": VIEW} if cfg.view else {}
     following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.view else []
     ended(

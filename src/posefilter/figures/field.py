@@ -80,9 +80,7 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
         own = np.concatenate([field.planes[k].ravel(), field.turns[k].ravel()])
         low = min(float(np.percentile(own, 2)), -1e-3)
         for row, (a, b), values in zip(rows[:3], PLANES, field.planes[k], strict=True):
-            x, y = (
-                make_shift_axis(f"translation in {_NAMES[axis]} [mm]", reach) for axis in (a, b)
-            )
+            x, y = (make_shift_axis(f"along {_NAMES[axis]} [mm]", reach) for axis in (a, b))
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
                 marks.append(

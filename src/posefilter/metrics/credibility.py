@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,7 +72,8 @@ class Credibility(Rows):
         if not len(rows):
             return {}
         density, rank = rows[:, 0], rows[:, 1]
-        out = {"log_density": float(density.mean()), "log_density_p50": float(density.median())}
+        median = float(np.median(density.numpy()))
+        out = {"log_density": float(density.mean()), "log_density_p50": median}
         for percent in SHOWN:
             out[f"coverage_{percent}"] = 100 * measure_coverage(rank, percent / 100)
         return {**out, **trace_curves(rank, rows[:, 3])}

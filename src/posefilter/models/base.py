@@ -475,12 +475,20 @@ class PoseEstimator(Module):
     def on_validation_epoch_end(self) -> None:
         """Log the metrics; the best checkpoint has the highest `val/score`."""
         results = self.compute_metrics()
+        self._log_step()
         self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
         self.log("val/score", compute_checkpoint_score(results), prog_bar=True)
+
+    def _log_step(self) -> None:
+        """Have the logger put what is logged at the step that the model has come to: by itself
+        Lightning counts from 0, one less.
+        """
+        self.log("step", float(self.trainer.global_step))
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
         results = self.compute_metrics()
+        self._log_step()
         self.log_dict({f"test/{name}": value for name, value in flatten(results).items()})
 
     # -- checkpoints ------------------------------------------------------------------------------

@@ -257,9 +257,16 @@ def list_changes_of_images(pairs: Sequence[Pair], names: tuple[str, str]) -> lis
 
 def list_settings(a: Run, b: Run, names: tuple[str, str]) -> list[Block]:
     """Return the settings in which two runs differ."""
-    changed = compare_settings(a.config, b.config)
-    return (
-        [list_changes(changed, names)]
-        if changed
-        else [Paragraph([Text("None that is known.", "soft")])]
-    )
+    known = bool(a.config and b.config)
+    first, second = (run.config if known else read_typed(run.overrides) for run in (a, b))
+    changed = compare_settings(first, second)
+    note = "" if known else "Of an evaluation only what was typed is known, and compared. "
+    if not changed:
+        return [Paragraph([Text(f"{note}None that is known.", "soft")])]
+    said: list[Block] = [Paragraph([Text(note.strip(), "soft")])] if note else []
+    return [*said, list_changes(changed, names)]
+
+
+def read_typed(overrides: Sequence[str]) -> dict[str, str]:
+    """Return typed settings by their key."""
+    return dict(one.lstrip("+~").split("=", 1) for one in overrides if "=" in one)

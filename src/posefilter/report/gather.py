@@ -1,7 +1,7 @@
 """Gather what a run's folder holds; what it lacks is written down rather than fatal."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from posefilter.report.images import StoredImage, read_images
 MARKS = ("metrics.json", ".hydra/config.yaml")
 _MOST_YAML, _MOST_JSON = 1 << 20, 1 << 26  # [bytes]
 SWEEP_MARKS = ("multirun.yaml", "summary.csv")
+_NO_ERRORS = "No errors.csv: what the test found in single images is not known."
 
 # what pages compute with, and follow into
 _QUARTER = {"from": NUMBER, "to": NUMBER, "instances": NUMBER, "coverage": [NUMBER]}
@@ -83,13 +84,16 @@ def read_run(folder: Path) -> Run:
         metrics_train=read_metrics(folder / "metrics_train.json"),
         config=config,
         choices=choices,
-        overrides=read_texts(typed, "task", said)
-        or read_texts(metrics, "overrides", folder / "metrics.json"),
+        overrides=[
+            one.removeprefix("++")  # which `++` the command put there
+            for one in read_texts(typed, "task", said)
+            or read_texts(metrics, "overrides", folder / "metrics.json")
+        ],
         data=data,
         curves=curves,
         pictures=[*files, *select_unsaved(logged, files)],
         errors=read_image_errors(folder),
-        missing=list_missing(folder, bool(files or logged)),
+        missing=list_missing(folder, bool(files or logged), is_evaluation(metrics, config)),
     )
 
 
@@ -112,12 +116,21 @@ def is_sweep(folder: Path) -> bool:
     return any((folder / mark).is_file() for mark in SWEEP_MARKS)
 
 
-def list_missing(folder: Path, pictures: bool) -> list[str]:
+def is_evaluation(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+    """Tell whether a folder is of evaluate.py, and no training's."""
+    return bool(metrics.get("checkpoint")) and not config
+
+
+def list_missing(folder: Path, pictures: bool, evaluation: bool) -> list[str]:
     """Return what a run's folder lacks, and what that means."""
+    if evaluation:
+        said = "An evaluation: how its checkpoint was trained is told by the run that wrote it."
+        lacking = not (folder / FILE).is_file()
+        return [said, *([_NO_ERRORS] if lacking else [])]
     lacks = (
         ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
         (
-            "No errors.csv: what the test found in single images is not known.",
+            _NO_ERRORS,
             (folder / "metrics.json").is_file() and not (folder / FILE).is_file(),
         ),
         (

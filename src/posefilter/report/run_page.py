@@ -109,7 +109,7 @@ def head_lines(run: Run) -> list[Paragraph]:
             if train
             else "nothing logged yet"
         )
-        state += f"; numbers of the validation at step {step + 1}" if step is not None else ""
+        state += f"; numbers of the validation at step {step}" if step is not None else ""
     objects = ", ".join(run.data.get("objects") or []) or str(
         (run.config.get("data") or {}).get("object") or ""
     )

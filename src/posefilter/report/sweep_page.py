@@ -61,7 +61,10 @@ def make_sweep_page(
     ]
     over_what = ", ".join(f"{axis} ({len(sweep.values(axis))})" for axis in sweep.axes) or "nothing"
     foot = Paragraph(["Made with", Text(command, "code")])
-    title, tiles = f"Sweep {sweep.folder.resolve().name}", make_tiles(best) if best else []
+    title = f"Sweep {sweep.folder.resolve().name}"
+    # of one run: where a setting has several, its mean is what counts
+    alone = all(len(group.jobs) == 1 for group in found) or not sweep.shown
+    tiles = make_tiles(best) if best and alone else []
     return Page(
         title,
         f"Sweep over {over_what}",
@@ -90,14 +93,31 @@ def head_lines(sweep: Sweep, winner: Job) -> list[Paragraph]:
         else str(len(sweep.jobs))
     )
     badge = Text(f"{count} runs", "badge" if sweep.unfinished else "done")
+    return [
+        Paragraph([badge, "best:", *name_best(sweep, winner)]),
+        Paragraph([Text(str(sweep.folder), "code")]),
+    ]
+
+
+def name_best(sweep: Sweep, winner: Job) -> list[Cell]:
+    """Return which setting is the best: by the mean over its seeds where it has several, else by
+    its run.
+    """
+    found = group_jobs(sweep)
+    group = found[find_best_group(found)]
+    if sweep.shown and len(group.jobs) > 1:
+        figures = [
+            f"{info.label} {format_mean(group.of(info.key), info)}"
+            for info in list_metrics(sweep)[:1]
+        ]
+        why = f"({', '.join([*figures, f'mean of {len(group.jobs)} seeds'])})"
+        return [Text(spell(group.place), "code"), Text(why, "soft")]
     tied = find_ties(sweep)
-    why = (
-        [Text(f"({tied} runs have its score to one decimal; it has the least median ADD)", "soft")]
-        if tied > 1
-        else []
-    )
-    name = Text(spell(winner.place) or winner.folder, "code")
-    return [Paragraph([badge, "best:", name, *why]), Paragraph([Text(str(sweep.folder), "code")])]
+    ties = f"({tied} runs have its score to one decimal; it has the least median ADD)"
+    return [
+        Text(spell(winner.place) or winner.folder, "code"),
+        *([Text(ties, "soft")] if tied > 1 else []),
+    ]
 
 
 def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
@@ -118,7 +138,7 @@ def list_notes(sweep: Sweep, best: Run | None) -> list[str]:
 def tabulate_groups(
     sweep: Sweep, found: Sequence[Group], infos: Sequence[MetricInfo]
 ) -> list[Block]:
-    """Return a row a setting: means, with half the range over seeds."""
+    """Return a row a setting: means, with the standard deviation over seeds."""
     rows: list[list[Cell]] = [
         [
             *(Text(str(group.place[axis]), "code") for axis in sweep.shown),
@@ -129,8 +149,8 @@ def tabulate_groups(
     ]
     head = [*sweep.shown, "runs", *(info.title for info in infos)]
     say = (
-        "The best is marked. Where there are several seeds: mean ± half the range from the worst "
-        "to the best."
+        "The best is marked. Where there are several seeds: mean ± standard deviation of the "
+        "sample."
     )
     numeric = range(len(sweep.shown), len(head))
     return [
@@ -143,8 +163,8 @@ def format_mean(values: Sequence[float], info: MetricInfo) -> str:
     """Return numbers of several seeds as one cell."""
     if not values:
         return "–"
-    half = (max(values) - min(values)) / 2
-    return info.format(mean(values)) + ("" if len(values) == 1 else f" ± {info.format(half)}")
+    spread = f" ± {info.format(stdev(values))}" if len(values) > 1 else ""
+    return info.format(mean(values)) + spread
 
 
 def note_seeds(found: Sequence[Group]) -> list[Block]:

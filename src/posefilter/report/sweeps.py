@@ -224,13 +224,15 @@ def rank(jobs: Sequence[Job]) -> tuple[float, float]:
 
 
 def find_best_job(sweep: Sweep) -> Job:
-    """Return the run with the highest score; of those that tie, the one with the least median ADD.
+    """Return the run with the highest score, of those with the best setting: one lucky seed makes
+    no setting the best. Of those that tie, the one with the least median ADD.
 
     Raises UserError where every run has failed.
     """
     if not sweep.jobs:
         raise UserError(f"sweep={sweep.folder}: all of its {len(sweep.failed)} runs failed")
-    return max(sweep.jobs, key=lambda job: rank([job]))
+    found = group_jobs(sweep)
+    return max(found[find_best_group(found)].jobs, key=lambda job: rank([job]))
 
 
 def find_ties(sweep: Sweep) -> int:

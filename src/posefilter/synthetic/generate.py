@@ -316,8 +316,8 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
         remove_parts(out, [".", "mixed/*"])
     elif out.is_dir() and any(path.name != LOCK for path in out.iterdir()):
         raise UserError(
-            f"{out}: not empty, and not begun by this generator (no {GENERATOR}); "
-            f"choose another out="
+            f"{out}: not empty, and not begun by this generator (no {GENERATOR}); render into "
+            "another folder"
         )
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
