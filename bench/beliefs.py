@@ -66,7 +66,7 @@ def collect(name: str, options: Any) -> list[dict[str, Any]]:
     checkpoint = read_checkpoint(name)
     method = method_of(checkpoint, lightning=False)
     method.seed = 0
-    own = method.model.name
+    own = method.object_model.name
     words = [f"checkpoint={name}", "data=fat", f"data.root={options.root / own}"]
     words += [f"data.meshes={options.meshes}", SPLIT, "data.min_visibility_test=0.1"]
     job = compose_job("calibrate", HOME / "conf", words, Path())
@@ -81,7 +81,7 @@ def collect(name: str, options: Any) -> list[dict[str, Any]]:
             belief = method.predict_step(seen, number).belief
             variants = list_variants(belief, method.encode(seen), method, number, options)
         for variant, one in variants.items():
-            scores = score_truth(one, batch.camera_from_object, method.model)
+            scores = score_truth(one, batch.camera_from_object, method.object_model)
             ess = 1 / one.log_weights.double().exp().square().sum(1)
             columns = (scores.log_density, scores.rank, batch.visibility, ess)
             for values in zip(*(x.tolist() for x in columns), strict=True):

@@ -91,7 +91,7 @@ def look(
     method: PoseEstimator, batch: Batch, number: int, there: bool, scenes: Sequence[str]
 ) -> Iterator[Row]:
     """Run the filter on a batch, and yield a row an image; `scenes` are those of its images."""
-    model, calibration = method.model, method.calibration
+    object_model, calibration = method.object_model, method.calibration
     assert calibration is not None
     seen = Batch(*hide_annotation(batch))
     with torch.no_grad():
@@ -99,12 +99,12 @@ def look(
         values = method.collect_features(trace, seen)
     found = calibration.assess(values)
     truth_poses = batch.camera_from_object
-    errors = measure_pose_errors(trace.belief.best, truth_poses, model) if there else None
-    truths = score_truth(trace.belief, truth_poses, model) if there else None
-    shown = measure_shown(batch, model.points[:: max(1, len(model.points) // 500)])
+    errors = measure_pose_errors(trace.belief.best, truth_poses, object_model) if there else None
+    truths = score_truth(trace.belief, truth_poses, object_model) if there else None
+    shown = measure_shown(batch, object_model.points[:: max(1, len(object_model.points) // 500)])
     for i in range(len(batch.rgb)):
         off = [math.nan] * 4 if errors is None else [float(part[i]) for part in errors]
-        row: Row = {"object": model.name, "there": there, "errors": off}
+        row: Row = {"object": object_model.name, "there": there, "errors": off}
         row["right"] = bool(RIGHT.accepts(PoseErrors(*np.array(off))))
         row |= {"presence": float(found.presence[i]), "probability": float(found.probability[i])}
         row |= {"scene": scenes[i], "features": {k: float(v[i]) for k, v in values.items()}}
@@ -121,7 +121,7 @@ def look(
             weights = trace.belief.log_weights[i].double().softmax(0).numpy()
             one = Batch(*(part[i : i + 1] for part in batch))
             belief, truth = trace.belief.poses[i].double().numpy(), batch.camera_from_object[i]
-            hull = model.hull.double().numpy()
+            hull = object_model.hull.double().numpy()
             row["band"] = measure_band(belief, weights, truth.double().numpy(), hull, one)
         yield row
 
@@ -132,7 +132,7 @@ def collect(file: str, options: Any, end: float) -> bool:
         return False
     checkpoint = read_checkpoint(file)
     method = method_of(checkpoint, lightning=False)
-    name, method.seed = method.model.name, 0
+    name, method.seed = method.object_model.name, 0
     if method.calibration is None or method.calibration.conformal is None:
         raise SystemExit(f"{file}: is not calibrated, or without conformal sets")
     rows = read_rows(options.rows) if options.rows.exists() else []

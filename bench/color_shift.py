@@ -132,7 +132,7 @@ def main() -> int:
     data = PoseDataModule(
         options.source,
         options.root,
-        method.model.name,
+        method.object_model.name,
         options.meshes,
         split=split,
         limit_test=options.images,

@@ -57,12 +57,15 @@ def measure_errors(results: list[Any], truths: list[np.ndarray]) -> np.ndarray:
     """Return the ADD of each result against each truth, in diameters, (R, T)."""
     out = np.full((len(results), len(truths)), np.inf)
     for r, result in enumerate(results):
-        model, pose = result.object_model, torch.from_numpy(result.pose)
+        object_model, pose = result.object_model, torch.from_numpy(result.pose)
         for t, truth in enumerate(truths):
             error = add_up_to_symmetry(
-                pose[None], torch.from_numpy(truth)[None], model.points, model.symmetries
+                pose[None],
+                torch.from_numpy(truth)[None],
+                object_model.points,
+                object_model.symmetries,
             )
-            out[r, t] = float(error) / model.diameter
+            out[r, t] = float(error) / object_model.diameter
     return out
 
 

@@ -41,7 +41,7 @@ def measure(file: str, options: Any, end: float) -> list[dict[str, Any]]:
         job = compose_job("predict", HOME / "conf", [f"checkpoint={file}", *words], Path())
         methods[way] = method_of(checkpoint, changes(job.cfg), lightning=False)
         methods[way].seed = 0
-    name = methods["default"].model.name
+    name = methods["default"].object_model.name
     data = open_frames(file, checkpoint, name, options)
     rows = []
     for number, batch in enumerate(make_loader(data.val_dataset, 1, 0)):
@@ -53,7 +53,7 @@ def measure(file: str, options: Any, end: float) -> list[dict[str, Any]]:
             with torch.no_grad():
                 belief = method.predict_step(seen, number).belief
             seconds = time.perf_counter() - start
-            scores = score_truth(belief, batch.camera_from_object, method.model)
+            scores = score_truth(belief, batch.camera_from_object, method.object_model)
             row = {"object": name, "way": way, "number": number, "seconds": seconds}
             row |= {"rank": float(scores.rank), "log_density": float(scores.log_density)}
             rows.append(row)

@@ -36,16 +36,18 @@ def give_texture(file: Path, meshes: str) -> int:
     checkpoint = read_checkpoint(file)
     own = checkpoint["object_model"]
     mesh = open_meshes(meshes, None, "fat", [own["name"]]).load(own["name"])
-    model = add_texture(ObjectModel(**own), mesh)
-    assert model.texture is not None
-    assert model.shape_symmetries is not None
-    checkpoint["object_model"] = dict(model._replace(texture=model.texture.half())._asdict())
+    object_model = add_texture(ObjectModel(**own), mesh)
+    assert object_model.texture is not None
+    assert object_model.shape_symmetries is not None
+    checkpoint["object_model"] = dict(
+        object_model._replace(texture=object_model.texture.half())._asdict()
+    )
     refine = checkpoint["recipe"]["settings"]["filter"]["refine"]
     refine["components"] = insert_turns(refine["components"])
     checkpoint["recipe"]["choices"]["filter/refine"] = REFINE.stem
     checkpoint.pop("calibration", None)
     write_whole(file, pack_whole(checkpoint), sync=True)
-    return len(model.shape_symmetries)
+    return len(object_model.shape_symmetries)
 
 
 def main() -> None:

@@ -86,13 +86,13 @@ def judge(
     results: Sequence[Any], frames: Sequence[VideoFrame], seconds: Sequence[float]
 ) -> Outcome:
     """Return the figures of results, a frame each; what is lost counts as missed."""
-    model = results[0].object_model
+    object_model = results[0].object_model
     poses = torch.from_numpy(np.stack([one.pose for one in results]))
-    truth = torch.from_numpy(np.stack([frame.truth[model.name] for frame in frames]))
+    truth = torch.from_numpy(np.stack([frame.truth[object_model.name] for frame in frames]))
     missed = torch.tensor([not getattr(one, "is_tracked", True) for one in results])
-    errors = [f(poses, truth, model.points.double()) for f in (add, add_s)]
+    errors = [f(poses, truth, object_model.points.double()) for f in (add, add_s)]
     areas = [auc(torch.where(missed, math.inf, error)) for error in errors]
-    jitter = measure_jitter(poses, truth, model.center.double())
+    jitter = measure_jitter(poses, truth, object_model.center.double())
     return Outcome(areas[0], areas[1], jitter, int(missed.sum()), float(np.median(seconds)))
 
 

@@ -144,7 +144,7 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
     settle(None, 0)
     kept = read_checkpoint(checkpoint)
     method = method_of(kept)
-    name = method.model.name
+    name = method.object_model.name
     scenes = scenes or HOME / "docs" / "scenes" / name
     if not scenes.is_dir():
         generate(
@@ -158,23 +158,31 @@ def of_checkpoint(checkpoint: Path, scenes: Path | None, meshes: str, out: Path)
             workers=1,
         )
     store = MeshStore(meshes)
-    shape: Shape = store.load(name) if name in store.names() else method.model.hull
+    shape: Shape = store.load(name) if name in store.names() else method.object_model.hull
     found = list(run(method, kept["recipe"]["settings"]["data"], scenes, name))
     write(out / "predictions.jpg", predictions(found, method, shape))
     one = found[min(EXAMPLE, len(found) - 1)]
     sample, K = one.sample, one.sample.intrinsics
     write(
         out / "belief.jpg",
-        draw_belief(sample.rgb, K, one.trace.belief, method.model, sample.camera_from_object),
+        draw_belief(
+            sample.rgb, K, one.trace.belief, method.object_model, sample.camera_from_object
+        ),
     )
     write(out / "particles.jpg", draw_iterations(sample.rgb, K, one.trace, 0, method.space))
     searching = method_of(kept, SEARCH)
     sample, _, trace = next(
         run(searching, kept["recipe"]["settings"]["data"], scenes, name, only=BRIGHT)
     )
-    model = method.model
+    object_model = method.object_model
     frames = animate_convergence(
-        sample.rgb, sample.intrinsics, trace, model.center, model.hull, model.hull, between=5
+        sample.rgb,
+        sample.intrinsics,
+        trace,
+        object_model.center,
+        object_model.hull,
+        object_model.hull,
+        between=5,
     )
     path = out / "convergence.webp"
     path.write_bytes(encode_webp(list(frames)))
@@ -212,7 +220,7 @@ def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.n
     for sample, _, trace in found:
         height, width = sample.mask.shape
         truth = torch.from_numpy(sample.camera_from_object)[None]
-        error = 1000 * float(add(trace.belief.best, truth, method.model.points)[0])
+        error = 1000 * float(add(trace.belief.best, truth, method.object_model.points)[0])
         view = full_view(height, width, 460)
         pose = trace.belief.best[0].double().numpy()
         drawn = draw_poses(
@@ -225,7 +233,7 @@ def predictions(found: list[Found], method: PoseEstimator, shape: Shape) -> np.n
         [
             draw_row(
                 figure.shape[1],
-                f"{method.model.name}: {len(found)} held-out scenes",
+                f"{method.object_model.name}: {len(found)} held-out scenes",
                 legend,
             ),
             figure,

@@ -77,12 +77,12 @@ class Estimator:
     @property
     def objects(self) -> tuple[str, ...]:
         """The names of the objects, in the order of the results."""
-        return tuple(method.model.name for method in self.methods)
+        return tuple(method.object_model.name for method in self.methods)
 
     @property
     def object_models(self) -> tuple[ObjectModel, ...]:
         """What is known of each object: its center, size, surface points and hull."""
-        return tuple(method.model for method in self.methods)
+        return tuple(method.object_model for method in self.methods)
 
     @property
     def models(self) -> tuple[ObjectModel, ...]:

@@ -14,7 +14,7 @@ _OFF = 0.24  # of the image's size: principal points farther from its middle are
 
 def find_warnings(
     pose: np.ndarray,
-    model: ObjectModel,
+    object_model: ObjectModel,
     depth: np.ndarray,
     intrinsics: np.ndarray,
     trained_depth: tuple[float, float] | None = None,
@@ -27,7 +27,7 @@ def find_warnings(
 
     Args:
         pose: The estimate (4, 4), camera_from_object [m].
-        model: The object.
+        object_model: The object.
         depth: Measured z-depth (H, W) [m], 0 where unknown, at the network's resolution.
         intrinsics: Its camera matrix (3, 3) [px].
         trained_depth: The nearest and farthest that training saw the object's center [m].
@@ -35,7 +35,7 @@ def find_warnings(
             the inputs.
     """
     height, width = depth.shape
-    x, y, z = (pose[:3, :3] @ model.center.double().numpy() + pose[:3, 3]).tolist()
+    x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
     found = []
     known = float((depth > 0).mean())
     if known < _FEWEST:
@@ -61,7 +61,7 @@ def find_warnings(
     if z <= 0:
         return (*found, "the object would be behind the camera")
     focal = float(np.sqrt(intrinsics[0, 0] * intrinsics[1, 1]))
-    pixels = model.diameter * focal / z
+    pixels = object_model.diameter * focal / z
     scale = "is the depth in the right units (depth_scale)?"
     if pixels < _SMALLEST:
         found.append(

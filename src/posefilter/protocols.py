@@ -105,7 +105,7 @@ class HasSurfacePoints(Protocol):
     `filter/estimate=agreement`.
     """
 
-    model: ObjectModel
+    object_model: ObjectModel
 
     def surface_points(self, encoding: Encoding, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return each particle's camera point (B, N, 3) [m], and whether its depth was measured (B,
@@ -250,7 +250,7 @@ class Refine(Protocol):
 class Label(Protocol):
     """Compute the training target of each particle."""
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return a target for each particle of each step, (T, B, N) or (T, B, N, D)."""
         ...
 
@@ -258,6 +258,6 @@ class Label(Protocol):
 class Loss(Protocol):
     """A loss of a roll-out of the filter, or of scored candidates."""
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return one value an image, (B,)."""
         ...

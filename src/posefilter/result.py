@@ -312,25 +312,25 @@ def make_result(
     run: Run, image: int, costs: Costs | None = None, pose_tolerance: PoseTolerance | None = None
 ) -> Result:
     """Return what a run amounts to for one image of its batch."""
-    model, belief, found = run.method.model, run.trace.belief, run.found
+    object_model, belief, found = run.method.object_model, run.trace.belief, run.found
     calibration = None if found is None else run.method.calibration
     features = {} if found is None or found.features is None else found.features
     values = {name: float(value[image]) for name, value in features.items()}
     weights = belief.log_weights[image].double().cpu().exp().numpy()
-    center = model.center.detach().cpu().double().numpy()
+    center = object_model.center.detach().cpu().double().numpy()
     pose = belief.best[image].double().cpu().numpy()
     size = math.nan if run.size is None else float(run.size.scale[image])
     wrong_size = run.size is not None and bool(run.size.contradicts()[image])
     blank = run.blank[image] if run.blank else ""
     warnings = find_warnings(
         pose,
-        model,
+        object_model,
         run.batch.depth[image, 0].cpu().numpy(),
         run.batch.intrinsics[image].double().cpu().numpy(),
         apparent_size=size if wrong_size else None,
     )
     return Result(
-        object=model.name,
+        object=object_model.name,
         pose=pose,
         score=float(belief.score[image]),
         probability=None if found is None else float(found.probability[image]),
@@ -339,14 +339,14 @@ def make_result(
             belief.poses[image].double().cpu().numpy(),
             weights / weights.sum(),
             center,
-            float(model.radius),
-            float(model.diameter),
-            model.name,
-            model.symmetries.detach().cpu().double().numpy(),
+            float(object_model.radius),
+            float(object_model.diameter),
+            object_model.name,
+            object_model.symmetries.detach().cpu().double().numpy(),
         ),
         warnings=(blank, *warnings) if blank else warnings,
         seconds=run.seconds,
-        object_model=model,
+        object_model=object_model,
         costs=costs or Costs(),
         pose_tolerance=pose_tolerance,
         calibration=calibration,

@@ -54,7 +54,7 @@ def test_drift_is_seen_in_numbers_curves_and_files(tmp_path: Path) -> None:
     signs.update(run, batch)
     hull = torch.zeros(4, 3)
     method = SimpleNamespace(
-        scores={"diagnostics": signs}, space=PixelSpace(), model=SimpleNamespace(hull=hull)
+        scores={"diagnostics": signs}, space=PixelSpace(), object_model=SimpleNamespace(hull=hull)
     )
     callback = Diagnostics(tmp_path, images=1)
     callback.on_validation_epoch_start(trainer, method)  # type: ignore[arg-type]

@@ -96,7 +96,7 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     """
     monkeypatch.setattr("posefilter.callbacks.errors.PoseEstimator", Method)
     monkeypatch.setattr(
-        "posefilter.callbacks.errors.find_shape", lambda trainer, method: method.model.hull
+        "posefilter.callbacks.errors.find_shape", lambda trainer, method: method.object_model.hull
     )
     errors = PoseErrors([object_model()])
     records = [
@@ -106,7 +106,7 @@ def tested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, PoseE
     data = SimpleNamespace(records=lambda split: records)
     trainer: Any = SimpleNamespace(datamodule=data, is_global_zero=True, loggers=[], global_step=3)
     method: Any = Method()
-    method.model, method.capabilities = object_model(), {"pose"}
+    method.object_model, method.capabilities = object_model(), {"pose"}
     at_truth = SimpleNamespace(log_density=torch.arange(3.0), rank=torch.full((3,), 0.5))
     method.scores = {"poses": errors, "credibility": SimpleNamespace(last=lambda: at_truth)}
     method.seconds_per_image = [0.5]

@@ -56,7 +56,7 @@ def test_weights_are_copied_and_the_object_stays(model: str, tmp_path: Path) -> 
             assert torch.equal(value, own[name]), name
         if name.endswith("running_mean"):
             assert bool((value == 0.25).all()), name
-    assert new.model.name == "mug"
+    assert new.object_model.name == "mug"
 
 
 def test_exported_weights_are_read_too(tmp_path: Path) -> None:

@@ -142,8 +142,8 @@ def test_the_example_aligns_as_torch_does(
     batch = make_batch(check_images(rgb, depth, K)[0], None, None)
     icp = PointToPlaneIcp(iterations=6, prior=0.01)
     own = poses.PoseFilter.__new__(poses.PoseFilter)
-    own.center, own.radius = method.model.center.numpy(), float(method.model.radius)
-    surface = icp.choose_points(method.model.points).numpy()
+    own.center, own.radius = method.object_model.center.numpy(), float(method.object_model.radius)
+    surface = icp.choose_points(method.object_model.points).numpy()
     found = torch.from_numpy(estimator.predict(rgb, depth, K).pose).float()
     image = {"depth": batch.depth[0, 0].numpy(), "intrinsics": batch.intrinsics[0].numpy()}
     for number in range(3):
@@ -166,7 +166,7 @@ def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
     encoding = look(name, truth)
     wrong = truth @ turns[len(turns) // 3]
     given = BeliefBatch(wrong.expand(1, 20, 4, 4), torch.zeros(1, 20), wrong[None], torch.zeros(1))
-    method: Any = SimpleNamespace(model=model)
+    method: Any = SimpleNamespace(object_model=model)
     theirs = turn(given, encoding, method, torch.Generator()).best[0].numpy()
     own = poses.PoseFilter.__new__(poses.PoseFilter)
     own.center, own.radius = model.center.numpy(), float(model.radius)

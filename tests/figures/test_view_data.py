@@ -127,7 +127,9 @@ def test_every_method_with_a_pose_can_be_shown(model: str, tmp_path: Path) -> No
     batch = toy.scenes(1)
     with torch.no_grad():
         trace = method.predict_step(batch, 0)
-    shown = collect_view_data(trace, batch, method.model, method.space, method.model.hull)
+    shown = collect_view_data(
+        trace, batch, method.object_model, method.space, method.object_model.hull
+    )
     assert len(shown.moments) == 4
     for moment, particles, output in zip(
         shown.moments, trace.particles, trace.outputs, strict=False

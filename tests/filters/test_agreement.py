@@ -23,7 +23,7 @@ MODEL = ObjectModel(
 
 class Points:
     def __init__(self, point: torch.Tensor) -> None:
-        self.point, self.model = point, MODEL
+        self.point, self.object_model = point, MODEL
 
     def surface_points(
         self, encoding: None, state: torch.Tensor

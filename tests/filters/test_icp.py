@@ -51,7 +51,7 @@ def render(pose: Tensor, wall: float = 1.5) -> Tensor:
 def method(points: Tensor | None = None) -> SimpleNamespace:
     own = surface() if points is None else points
     model = SimpleNamespace(points=own, center=MIDDLE, radius=SPACE.radius)
-    return SimpleNamespace(model=model)
+    return SimpleNamespace(object_model=model)
 
 
 def belief(pose: Tensor) -> BeliefBatch:

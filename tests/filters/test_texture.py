@@ -34,12 +34,16 @@ def believe(pose: Tensor, count: int = 40) -> BeliefBatch:
     return BeliefBatch(poses, torch.full((1, count), -np.log(count)), pose[None], torch.zeros(1))
 
 
-def method(model: ObjectModel) -> SimpleNamespace:
-    return SimpleNamespace(model=model)
+def method(object_model: ObjectModel) -> SimpleNamespace:
+    return SimpleNamespace(object_model=object_model)
 
 
-def turn(belief: BeliefBatch, encoding: Seen, model: ObjectModel, **settings: float) -> BeliefBatch:
-    out = TextureTurns(**settings)(belief, encoding, method(model), Generator().manual_seed(0))  # type: ignore[arg-type]
+def turn(
+    belief: BeliefBatch, encoding: Seen, object_model: ObjectModel, **settings: float
+) -> BeliefBatch:
+    out = TextureTurns(**settings)(
+        belief, encoding, method(object_model), Generator().manual_seed(0)
+    )  # type: ignore[arg-type]
     assert torch.equal(out.score, belief.score)
     return out
 
@@ -90,17 +94,19 @@ def test_exposure_white_balance_and_light_hardly_matter() -> None:
     assert third == pytest.approx(first, rel=0.35)
 
 
-def measure_plainly(pose: Tensor, encoding: Seen, model: ObjectModel, shift: float) -> Tensor:
+def measure_plainly(
+    pose: Tensor, encoding: Seen, object_model: ObjectModel, shift: float
+) -> Tensor:
     """Return the evidence of one pose: all of the image blurred, a regression a shift."""
     color, K = encoding.measured_color[0].double(), encoding.intrinsics[0].double()
-    assert model.texture is not None
-    points, normals, own = model.texture.double().split(3, dim=1)
+    assert object_model.texture is not None
+    points, normals, own = object_model.texture.double().split(3, dim=1)
     pose = pose.double()
     at, normals = transform(pose, points), normals @ pose[:3, :3].T
     cosine = -(normals * torch.nn.functional.normalize(at, dim=-1)).sum(-1)
     pixels = project(at, K)
     z = gather_pixels(encoding.measured_depth[None].double(), nearest_pixel(pixels)[None])[0, :, 0]
-    seen = (z > 0) & ((z - at[:, 2]).abs() < 0.004 + 0.03 * model.diameter) & (cosine > 0.25)
+    seen = (z > 0) & ((z - at[:, 2]).abs() < 0.004 + 0.03 * object_model.diameter) & (cosine > 0.25)
     root = (seen * cosine).sqrt()[:, None]
     basis = root * torch.cat([torch.ones_like(root), normals], dim=1)
 
@@ -109,8 +115,8 @@ def measure_plainly(pose: Tensor, encoding: Seen, model: ObjectModel, shift: flo
         gram = basis.T @ basis + ridge * torch.eye(4, dtype=torch.float64)
         return root * values - basis @ torch.linalg.inv(gram) @ basis.T @ (root * values)
 
-    focal, spacing = float(K[0, 0]), model.radius * (4 * np.pi / 3 / len(points)) ** 0.5
-    middle = float((pose[:3, :3] @ model.center.double() + pose[:3, 3])[2])
+    focal, spacing = float(K[0, 0]), object_model.radius * (4 * np.pi / 3 / len(points)) ** 0.5
+    middle = float((pose[:3, :3] @ object_model.center.double() + pose[:3, 3])[2])
     image = (blur(color, max(0.5, 0.33 * spacing * focal / middle)) + 0.03).log()
     x, best = leave((own + 0.03).log()), 0.0
     for u in (-1, 0, 1):

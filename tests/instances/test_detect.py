@@ -30,7 +30,7 @@ class Toy:
     """Finds the brightest pixel of its color; the brighter, the more probable."""
 
     def __init__(self, channel: int, rank: float = 1.0, calibrated: bool = True) -> None:
-        self.channel, self.rank, self.model = channel, rank, MODEL
+        self.channel, self.rank, self.object_model = channel, rank, MODEL
         self.filter = SimpleFilter()
         self.calibrated, self.encoded = calibrated, 0
 

@@ -36,7 +36,7 @@ CALIBRATION = replace(CALIBRATION, choice=Logistic((5.0,), 0.0))
 class Toy:
     """Finds the pixel that is most red; with `filter.draws`, one that its generator draws."""
 
-    model = MODEL
+    object_model = MODEL
 
     def __init__(
         self, max_searches: int = 3, calibration: Calibration | None = CALIBRATION

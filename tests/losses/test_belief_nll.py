@@ -174,11 +174,11 @@ def roll_out(resample: Any, reweight: Any = None, steps: str = "last") -> Any:
         Argmax(), NoRefine(),
     )  # fmt: skip
 
-    def value(taste: Tensor, pull: Tensor, batch: Batch, model: ObjectModel) -> Tensor:
+    def value(taste: Tensor, pull: Tensor, batch: Batch, object_model: ObjectModel) -> Tensor:
         if isinstance(resample, Frozen):
             resample.turn = 0
         trace = filter(batch, Taste(taste, pull), Generator().manual_seed(5))
-        return BeliefNll({"mask": MaskDensity(0.1)}, steps)(trace, batch, model)
+        return BeliefNll({"mask": MaskDensity(0.1)}, steps)(trace, batch, object_model)
 
     return value
 

@@ -119,13 +119,15 @@ def test_the_recall_is_the_challenges() -> None:
 
 @pytest.mark.parametrize("width", [320, 640])
 def test_collected_errors_do_not_depend_on_the_images_size(width: int) -> None:
-    model = ObjectModel("rod", POINTS.float(), torch.zeros(3), 0.3, 0.4, EYE.float(), POINTS[:4])
+    object_model = ObjectModel(
+        "rod", POINTS.float(), torch.zeros(3), 0.3, 0.4, EYE.float(), POINTS[:4]
+    )
     scaled = K.clone()
     scaled[:2] *= width / 640
     truth = make_pose(torch.eye(3), torch.tensor([[0.0, 0.0, 1.0]] * 3)).double()
     guess = truth.clone()
     guess[1, 0, 3], guess[2] = 0.01, torch.nan
-    metric = BopErrors([model])
+    metric = BopErrors([object_model])
     metric.update(guess, truth, scaled.expand(3, 3, 3), width)
     found = metric.compute()
     # 0, 10 mm and a miss; of a diameter of 0.4 m: 10 of 10, 10 of 10 and none
@@ -134,6 +136,6 @@ def test_collected_errors_do_not_depend_on_the_images_size(width: int) -> None:
     assert found["mspd"]["median_px"] == pytest.approx(
         float(mspd(guess[1], truth[1], EYE, POINTS, K)), rel=1e-6
     )
-    empty = BopErrors([model]).compute()
+    empty = BopErrors([object_model]).compute()
     assert math.isnan(empty["mssd"]["ar"])
     assert math.isnan(empty["mspd"]["median_px"])

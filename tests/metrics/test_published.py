@@ -29,13 +29,13 @@ def published(real_data: Path) -> tuple[Tensor, Tensor, ObjectModel]:
     if not (root / "published").is_dir():
         pytest.skip(f"no published poses at {root / 'published'}")
     points = torch.from_numpy(np.loadtxt(root / "models" / "003_cracker_box" / "points.xyz"))
-    model = ObjectModel(
+    object_model = ObjectModel(
         "003_cracker_box", points, torch.zeros(3), 0.135, 0.2694, torch.eye(4)[None], points
     )
     return (
         poses_of(root / "published" / "posecnn_rss2018"),
         poses_of(root / "published" / "ground_truth"),
-        model,
+        object_model,
     )
 
 

@@ -57,14 +57,14 @@ def test_the_target_of_the_sides_has_an_iou_of_one() -> None:
     method, batch = working(CnnPatch, 9).eval(), half_hidden()
     height, width = batch.rgb.shape[-2:]
     whole = box_of_pose(
-        batch.camera_from_object, method.model.hull, batch.intrinsics, height, width
+        batch.camera_from_object, method.object_model.hull, batch.intrinsics, height, width
     )
     seen = torch.stack([visible_box(mask) for mask in batch.mask])
     assert box_iou(seen, whole).max() < 0.75  # the two truths differ, or nothing is tested
     candidate_sampler = Sides(OnObject())
     for box, iou in ((whole, 1.0), (seen, box_iou(seen, whole).mean().item())):
         trace = telling(method, batch, box)
-        lost = candidate_sampler(trace, batch, method.model).mean().item()
+        lost = candidate_sampler(trace, batch, method.object_model).mean().item()
         assert lost == pytest.approx(0.0, abs=1e-4) if iou == 1.0 else lost > 0.2
         method._reset()
         method.update_metrics(trace, batch)

@@ -50,7 +50,7 @@ def test_a_box_of_where_particles_are_leaves_out_the_lightest_tails() -> None:
 
     def box(quantile: float) -> list[list[float]]:
         found: list[list[float]] = QuantileBox(size=3, quantile=quantile)(
-            trace, batch, method.model
+            trace, batch, method.object_model
         ).tolist()
         return found
 
@@ -80,7 +80,7 @@ def test_a_box_that_is_voted_for_ignores_what_the_lesser_weight_says() -> None:
     boxes = torch.stack([wrong, right, wrong, right, wrong])
     # the two right ones: 0.62, and 0.4
     weights = torch.tensor([[0.10, 0.42, 0.13, 0.20, 0.15], [0.2] * 5])
-    found = VotedBox()(made(method, batch, places, weights, boxes), batch, method.model)
+    found = VotedBox()(made(method, batch, places, weights, boxes), batch, method.object_model)
     torch.testing.assert_close(found, torch.stack([right, wrong]))  # a median, so no mix of the two
     # where all differ, each side has its own order: from particle 1 on the weights add up to 0.10,
     # 0.52, ...; the tops
@@ -95,7 +95,7 @@ def test_a_box_that_is_voted_for_ignores_what_the_lesser_weight_says() -> None:
         ],
         1,
     )
-    found = VotedBox()(made(method, batch, places, weights, differ), batch, method.model)
+    found = VotedBox()(made(method, batch, places, weights, differ), batch, method.object_model)
     torch.testing.assert_close(
         found, torch.tensor([[2.0, 8.0, 32.0, 42.0], [3.0, 7.0, 33.0, 43.0]])
     )

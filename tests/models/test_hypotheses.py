@@ -78,7 +78,7 @@ def run(method: Hypotheses, count: int = 16, seed: int = 10_000) -> tuple[Trace,
     """Return traces of scenes that no training saw, and the estimates' ADD [m]."""
     batch = scenes(count, seed=seed)
     trace = method.eval().filter(batch, method, torch.Generator().manual_seed(0))
-    return trace, add(trace.belief.best, batch.camera_from_object, method.model.points)
+    return trace, add(trace.belief.best, batch.camera_from_object, method.object_model.points)
 
 
 @pytest.mark.parametrize(("kind", "steps", "most"), [
@@ -148,7 +148,7 @@ def test_planted_maps_give_back_the_pose(hidden: int, ghosts: float) -> None:
     pixels = project_keypoints(truth[:, None], keypoints, batch.intrinsics)[0][:, 0]
     method.net = Planted(pixels, hidden, ghosts)  # type: ignore[assignment]
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))
-    assert add(trace.belief.best, truth, method.model.points).median() < 0.02
+    assert add(trace.belief.best, truth, method.object_model.points).median() < 0.02
     right = method.score(trace.encoding, truth[:, None])
     assert (trace.belief.score.exp() > right[:, 0] - 0.05).all()
 
@@ -162,7 +162,7 @@ def test_maps_that_are_right_cost_nothing_and_a_flipped_one_much() -> None:
     for logits in (Planted(pixels).logits, Planted(pixels.flip(1)).logits):
         encoding = method.encode(batch)._replace(logits=logits)
         empty = Trace((), (), (), None, encoding=encoding)  # type: ignore[arg-type]
-        losses.append(method.loss(empty, batch, method.model))
+        losses.append(method.loss(empty, batch, method.object_model))
     assert losses[0].max() < 0.1
     assert losses[1].min() > 3
 

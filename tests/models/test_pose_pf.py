@@ -64,7 +64,7 @@ def error(method: PosePF, count: int = 16, more: tuple[int, int] = (0, 0)) -> to
     batch = widened(scenes(count, seed=10_000), *more)
     with torch.no_grad():
         trace = method.filter(batch, method, torch.Generator().manual_seed(0))
-    return add(trace.belief.best, batch.camera_from_object, method.model.points)
+    return add(trace.belief.best, batch.camera_from_object, method.object_model.points)
 
 
 def widened(batch: Batch, columns: int, rows: int) -> Batch:
@@ -123,7 +123,7 @@ def test_refinement_brings_the_estimate_closer(trained: PosePF) -> None:
         climb = Gradient(40, lr=4e-3, sigma=SIGMA[0], final_sigma=SIGMA[0])
         refined = Compose([Rescore(1, 256, SIGMA[0]), climb])(belief, encoding, trained, g)
     before, after = (
-        add(x, truth, trained.model.points).median() for x in (belief.best, refined.best)
+        add(x, truth, trained.object_model.points).median() for x in (belief.best, refined.best)
     )
     assert before > 0.05
     assert after < 0.6 * before

@@ -90,7 +90,7 @@ def trained() -> RotationGrid:
 def errors(method: RotationGrid) -> Tensor:
     batch = scenes(12, seed=10_000)
     trace = method.eval().filter(batch, method, torch.Generator().manual_seed(0))
-    return add(trace.belief.best, batch.camera_from_object, method.model.points)
+    return add(trace.belief.best, batch.camera_from_object, method.object_model.points)
 
 
 def test_a_short_training_finds_the_pose(trained: RotationGrid) -> None:

@@ -132,8 +132,10 @@ def _good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train", HOME / "conf", ["model=cnn_patch", "debug=smoke", "filter.particles=8"], folder
     )
     points = torch.rand(50, 3)
-    model = ObjectModel("carton", points, points.mean(0), 0.5, 1.0, torch.eye(4)[None], points[:8])
-    method = build_method(recipe(job), model)
+    object_model = ObjectModel(
+        "carton", points, points.mean(0), 0.5, 1.0, torch.eye(4)[None], points[:8]
+    )
+    method = build_method(recipe(job), object_model)
     content = {"state_dict": method.state_dict(), "global_step": 3, "epoch": 0}
     method.on_save_checkpoint(content)
     torch.save(content, folder / "good.ckpt")

@@ -92,7 +92,7 @@ def test_a_method_larger_than_its_weights_is_not_allocated(
 def test_the_good_checkpoint_is_read(good: Path, watch: Any) -> None:
     with watch:
         method = method_of(read_checkpoint(good))
-    assert method.model.name == "carton"
+    assert method.object_model.name == "carton"
 
 
 def test_what_the_user_resolves_is_resolved_before_it_is_kept(

@@ -88,8 +88,8 @@ def test_it_goes_on_after_an_interruption(
     from posefilter import load
 
     (method,) = load(out / "brick.ckpt").methods
-    model = method.model
+    object_model = method.object_model
     assert method.calibration.counts["absent"] == 3
     assert method.calibration.counts["right"] + method.calibration.counts["wrong"] == 3
-    assert model.name == "brick"
-    assert len(model.symmetries) == 8
+    assert object_model.name == "brick"
+    assert len(object_model.symmetries) == 8

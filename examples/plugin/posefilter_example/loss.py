@@ -17,7 +17,7 @@ class Brier:
     def __init__(self, label: Label) -> None:
         self.label = label
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return one value an image, (B,)."""
-        target = self.label(trace, batch, model)[-1]
+        target = self.label(trace, batch, object_model)[-1]
         return (trace.outputs[-1].log_likelihood.exp() - target).square().mean(1)

@@ -46,4 +46,4 @@ class ColorWalk(PoseEstimator):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return where the particles are, (B, 4) [px]."""
-        return QuantileBox(size=9)(trace, batch, self.model)
+        return QuantileBox(size=9)(trace, batch, self.object_model)

@@ -100,7 +100,12 @@ def particles(o: Occasion) -> Drawn:
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
     return draw_belief(
-        o.one.rgb, o.one.intrinsics, o.trace.belief, o.method.model, o.one.truth, o.title("Belief")
+        o.one.rgb,
+        o.one.intrinsics,
+        o.trace.belief,
+        o.method.object_model,
+        o.one.truth,
+        o.title("Belief"),
     )
 
 
@@ -109,7 +114,7 @@ def silhouettes(o: Occasion) -> Drawn:
     """Draw the silhouettes of particles that are poses."""
     title = o.title("Silhouettes")
     return draw_silhouettes(
-        o.one.rgb, o.one.intrinsics, o.trace, o.method.model.hull.cpu(), o.one.truth, title
+        o.one.rgb, o.one.intrinsics, o.trace, o.method.object_model.hull.cpu(), o.one.truth, title
     )
 
 
@@ -117,11 +122,15 @@ def silhouettes(o: Occasion) -> Drawn:
 def field(o: Occasion) -> Drawn:
     """Draw slices of the score about the truth."""
     assert isinstance(o.method, ScoresPoses)
-    model = o.method.model
+    object_model = o.method.object_model
     found = evaluate_pose_field(
-        o.method, o.encoding, o.batch.camera_from_object[0], model, choose_levels(o.trace.steps)
+        o.method,
+        o.encoding,
+        o.batch.camera_from_object[0],
+        object_model,
+        choose_levels(o.trace.steps),
     )
-    center = model.center.cpu().double().numpy()
+    center = object_model.center.cpu().double().numpy()
     shift = (
         (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center
         + o.one.estimate[:3, 3]
@@ -138,22 +147,22 @@ def points(o: Occasion) -> Drawn:
     likelihood = getattr(o.method, "likelihood", None)
     if not isinstance(likelihood, ScoresPoints):
         return None
-    model, truth = o.method.model, o.batch.camera_from_object[0]
+    object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
     slices = [
         evaluate_point_field(
             likelihood,
             o.encoding.image,
             truth,
-            model,
+            object_model,
             pixel,
             on,
             choose_levels(o.trace.steps),
             depthwise,
         )
-        for pixel, on in choose_pixels(o.batch, model)
+        for pixel, on in choose_pixels(o.batch, object_model)
         for depthwise in ((False, True) if on else (False,))
     ]
-    surface = (model.points - model.center).cpu().double().numpy()
+    surface = (object_model.points - object_model.center).cpu().double().numpy()
     return (
         draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
         if slices
@@ -166,12 +175,18 @@ def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
     if not isinstance(o.method, ProposesPoses):
         return None
-    predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.model)
+    predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.object_model)
     if predicted is None:
         return None
     title = o.title("Proposals")
     return draw_proposals(
-        predicted, o.one.rgb, o.one.intrinsics, o.one.truth, o.shape, o.method.model.radius, title
+        predicted,
+        o.one.rgb,
+        o.one.intrinsics,
+        o.one.truth,
+        o.shape,
+        o.method.object_model.radius,
+        title,
     )
 
 
@@ -222,7 +237,7 @@ class AnimatedScene(NamedTuple):
 
 def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: str) -> bytes:
     """Animate the filter on one image, whose trace this is.  -> a GIF."""
-    hull, K = method.model.hull.cpu(), scene.intrinsics
+    hull, K = method.object_model.hull.cpu(), scene.intrinsics
     posed = isinstance(method.space, PoseSpace)
     target = (
         outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))

@@ -57,7 +57,7 @@ def evaluate_pose_field(
     method: ScoresPoses,
     encoding: Encoding,
     truth: Tensor,
-    model: ObjectModel,
+    object_model: ObjectModel,
     sigmas: Sequence[float],
     pixels: int = 48,
     cells: int = 9,
@@ -69,12 +69,14 @@ def evaluate_pose_field(
     so that the truth is its middle. Slices go as far as six noise levels, at least a quarter of the
     object's radius and at most twice it.
     """
-    center = model.center.to(truth)
+    center = object_model.center.to(truth)
     degrees = torch.tensor(
         sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()})
     )
     about = turn_pose(truth, center, degrees.to(truth) * math.pi / 180)
-    reaches = tuple(min(max(6 * sigma, model.radius / 4), 2 * model.radius) for sigma in sigmas)
+    reaches = tuple(
+        min(max(6 * sigma, object_model.radius / 4), 2 * object_model.radius) for sigma in sigmas
+    )
     planes, turns = [], []
     for sigma, reach in zip(sigmas, reaches, strict=True):
         poses = torch.cat(
@@ -118,7 +120,7 @@ def evaluate_point_field(
     likelihood: ScoresPoints,
     image: Pixels,
     truth: Tensor,
-    model: ObjectModel,
+    object_model: ObjectModel,
     pixel: tuple[int, int],
     on: bool,
     sigmas: Sequence[float],
@@ -130,11 +132,11 @@ def evaluate_point_field(
     The slice goes through where the pixel lies under the truth (4, 4), across the viewing ray, or
     (`depthwise`) along it: it is spanned by the two object axes that lie best so.
     """
-    points = make_point(pixel, image, truth, model)
-    place, center = points.position[0, 0, 0], model.center.to(points.position)
+    points = make_point(pixel, image, truth, object_model)
+    place, center = points.position[0, 0, 0], object_model.center.to(points.position)
     order = points.ray[0, 0, 0].abs().argsort().tolist()  # the axis most along the ray comes last
     plane = (min(order[1:]), max(order[1:])) if depthwise else (min(order[:2]), max(order[:2]))
-    reach = 1.3 * model.radius
+    reach = 1.3 * object_model.radius
     line = torch.linspace(-reach, reach, cells, dtype=truth.dtype, device=truth.device)
     places = place.expand(cells, cells, 3).clone()
     places[..., plane[0]], places[..., plane[1]] = line[None, :], line[:, None]
@@ -146,10 +148,12 @@ def evaluate_point_field(
     )
     if image.context is not None:  # what the proposal network says of the place that is asked for
         u, v = (torch.full((1, 1, len(asked)), float(x), device=truth.device) for x in pixel)
-        many = many._replace(context=query(image.context, u, v, many.position / model.radius))
+        many = many._replace(
+            context=query(image.context, u, v, many.position / object_model.radius)
+        )
     found = torch.stack(
         [
-            likelihood.score_points(many, sigma, center, model.radius)[0, 0].float().cpu()
+            likelihood.score_points(many, sigma, center, object_model.radius)[0, 0].float().cpu()
             for sigma in sigmas
         ]
     ).numpy()
@@ -159,21 +163,23 @@ def evaluate_point_field(
     )
 
 
-def make_point(pixel: tuple[int, int], image: Pixels, truth: Tensor, model: ObjectModel) -> Points:
+def make_point(
+    pixel: tuple[int, int], image: Pixels, truth: Tensor, object_model: ObjectModel
+) -> Points:
     """Return one pixel (u, v) of one image as a point that the truth (4, 4) looks at.  -> Points
     (1, 1, 1).
     """
-    center = model.center.to(truth)
+    center = object_model.center.to(truth)
     middle = origin_of(truth, center)
-    reach = model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
+    reach = object_model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
     # what `sample_points` will undo
     noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach
     return sample_points(
-        image, truth[None, None], center, model.radius, noise[None, None, None], spread=1.0
+        image, truth[None, None], center, object_model.radius, noise[None, None, None], spread=1.0
     )
 
 
-def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
+def choose_pixels(batch: Batch, object_model: ObjectModel) -> list[tuple[tuple[int, int], bool]]:
     """Choose pixels of known depth in one image: one well on the object, and one off it but near;
     (u, v), and which it is.
 
@@ -188,14 +194,16 @@ def choose_pixels(batch: Batch, model: ObjectModel) -> list[tuple[tuple[int, int
     grid = pixel_grid(H, W, device=batch.depth.device).reshape(1, -1, 2)
     points = back_project(grid, batch.depth.flatten(1), batch.intrinsics)
     away = (
-        (transform(invert(batch.camera_from_object), points)[0] - model.center.to(points))
+        (transform(invert(batch.camera_from_object), points)[0] - object_model.center.to(points))
         .norm(dim=-1)
         .cpu()
         .numpy()
     )
     off = (distance_transform_edt(~mask) > 4) & known
     if off.any():
-        best.append(int(np.where(off.reshape(-1), np.abs(away - model.radius), np.inf).argmin()))
+        best.append(
+            int(np.where(off.reshape(-1), np.abs(away - object_model.radius), np.inf).argmin())
+        )
     return [((i % W, i // W), number == 0) for number, i in enumerate(best)]
 
 
@@ -203,24 +211,27 @@ def predict_proposals(
     method: ProposesPoses,
     encoding: HasCoordinates,
     batch: Batch,
-    model: ObjectModel,
+    object_model: ObjectModel,
     drawn: int = 24,
 ) -> Proposals | None:
     """Return what the proposal network makes of one image; None where no depth is known."""
     if not bool(encoding.cells.valid.any()):
         return None
-    center = model.center.to(batch.depth)
+    center = object_model.center.to(batch.depth)
     generator = torch.Generator(device=batch.depth.device).manual_seed(0)
     poses = method.propose_poses(encoding, drawn, generator)[0].cpu().double()
     axes = project_axes(
-        poses, model.center.cpu().double(), 0.5 * model.radius, batch.intrinsics[0].cpu().double()
+        poses,
+        object_model.center.cpu().double(),
+        0.5 * object_model.radius,
+        batch.intrinsics[0].cpu().double(),
     )
     truth, _, usable = true_coordinates(
-        encoding.cells, batch.mask, batch.camera_from_object, center, model.radius
+        encoding.cells, batch.mask, batch.camera_from_object, center, object_model.radius
     )
     true, on = truth[0], usable[0]
     chance, coordinate = encoding.coordinates.logit[0].sigmoid(), encoding.coordinates.coordinate[0]
     off = (coordinate - true).norm(dim=-1)[on]
-    error = model.radius * float(off.mean()) if len(off) else math.nan
+    error = object_model.radius * float(off.mean()) if len(off) else math.nan
     arrays = [x.detach().cpu().numpy() for x in (chance, coordinate, true, on)]
     return Proposals(arrays[0], arrays[1], arrays[2], arrays[3], axes, error)

@@ -89,7 +89,7 @@ class Figures(TraceCallback):
         if self._validations % self.every_n_validations:
             return
         if self._points is None:
-            self._points = subsample(method.model.points, 256).to(batch.rgb.device)
+            self._points = subsample(method.object_model.points, 256).to(batch.rgb.device)
         errors = compute_errors(trace, batch, method, self._points).tolist()
         for i, error in enumerate(errors):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))

@@ -128,9 +128,9 @@ def find_shape(trainer: Trainer, method: PoseEstimator) -> Shape:
     method carries.
     """
     store = getattr(getattr(trainer, "datamodule", None), "meshes", None)
-    if isinstance(store, MeshStore) and store.has(method.model.name):
-        return store.load(method.model.name)
-    return method.model.hull
+    if isinstance(store, MeshStore) and store.has(method.object_model.name):
+        return store.load(method.object_model.name)
+    return method.object_model.hull
 
 
 def draw_gallery(

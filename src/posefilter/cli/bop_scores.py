@@ -53,11 +53,11 @@ def assign_estimates(
             if known:
                 out[own[0].key] = known[0]
             continue
-        model = data.object_model(data.objects.index(own[0].object))
+        object_model = data.object_model(data.objects.index(own[0].object))
         samples = [data.reader.read(place[record.key]) for record in own]
         truths, poses = _stack_poses(samples, known, data.reader)
-        points = torch.cat([model.hull, model.points]).double()
-        errors = _pair(mssd, poses, truths, densify(model.symmetries.double()), points)
+        points = torch.cat([object_model.hull, object_model.points]).double()
+        errors = _pair(mssd, poses, truths, densify(object_model.symmetries.double()), points)
         out |= {own[t].key: known[e] for e, t in match_greedily(errors, np.inf)}
     return out
 
@@ -152,10 +152,10 @@ class _Judge:
             name = self.data.objects[index]
             if name not in self.data.meshes.names():
                 raise UserError(f"data.meshes: has no {name}, which VSD renders; name the meshes")
-            mesh, model = self.data.meshes.load(name), self.data.object_model(index)
+            mesh, object_model = self.data.meshes.load(name), self.data.object_model(index)
             points = torch.from_numpy(hull_vertices(mesh.vertices)).double()
-            symmetries = densify(model.symmetries.double())
-            self._known[index] = mesh, symmetries, points, float(model.diameter)
+            symmetries = densify(object_model.symmetries.double())
+            self._known[index] = mesh, symmetries, points, float(object_model.diameter)
         return self._known[index]
 
 

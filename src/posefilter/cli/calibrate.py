@@ -61,7 +61,7 @@ def calibrate(job: Job) -> None:
     checkpoint = read_checkpoint(cfg.checkpoint)
     check_out(checkpoint, file, out, cfg.replace)
     method = method_of(checkpoint, lightning=False)
-    name = method.model.name
+    name = method.object_model.name
     if "pose" not in method.capabilities:
         raise UserError(
             f"checkpoint={cfg.checkpoint}: {type(method).__name__} detects {name}, and estimates "
@@ -130,9 +130,9 @@ def collect_frames(
         nothing = np.full(len(truth), np.nan)
         off, surprise = PoseErrors(*[nothing] * 4), nothing
         if is_there:
-            measured = measure_pose_errors(trace.belief.best.cpu(), truth, method.model)
+            measured = measure_pose_errors(trace.belief.best.cpu(), truth, method.object_model)
             off = PoseErrors(*(part.double().numpy() for part in measured))
-            surprise = score_truth(trace.belief, truth, method.model).nonconformity.numpy()
+            surprise = score_truth(trace.belief, truth, method.object_model).nonconformity.numpy()
         errors.append(off)
         scores.append(surprise)
     return make_frames(values, there, errors, scores)
@@ -191,7 +191,7 @@ def tell(job: Job, method: PoseEstimator, calibration: Calibration, out: Path) -
     infos = {key: find_metric(f"confidence/{key}") for key in _SHOWN if key in quality}
     rows += [(info.label, info.describe(quality[key])) for key, info in infos.items()]
     if job.cfg.console != JSON:
-        show_table(f"{method.model.name}: held-out parts of the calibration frames", rows)
+        show_table(f"{method.object_model.name}: held-out parts of the calibration frames", rows)
     following = [typed_prediction(out)]
-    content = {"object": method.model.name, "counts": dict(counts), "quality": dict(quality)}
+    content = {"object": method.object_model.name, "counts": dict(counts), "quality": dict(quality)}
     ended(job.cfg.console, "calibrated", {"weights": out}, following, **content)

@@ -41,13 +41,13 @@ def recipe(job: Job) -> dict[str, Any]:
 
 
 def build_method(
-    recipe: dict[str, Any], model: ObjectModel | None = None, lightning: bool = True
+    recipe: dict[str, Any], object_model: ObjectModel | None = None, lightning: bool = True
 ) -> PoseEstimator:
     """Build the method of a recipe.
 
     Args:
         recipe: Of a checkpoint, or of `recipe`.
-        model: Its object, where it is known.
+        object_model: Its object, where it is known.
         lightning: Whether it is a LightningModule; False for prediction alone, which is seconds
             sooner there.
     """
@@ -67,8 +67,8 @@ def build_method(
     if not isinstance(method, PoseEstimator):
         raise UserError(f"model: is a {type(method).__name__}, not a method")
     method.recipe = recipe
-    if model is not None:
-        method.set_object(model)
+    if object_model is not None:
+        method.set_object(object_model)
     return method
 
 

@@ -103,10 +103,11 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         method.calibration.fit_success(method.pose_tolerance)  # refused before anything is tested
     check_links(job.folder)
     data = build_data(
-        data_settings(job, checkpoint["recipe"]["settings"], method.model.name), job.cfg.console
+        data_settings(job, checkpoint["recipe"]["settings"], method.object_model.name),
+        job.cfg.console,
     )
     data.setup("test")
-    method.set_object(object_to_judge(data, method.model))
+    method.set_object(object_to_judge(data, method.object_model))
     warn_of_several(data, job.cfg.console)
     records = Records(beliefs=True)
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]

@@ -72,7 +72,7 @@ def predict_one(job: Job) -> list[Result]:
     estimator = Estimator([method], pose_tolerance=tolerance)
     rgb, depth = read_photograph(cfg.rgb, cfg.depth, cfg.depth_scale)
     K = read_intrinsics(cfg.intrinsics)
-    shape = load_shape(open_shapes(cfg, [method.model.name]), method.model)
+    shape = load_shape(open_shapes(cfg, [method.object_model.name]), method.object_model)
     images, _ = check_images(rgb, depth, K)
     (run,) = estimator.run(images, cfg.seed)
     ((result,),) = collect_results([run], costs, tolerance)
@@ -134,7 +134,7 @@ def predict_several(job: Job) -> list[Result]:
     save_image(draw_detections(rgb, K, drawn, absent), folder / "overlay.png")
     checkpoints = expand_weights(cfg.checkpoint)
     own = dict(zip(estimator.objects, checkpoints, strict=True))
-    scores = {one.model.name: one.filter.score_is for one in estimator.methods}
+    scores = {one.object_model.name: one.filter.score_is for one in estimator.methods}
     answers = []
     for number, result in enumerate(results):
         file = beliefs / f"{number:02d}_{result.object}.npz"
@@ -171,7 +171,7 @@ def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow
 def record_view(run: Run, shape: Any, path: Path) -> None:
     """Write the interactive 3-D view."""
     method = run.method
-    record(collect_view_data(run.trace, run.batch, method.model, method.space, shape), path)
+    record(collect_view_data(run.trace, run.batch, method.object_model, method.space, shape), path)
 
 
 def read_costs(cfg: DictConfig) -> Costs:

@@ -27,7 +27,7 @@ def open_shapes(cfg: DictConfig, objects: Sequence[str]) -> MeshStore | None:
     return MeshStore(cfg.meshes, scale=scale)
 
 
-def load_shape(store: MeshStore | None, model: ObjectModel) -> Shape:
+def load_shape(store: MeshStore | None, object_model: ObjectModel) -> Shape:
     """Return what to draw of an object: its mesh, or the checkpoint's hull where there are none.
 
     Raises:
@@ -35,9 +35,9 @@ def load_shape(store: MeshStore | None, model: ObjectModel) -> Shape:
             object.
     """
     if store is None:
-        return model.hull
-    mesh = store.load(model.name)
-    ratio = diameter(mesh.vertices) / model.diameter
+        return object_model.hull
+    mesh = store.load(object_model.name)
+    ratio = diameter(mesh.vertices) / object_model.diameter
     if 1 / _SAME < ratio < _SAME:
         return mesh
     fitting = [
@@ -47,7 +47,8 @@ def load_shape(store: MeshStore | None, model: ObjectModel) -> Shape:
     ]
     cause = f"give {fitting[0]}" if fitting else "is it a mesh of another object?"
     raise UserError(
-        f"meshes={store.root}: {model.name} is {1000 * ratio * model.diameter:.3g} mm across with "
+        f"meshes={store.root}: {object_model.name} is "
+        f"{1000 * ratio * object_model.diameter:.3g} mm across with "
         f"mesh_scale={store.scale:g}, and the checkpoint's object "
-        f"{1000 * model.diameter:.0f} mm; {cause}"
+        f"{1000 * object_model.diameter:.0f} mm; {cause}"
     )

@@ -124,7 +124,9 @@ def follow(
 ) -> None:
     """Track the objects through one video, write its pictures, and log its rows as they come."""
     methods = [
-        m for m in estimator.methods if video.objects is None or m.model.name in video.objects
+        m
+        for m in estimator.methods
+        if video.objects is None or m.object_model.name in video.objects
     ]
     if not methods:
         return

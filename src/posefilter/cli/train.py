@@ -76,10 +76,10 @@ def build(job: Job) -> Run:
     method, trainer = build_method(recipe(job)), build_trainer(job)
     data = build_data(job.cfg.data, job.cfg.console)
     data.setup("fit")
-    model = data.object_to_learn()
-    method.set_object(model)
+    object_model = data.object_to_learn()
+    method.set_object(object_model)
     if job.cfg.warm_start:
-        starts = read_starts(job.cfg.warm_start, model.name)
+        starts = read_starts(job.cfg.warm_start, object_model.name)
         copied, left = warm_start(method, starts)
         log.info(
             "warm start from %s (%d files): %d tensors copied, %d left as drawn",

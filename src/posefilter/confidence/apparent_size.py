@@ -42,7 +42,7 @@ class ApparentSize(NamedTuple):
 
 
 def measure_apparent_size(
-    best: Tensor, coordinates: Coordinates, cells: Cells, model: ObjectModel
+    best: Tensor, coordinates: Coordinates, cells: Cells, object_model: ObjectModel
 ) -> ApparentSize:
     """Measure how large the object appears, by the profile likelihood of the scale.
 
@@ -54,9 +54,11 @@ def measure_apparent_size(
         best: (B, 4, 4) camera_from_object [m], the estimates.
         coordinates: The network's output.
         cells: The measured point of each cell.
-        model: The object.
+        object_model: The object.
     """
-    found = [_measure(best[i], _seen(coordinates, cells, i), model) for i in range(len(best))]
+    found = [
+        _measure(best[i], _seen(coordinates, cells, i), object_model) for i in range(len(best))
+    ]
     return ApparentSize(*(torch.stack(part) for part in zip(*found, strict=True)))
 
 
@@ -79,7 +81,7 @@ def _seen(coordinates: Coordinates, cells: Cells, image: int) -> _Seen:
     return _Seen(member[which], share, points, measured)
 
 
-def _measure(pose: Tensor, seen: _Seen, model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
+def _measure(pose: Tensor, seen: _Seen, object_model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
     """Return scale, gain and share of one image."""
     member, share, points, measured = seen
     if len(member) < _FEWEST:
@@ -87,8 +89,10 @@ def _measure(pose: Tensor, seen: _Seen, model: ObjectModel) -> tuple[Tensor, Ten
     exponents = torch.linspace(math.log(_LEAST), math.log(_MOST), _STEPS, device=pose.device)
     scales = exponents.exp().to(pose)  # 1 is the middle one
     turned = scales[:, None, None, None] * (points @ rotation_of(pose).mT)  # (S, cells, K, 3)
-    away = measured[:, None] / model.radius - turned  # where each fragment puts the center
-    center = (origin_of(pose, model.center.to(pose)) / model.radius).expand(len(scales), 3)
+    away = measured[:, None] / object_model.radius - turned  # where each fragment puts the center
+    center = (origin_of(pose, object_model.center.to(pose)) / object_model.radius).expand(
+        len(scales), 3
+    )
     for _ in range(_ROUNDS):
         each = share - (away - center[:, None, None]).square().sum(-1) / (2 * _NOISE**2)
         whole = each.logsumexp(-1)

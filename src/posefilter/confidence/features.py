@@ -26,26 +26,26 @@ _CELLS = 6  # of the network, that a small object covers
 _NEAREST = 0.01  # [m] points before the camera's plane
 
 
-def measure_belief(belief: BeliefBatch, model: ObjectModel) -> dict[str, Tensor]:
+def measure_belief(belief: BeliefBatch, object_model: ObjectModel) -> dict[str, Tensor]:
     """Return how the particles agree with the estimate.
 
     Args:
         belief: B beliefs.
-        model: The object.
+        object_model: The object.
 
     Returns:
         (B,) each. `score`: the estimate's log-likelihood. `concentration`: the negative logarithm
         of the particles' root mean square distance from the estimate (`PoseSpace`), in diameters.
     """
-    x, y, z = model.center.tolist()
-    space = PoseSpace((x, y, z), model.radius)
+    x, y, z = object_model.center.tolist()
+    space = PoseSpace((x, y, z), object_model.radius)
     weights = belief.log_weights.exp()
-    distance = space.distance(belief.poses, belief.best[:, None]) / model.diameter
+    distance = space.distance(belief.poses, belief.best[:, None]) / object_model.diameter
     spread = (weights * distance.square()).sum(1).sqrt()
     return {"score": belief.score, "concentration": -spread.clamp(1e-3, 1e3).log()}
 
 
-def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, Tensor]:
+def measure_depth(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict[str, Tensor]:
     """Return whether the depth shows a surface where poses put the object's.
 
     A surface point whose pixel shows a surface at its own depth agrees; one before which something
@@ -55,18 +55,18 @@ def measure_depth(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, T
     Args:
         best: (B, 4, 4) camera_from_object [m].
         batch: B images.
-        model: The object.
+        object_model: The object.
 
     Returns:
         (B,) each. `surface`: the share of the points that agree. `free_space`: of those that agree
         or are seen through, the share that agrees.
     """
-    points = transform(best, subsample(model.points, _POINTS).to(best))
+    points = transform(best, subsample(object_model.points, _POINTS).to(best))
     pixels = nearest_pixel(project(points, batch.intrinsics))
     depth = gather_pixels(batch.depth, pixels)[..., 0]  # 0 off the frame
     known = (depth > 0) & (points[..., 2] > _NEAREST)
     behind = depth - points[..., 2]  # what is measured lies so far behind the point
-    tolerance = _NOISE + 0.05 * model.diameter
+    tolerance = _NOISE + 0.05 * object_model.diameter
     agrees = (known & (behind.abs() < tolerance)).float().mean(1)
     through = (known & (behind >= tolerance)).float().mean(1)
     few = 1 / points.shape[1]
@@ -81,26 +81,26 @@ class _Image(NamedTuple):
     intrinsics: Tensor
 
 
-def measure_print(best: Tensor, batch: Batch, model: ObjectModel) -> dict[str, Tensor]:
+def measure_print(best: Tensor, batch: Batch, object_model: ObjectModel) -> dict[str, Tensor]:
     """Return whether the image shows the object's print where poses put it.
 
     Args:
         best: (B, 4, 4) camera_from_object [m].
         batch: B images.
-        model: The object.
+        object_model: The object.
 
     Returns:
         (B,) `texture`: the logarithm of one plus the evidence of the print [nat]. Nothing where the
         object has no texture.
     """
-    if model.texture is None:
+    if object_model.texture is None:
         return {}
     image = _Image(batch.rgb, batch.depth[:, 0], batch.intrinsics)
-    return {"texture": measure_texture(best[:, None], image, model)[:, 0].log1p()}
+    return {"texture": measure_texture(best[:, None], image, object_model)[:, 0].log1p()}
 
 
 def measure_coordinates(
-    best: Tensor, coordinates: Coordinates, cells: Cells, model: ObjectModel
+    best: Tensor, coordinates: Coordinates, cells: Cells, object_model: ObjectModel
 ) -> dict[str, Tensor]:
     """Return whether the network of dense object coordinates sees the object where poses put it.
 
@@ -110,7 +110,7 @@ def measure_coordinates(
         best: (B, 4, 4) camera_from_object [m].
         coordinates: The network's output.
         cells: The measured point of each cell.
-        model: The object.
+        object_model: The object.
 
     Returns:
         (B,) each. `mask_precision`: of the cells that the network takes for the object, by its
@@ -122,11 +122,11 @@ def measure_coordinates(
     """
     share = torch.sigmoid(coordinates.logit).flatten(1) * cells.valid.flatten(1)
     points = transform(invert(best), cells.point.flatten(1, 2))
-    surface = subsample(model.points, _POINTS).to(best)
+    surface = subsample(object_model.points, _POINTS).to(best)
     nearest = torch.cdist(points, surface.expand(len(best), -1, -1)).amin(-1)
-    on = (nearest < _NOISE + 0.08 * model.diameter) & cells.valid.flatten(1)
+    on = (nearest < _NOISE + 0.08 * object_model.diameter) & cells.valid.flatten(1)
     predicted = coordinates.coordinate.flatten(1, 2)
-    error = (predicted - (points - model.center.to(best)) / model.radius).norm(dim=-1)
+    error = (predicted - (points - object_model.center.to(best)) / object_model.radius).norm(dim=-1)
     total, few = share.sum(1), 0.5  # cells, so that few of them tell little
     return {
         "mask_precision": (share * on).sum(1) / (total + few),

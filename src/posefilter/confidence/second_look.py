@@ -39,7 +39,7 @@ class Searcher(Protocol):
     filter: ParticleFilter
 
     @property
-    def model(self) -> ObjectModel:
+    def object_model(self) -> ObjectModel:
         """The object."""
         ...
 
@@ -130,8 +130,8 @@ def _search(
     generator: Generator,
 ) -> Trace | None:
     """Return the best of the other searches of one image; None where no rank is above `least`."""
-    model, pose = method.model, first.belief.best[row : row + 1]
-    hidden = find_visible(pose, model, image.depth[0, 0], image.intrinsics[0])
+    object_model, pose = method.object_model, first.belief.best[row : row + 1]
+    hidden = find_visible(pose, object_model, image.depth[0, 0], image.intrinsics[0])
     best: Trace | None = None
     # of a single image, its first search has encoded it
     known = first.encoding is not None and len(first.belief.best) == 1

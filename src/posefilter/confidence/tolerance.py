@@ -94,25 +94,25 @@ def read_pose_tolerance(given: Mapping[str, Any] | None) -> PoseTolerance | None
     return PoseTolerance(**given)
 
 
-def measure_pose_errors(poses: Tensor, truth: Tensor, model: ObjectModel) -> PoseErrors:
+def measure_pose_errors(poses: Tensor, truth: Tensor, object_model: ObjectModel) -> PoseErrors:
     """Return how far estimates are off.
 
     Args:
         poses: (B, 4, 4) camera_from_object [m].
         truth: (B, 4, 4).
-        model: The object.
+        object_model: The object.
     """
     from posefilter.metrics.errors import add, add_s  # trees of scipy, prediction needs none
 
-    truth, points = truth.to(poses), model.points.to(poses)
-    equal = truth[:, None] @ model.symmetries.to(truth)
+    truth, points = truth.to(poses), object_model.points.to(poses)
+    equal = truth[:, None] @ object_model.symmetries.to(truth)
     distances = add(poses[:, None], equal, points)
     least, which = distances.min(1)
     near = equal[torch.arange(len(equal)), which]
-    center = model.center.to(poses)
+    center = object_model.center.to(poses)
     return PoseErrors(
         (origin_of(poses, center) - origin_of(near, center)).norm(dim=-1),
         angle_between(rotation_of(poses), rotation_of(near)),
-        least / model.diameter,
-        add_s(poses, truth, points) / model.diameter,
+        least / object_model.diameter,
+        add_s(poses, truth, points) / object_model.diameter,
     )

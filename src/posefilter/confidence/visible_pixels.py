@@ -18,7 +18,9 @@ _DIRECTIONS = 256
 _RIM = 3  # [px] about hidden pixels
 
 
-def find_visible(poses: Tensor, model: ObjectModel, depth: Tensor, intrinsics: Tensor) -> Tensor:
+def find_visible(
+    poses: Tensor, object_model: ObjectModel, depth: Tensor, intrinsics: Tensor
+) -> Tensor:
     """Return the pixels on which an object is seen at poses.
 
     A pixel whose measured point lies within the object's convex hull shows the object; one that
@@ -26,7 +28,7 @@ def find_visible(poses: Tensor, model: ObjectModel, depth: Tensor, intrinsics: T
 
     Args:
         poses: (R, 4, 4) camera_from_object [m].
-        model: The object.
+        object_model: The object.
         depth: (H, W) [m], 0 where unknown.
         intrinsics: (3, 3) [px].
 
@@ -36,19 +38,19 @@ def find_visible(poses: Tensor, model: ObjectModel, depth: Tensor, intrinsics: T
     H, W = depth.shape
     grid = pixel_grid(H, W, device=depth.device).reshape(-1, 2)
     points = back_project(grid, depth.flatten(), intrinsics)
-    tolerance = _NOISE + _SHARE * model.diameter
+    tolerance = _NOISE + _SHARE * object_model.diameter
     known = depth.flatten() > 0
     out = torch.zeros(len(poses), H * W, dtype=torch.bool, device=depth.device)
     for row, pose in enumerate(poses):
-        local = transform(invert(pose), points) - model.center.to(points)
-        near = (known & (local.norm(dim=-1) < model.radius + tolerance)).nonzero()[:, 0]
-        out[row, near] = lie_in_hull(local[near], model, tolerance)
-        covered = _cover(pose, model, intrinsics, H, W)
+        local = transform(invert(pose), points) - object_model.center.to(points)
+        near = (known & (local.norm(dim=-1) < object_model.radius + tolerance)).nonzero()[:, 0]
+        out[row, near] = lie_in_hull(local[near], object_model, tolerance)
+        covered = _cover(pose, object_model, intrinsics, H, W)
         out[row] |= ~known & torch.from_numpy(covered).to(known).flatten()
     return out.unflatten(1, (H, W))
 
 
-def lie_in_hull(points: Tensor, model: ObjectModel, tolerance: float = 0.0) -> Tensor:
+def lie_in_hull(points: Tensor, object_model: ObjectModel, tolerance: float = 0.0) -> Tensor:
     """Tell which points lie in an object's convex hull.
 
     The hull is bounded by its tangent planes along the mesh's axes and in 256 more directions, so
@@ -56,14 +58,14 @@ def lie_in_hull(points: Tensor, model: ObjectModel, tolerance: float = 0.0) -> T
 
     Args:
         points: (P, 3) object points, from the object's center [m].
-        model: The object.
+        object_model: The object.
         tolerance: By which a point may lie outside [m].
 
     Returns:
         (P,) bool.
     """
     directions = _spread_directions(_DIRECTIONS).to(points)
-    hull = (model.hull.to(points) - model.center.to(points)) @ directions.T
+    hull = (object_model.hull.to(points) - object_model.center.to(points)) @ directions.T
     return (points @ directions.T <= hull.amax(0) + tolerance).all(-1)
 
 
@@ -94,13 +96,13 @@ def _spread_directions(count: int) -> Tensor:
 
 
 def _cover(
-    pose: Tensor, model: ObjectModel, intrinsics: Tensor, height: int, width: int
+    pose: Tensor, object_model: ObjectModel, intrinsics: Tensor, height: int, width: int
 ) -> np.ndarray:
     """Return the pixels (H, W) bool within the outline of the hull; none where it reaches behind
     the camera.
     """
     out = np.zeros((height, width), np.uint8)
-    camera = transform(pose, model.hull.to(pose))
+    camera = transform(pose, object_model.hull.to(pose))
     if bool((camera[:, 2] > _NEAREST).all()):
         pixels = project(camera, intrinsics).clamp(-1e4, 1e4).double().cpu().numpy()
         outline = cv2.convexHull(pixels.astype(np.float32)).round().astype(np.int32)

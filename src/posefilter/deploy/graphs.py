@@ -92,9 +92,9 @@ class ScorePoses(nn.Module):
     def __init__(self, method: PosePF, size: tuple[int, int]) -> None:
         super().__init__()
         self.likelihood, self.size = method.likelihood, size
-        self.radius = float(method.model.radius)
+        self.radius = float(method.object_model.radius)
         assert method.proposals is not None
-        self.register_buffer("center", method.model.center.clone(), persistent=False)
+        self.register_buffer("center", method.object_model.center.clone(), persistent=False)
         self.register_buffer("fragments", method.proposals.centers.clone(), persistent=False)
 
     def forward(
@@ -222,9 +222,9 @@ class MeasurePixels(nn.Module):
         found = [out.log_likelihood, out.displacement, out.latent, out.pose]
         if self.agreement is not None:
             point, known = self.method.surface_points(encoding, state[None])
-            model = self.method.model
+            object_model = self.method.object_model
             share, position = self.agreement.list_object_points(
-                out, point, model.center.to(state), model.radius
+                out, point, object_model.center.to(state), object_model.radius
             )
             found += [point, known.float(), share, position]
         return tuple(one[0] for one in found)

@@ -28,14 +28,14 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         UserError: A component cannot be exported; the message names a choice that can.
     """
     check_method(method)
-    own, model = method.filter, method.model
+    own, object_model = method.filter, method.object_model
     return {
         "version": VERSION,
         "particles_are": "poses" if isinstance(method, PosePF) else "pixels",
-        "object": model.name,
-        "center": model.center.tolist(),
-        "radius": float(model.radius),
-        "diameter": float(model.diameter),
+        "object": object_model.name,
+        "center": object_model.center.tolist(),
+        "radius": float(object_model.radius),
+        "diameter": float(object_model.diameter),
         "first_particles": own.first_particles,
         "particles": own.particles,
         "levels": [float(level) for level in own.schedule(own.steps)],
@@ -151,21 +151,21 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
         return [{"kind": "mean_shift", **{name: getattr(one, name) for name in names}}]
     if isinstance(one, PointToPlaneIcp) and isinstance(method, PosePF):
         names = ("iterations", "initial_gate", "final_gate", "prior", "noise", "effective")
-        surface = one.choose_points(method.model.points).tolist()
+        surface = one.choose_points(method.object_model.points).tolist()
         own = {name: getattr(one, name) for name in names}
         return [{"kind": "icp", **own, "surface": surface}]
     if isinstance(one, TextureTurns) and isinstance(method, PosePF):
-        return describe_turns(one, method.model)
+        return describe_turns(one, method.object_model)
     choices = ("mean_shift_icp_texture", "mean_shift_icp", "mean_shift", "rescore", "none")
     raise _refuse(one, "refine", *choices)
 
 
-def describe_turns(one: TextureTurns, model: ObjectModel) -> list[dict[str, Any]]:
+def describe_turns(one: TextureTurns, object_model: ObjectModel) -> list[dict[str, Any]]:
     """Return what turns by texture need; nothing where the shape leaves no turn open."""
-    turns, coarse = list_turns(model)
+    turns, coarse = list_turns(object_model)
     if len(turns) == 1:
         return []
-    own = read_print(model)
+    own = read_print(object_model)
     surface = torch.cat([own.points, own.normals, own.color], dim=1)
     return [
         {

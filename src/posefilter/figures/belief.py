@@ -55,7 +55,7 @@ def draw_belief(
     rgb: Any,
     intrinsics: Any,
     belief: Belief | BeliefBatch,
-    model: ObjectModel,
+    object_model: ObjectModel,
     truth: Any = None,
     title: str = "",
     axis: int | None = None,
@@ -71,9 +71,9 @@ def draw_belief(
     rgb, K = to_picture(rgb), to_camera(intrinsics)
     poses, weights, best = select_single(belief)
     true = None if truth is None else torch.from_numpy(to_pose(truth))
-    axis = find_longest_axis(model) if axis is None else axis
+    axis = find_longest_axis(object_model) if axis is None else axis
     ess = float(1 / weights.square().sum())
-    summary = summarize_belief(poses, weights, best, model)
+    summary = summarize_belief(poses, weights, best, object_model)
     sure, other = describe_belief(summary)
     marks = [Mark(best, ESTIMATE, "square"), *([] if true is None else [Mark(true, TRUTH, "ring")])]
     entries = [("estimate", ESTIMATE), *([] if true is None else [("truth", TRUTH)])]
@@ -92,16 +92,19 @@ def draw_belief(
         [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
     )
     return compose_figure(
-        title or f"Belief\n{model.name}",
+        title or f"Belief\n{object_model.name}",
         draw_text(sure, CAPTION, bold=True),
         draw_text(other, CAPTION),
         draw_rotations(poses, weights, marks, axis, tile_width(1)),
         draw_turn_scale(),
         arrange_row(
-            [arrange_grid([draw_centers(poses, weights, marks, model, rgb, K, half)], 1), notes]
+            [
+                arrange_grid([draw_centers(poses, weights, marks, object_model, rgb, K, half)], 1),
+                notes,
+            ]
         ),
         draw_weight_scale(),
-        *draw_marginals(poses, weights, best, true, model),
+        *draw_marginals(poses, weights, best, true, object_model),
     )
 
 
@@ -124,9 +127,9 @@ def select_single(
     return poses, torch.softmax(log_weights, 0), best
 
 
-def find_longest_axis(model: ObjectModel) -> int:
+def find_longest_axis(object_model: ObjectModel) -> int:
     """Return which of the object's axes its bounding box is longest along; the last of equals."""
-    size = (model.hull.max(0).values - model.hull.min(0).values).tolist()
+    size = (object_model.hull.max(0).values - object_model.hull.min(0).values).tolist()
     return max(range(3), key=lambda i: (round(size[i], 4), i))
 
 
@@ -163,7 +166,7 @@ def draw_centers(
     poses: torch.Tensor,
     weights: torch.Tensor,
     marks: Sequence[Mark],
-    model: ObjectModel,
+    object_model: ObjectModel,
     rgb: np.ndarray,
     K: np.ndarray,
     size: int,
@@ -172,12 +175,12 @@ def draw_centers(
     first mark has it.
     """
     camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
-    center = model.center.cpu().double()
+    center = object_model.center.cpu().double()
     dots = project(origin_of(poses, center), camera).numpy()
     order = np.argsort(weights.numpy(), kind="stable")
     best = marks[0].pose
     left, top, right, _ = choose_window(
-        dots, weights.numpy(), best, model, camera.numpy(), *rgb.shape[:2]
+        dots, weights.numpy(), best, object_model, camera.numpy(), *rgb.shape[:2]
     )
     view = View(left, top, 2 * size / (right - left), 2 * size, 2 * size)
     picture = fade(view.show(rgb), 0.4)
@@ -192,7 +195,7 @@ def choose_window(
     dots: np.ndarray,
     weights: np.ndarray,
     best: torch.Tensor,
-    model: ObjectModel,
+    object_model: ObjectModel,
     K: np.ndarray,
     height: int,
     width: int,
@@ -200,11 +203,11 @@ def choose_window(
     """Return the square part of the frame that shows the object as estimated, and 98 % of the
     particles.  -> [px].
     """
-    z = max(float(origin_of(best, model.center.cpu().double())[2]), 0.05)
-    middle = project(origin_of(best, model.center.cpu().double())[None], torch.as_tensor(K))[
+    z = max(float(origin_of(best, object_model.center.cpu().double())[2]), 0.05)
+    middle = project(origin_of(best, object_model.center.cpu().double())[None], torch.as_tensor(K))[
         0
     ].numpy()
-    reach = 1.1 * model.radius * K[0, 0] / z
+    reach = 1.1 * object_model.radius * K[0, 0] / z
     far = np.abs(dots - middle).max(1)
     order = np.argsort(far)
     reach = max(

@@ -37,7 +37,7 @@ class BeliefSummary(NamedTuple):
 
 
 def summarize_belief(
-    poses: Tensor, weights: Tensor, best: Tensor, model: ObjectModel
+    poses: Tensor, weights: Tensor, best: Tensor, object_model: ObjectModel
 ) -> BeliefSummary:
     """Return how sure a belief is.
 
@@ -45,11 +45,11 @@ def summarize_belief(
         poses: Particles (N, 4, 4), camera_from_object [m], float64.
         weights: Their weights (N,), summing to 1.
         best: The estimate (4, 4).
-        model: The object.
+        object_model: The object.
     """
-    center = model.center.detach().cpu().double()
-    found = find_hypotheses(poses, weights.log(), best, model)
-    space = PoseSpace((*center.tolist(),), model.radius)
+    center = object_model.center.detach().cpu().double()
+    found = find_hypotheses(poses, weights.log(), best, object_model)
+    space = PoseSpace((*center.tolist(),), object_model.radius)
     members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
     own = torch.where(members, weights, 0.0)
     translation, rotation = spread(poses[None], (own / own.sum()).log()[None], space)

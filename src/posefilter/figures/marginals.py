@@ -78,11 +78,11 @@ def draw_marginals(
     weights: torch.Tensor,
     best: torch.Tensor,
     true: torch.Tensor | None,
-    model: ObjectModel,
+    object_model: ObjectModel,
 ) -> list[np.ndarray]:
     """Draw six weighted histograms, in two rows with what they are above them."""
     translations, rotations = compute_marginals(
-        poses, weights, best, true, model.center.cpu().double()
+        poses, weights, best, true, object_model.center.cpu().double()
     )
     names = [
         [f"{CAMERA_AXES[i]} [mm]" for i in range(3)],

@@ -66,18 +66,23 @@ class ViewData(NamedTuple):
 
 
 def collect_view_data(
-    trace: Trace, batch: Batch, model: ObjectModel, space: Space, shape: Shape, image: int = 0
+    trace: Trace,
+    batch: Batch,
+    object_model: ObjectModel,
+    space: Space,
+    shape: Shape,
+    image: int = 0,
 ) -> ViewData:
     """Gather what is shown of one of a trace's images.  shape: the object's mesh, or the vertices
     of its hull [m].
     """
     K = batch.intrinsics[image].detach().cpu().double()
-    center = model.center.detach().cpu().double()
+    center = object_model.center.detach().cpu().double()
     points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
     estimate, others, left_out, _ = find_hypotheses(
-        poses, belief.log_weights[image].detach().cpu(), best, model
+        poses, belief.log_weights[image].detach().cpu(), best, object_model
     )
     unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
     moments = []
@@ -92,15 +97,15 @@ def collect_view_data(
         make_moment(belief.poses[image], belief.log_weights[image], last, center, K, None)
     )
     return ViewData(
-        name=model.name,
+        name=object_model.name,
         rgb=to_image(batch.rgb[image]),
         K=K.numpy(),
         points=points,
         colors=colors,
         footprints=points[:, 2] / float(K[0, 0]),
-        mesh=make_mesh(shape, model.name),
+        mesh=make_mesh(shape, object_model.name),
         center=center.numpy(),
-        radius=model.radius,
+        radius=object_model.radius,
         unit="mm" if isinstance(space, PoseSpace) else "px",
         moments=tuple(moments),
         estimate=estimate,
@@ -153,7 +158,7 @@ class Hypotheses(NamedTuple):
 
 
 def find_hypotheses(
-    poses: Tensor, log_weights: Tensor, best: Tensor, model: ObjectModel
+    poses: Tensor, log_weights: Tensor, best: Tensor, object_model: ObjectModel
 ) -> Hypotheses:
     """Return the estimate, the belief's other modes, and the weight in modes too light to be shown.
 
@@ -161,10 +166,10 @@ def find_hypotheses(
     no particle is within a tenth of the diameter (a refinement led away from them all) it has none.
     (N, 4, 4), (N,), (4, 4).
     """
-    space = PoseSpace((*model.center.tolist(),), model.radius)
-    modes = find_pose_modes(poses, log_weights, space, model.diameter)
+    space = PoseSpace((*object_model.center.tolist(),), object_model.radius)
+    modes = find_pose_modes(poses, log_weights, space, object_model.diameter)
     distance, nearest = space.distance(poses, best).min(0)
-    own = int(modes.member[nearest]) if float(distance) <= APART * model.diameter else None
+    own = int(modes.member[nearest]) if float(distance) <= APART * object_model.diameter else None
     rest = [i for i in range(len(modes.weights)) if i != own]
     shown = [i for i in rest if float(modes.weights[i]) >= _LEAST][:_MOST]
     others = tuple(Hypothesis(modes.states[i].numpy(), float(modes.weights[i])) for i in shown)

@@ -88,7 +88,10 @@ class Agreement:
         Its score is the share of the weight that agrees, times the highest likelihood.
         """
         provider = require_surface_points(method)
-        center, radius = provider.model.center.to(particles.state), provider.model.radius
+        center, radius = (
+            provider.object_model.center.to(particles.state),
+            provider.object_model.radius,
+        )
         point, known = provider.surface_points(encoding, particles.state)
         share, position = self.list_object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known

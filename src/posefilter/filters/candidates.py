@@ -48,7 +48,7 @@ def perturb(poses: Tensor, sigma: Tensor, space: PoseSpace, generator: Generator
 
 def sample_around_truth(
     batch: Batch,
-    model: ObjectModel,
+    object_model: ObjectModel,
     space: PoseSpace,
     per_kind: int,
     sigma: Sequence[float],
@@ -64,7 +64,7 @@ def sample_around_truth(
 
     Args:
         batch: Images with their true poses.
-        model: The object.
+        object_model: The object.
         space: The space of the poses.
         per_kind: Candidates of a kind.
         sigma: Lowest and highest noise level [m]; levels are drawn log-uniformly.
@@ -77,7 +77,7 @@ def sample_around_truth(
     B = len(batch.rgb)
     device = batch.rgb.device
     truth = batch.camera_from_object[:, None]
-    center = model.center.to(device)
+    center = object_model.center.to(device)
     low, high = math.log(sigma[0]), math.log(sigma[1])
     size = torch.exp(
         torch.empty(B, per_kind, device=device).uniform_(low, high, generator=generator)

@@ -86,16 +86,19 @@ class PointToPlaneIcp:
         Raises:
             UserError: The method has no depth.
         """
-        model: ObjectModel | None = getattr(method, "model", None)
-        if not isinstance(encoding, HasDepth) or model is None:
+        object_model: ObjectModel | None = getattr(method, "object_model", None)
+        if not isinstance(encoding, HasDepth) or object_model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no depth to align poses with; "
                 "choose filter/refine=mean_shift or none"
             )
         first = belief.best
-        x, y, z = model.center.tolist()
-        space = PoseSpace((x, y, z), model.radius)
-        center, own = model.center.to(first), self.choose_points(model.points).to(first)
+        x, y, z = object_model.center.tolist()
+        space = PoseSpace((x, y, z), object_model.radius)
+        center, own = (
+            object_model.center.to(first),
+            self.choose_points(object_model.points).to(first),
+        )
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, 1, dtype=torch.float64)

@@ -49,7 +49,7 @@ class Print(NamedTuple):
 
 
 def measure_texture(
-    poses: Tensor, encoding: HasColor, model: ObjectModel, shift: float = _SHIFT
+    poses: Tensor, encoding: HasColor, object_model: ObjectModel, shift: float = _SHIFT
 ) -> Tensor:
     """Return how much better the object's print explains the image than plain shading does.
 
@@ -62,7 +62,7 @@ def measure_texture(
     Args:
         poses: (B, C, 4, 4) camera_from_object [m].
         encoding: B images with color and depth.
-        model: The object.
+        object_model: The object.
         shift: The best of nine shifts of the image counts, which lie so far apart [focal lengths],
             since fine print does not correlate where a pose is a millimeter off. 0: none.
 
@@ -72,24 +72,24 @@ def measure_texture(
     Raises:
         UserError: The object has no texture.
     """
-    own = read_print(model, poses)
+    own = read_print(object_model, poses)
     images = zip(
         poses, encoding.measured_color, encoding.measured_depth, encoding.intrinsics, strict=True
     )
-    return torch.stack([_compare(*image, own, model, shift) for image in images])
+    return torch.stack([_compare(*image, own, object_model, shift) for image in images])
 
 
-def read_print(model: ObjectModel, like: Tensor | None = None) -> Print:
+def read_print(object_model: ObjectModel, like: Tensor | None = None) -> Print:
     """Return an object's textured points, as `like` is.
 
     Raises:
         UserError: The object has no texture.
     """
-    if model.texture is None:
-        raise UserError(_MISSING.format(name=model.name))
-    texture = model.texture.float() if like is None else model.texture.to(like)
+    if object_model.texture is None:
+        raise UserError(_MISSING.format(name=object_model.name))
+    texture = object_model.texture.float() if like is None else object_model.texture.to(like)
     # by a sphere's area: a cylinder's or a box's differs by less than matters for a blur
-    spacing = model.radius * (4 * torch.pi / 3 / len(texture)) ** 0.5
+    spacing = object_model.radius * (4 * torch.pi / 3 / len(texture)) ** 0.5
     return Print(texture[:, :3], texture[:, 3:6], (texture[:, 6:] + _DARK).log(), spacing)
 
 
@@ -99,7 +99,7 @@ def _compare(
     depth: Tensor,
     K: Tensor,
     own: Print,
-    model: ObjectModel,
+    object_model: ObjectModel,
     shift: float,
 ) -> Tensor:
     """Return the ratios of poses in one image.  (C, 4, 4), (3, H, W), (H, W), (3, 3) -> (C,)."""
@@ -109,7 +109,7 @@ def _compare(
     pixels = project(points, K)
     at = nearest_pixel(pixels).flatten(0, 1)
     z = gather_pixels(depth[None, None], at[None])[0, :, 0].unflatten(0, cosine.shape)
-    near = (z - points[..., 2]).abs() < _NEAR[0] + _NEAR[1] * model.diameter
+    near = (z - points[..., 2]).abs() < _NEAR[0] + _NEAR[1] * object_model.diameter
     seen = (z > 0) & near & (cosine > _GRAZING)
     weights = seen * cosine
     focal = float(K[0, 0])
@@ -119,7 +119,7 @@ def _compare(
     if not bool(seen.any()):
         return torch.zeros_like(count)
     x = _remove(own.color.expand_as(points), basis, weights)
-    middle = float(origin_of(poses, model.center.to(poses))[:, 2].median().clamp_min(0.05))
+    middle = float(origin_of(poses, object_model.center.to(poses))[:, 2].median().clamp_min(0.05))
     sigma, step = max(_SHARPEST, _BLUR * own.spacing * focal / middle), shift * focal
     image, corner = _blur_around(color, pixels[seen], sigma, step)
     offsets = torch.cartesian_prod(*2 * [pixels.new_tensor([-step, 0, step] if step else [0])])
@@ -230,19 +230,19 @@ class TextureTurns:
         Raises:
             UserError: The method keeps no color, or its object has no texture.
         """
-        model, colored = self._check(encoding, method)
+        object_model, colored = self._check(encoding, method)
         first = belief.best
-        turns, first_tried = list_turns(model)
+        turns, first_tried = list_turns(object_model)
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
         log_posterior, tried = self._score(
-            first, turns, first_tried, colored, method, model, generator
+            first, turns, first_tried, colored, method, object_model, generator
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
-        best = self._turn_finely(first, chosen, turns, colored, model)
+        best = self._turn_finely(first, chosen, turns, colored, object_model)
         poses = _turn_particles(
-            belief, turns[first_tried], turns[tried], log_posterior, model, generator
+            belief, turns[first_tried], turns[tried], log_posterior, object_model, generator
         )
         return belief._replace(best=best, poses=poses)
 
@@ -256,22 +256,22 @@ class TextureTurns:
         Raises:
             UserError: As when called.
         """
-        model, colored = self._check(encoding, method)
-        turns, first_tried = list_turns(model)
+        object_model, colored = self._check(encoding, method)
+        turns, first_tried = list_turns(object_model)
         if len(first_tried) <= _MOST:
             return None
         here = torch.eye(4).expand_as(best).to(best)
-        return self._turn_finely(best, here, turns.to(best), colored, model)
+        return self._turn_finely(best, here, turns.to(best), colored, object_model)
 
     @staticmethod
     def _check(encoding: Encoding, method: Method) -> tuple[ObjectModel, HasColor]:
-        model: ObjectModel | None = getattr(method, "model", None)
-        if not isinstance(encoding, HasColor) or model is None:
+        object_model: ObjectModel | None = getattr(method, "object_model", None)
+        if not isinstance(encoding, HasColor) or object_model is None:
             raise UserError(
                 f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
                 "choose filter/refine=icp or none"
             )
-        return model, encoding
+        return object_model, encoding
 
     def _score(
         self,
@@ -280,7 +280,7 @@ class TextureTurns:
         first_tried: Tensor,
         encoding: HasColor,
         method: Method,
-        model: ObjectModel,
+        object_model: ObjectModel,
         generator: Generator,
     ) -> tuple[Tensor, Tensor]:
         """Score the turns that are tried first, the most promising at the best turn beside them.
@@ -294,7 +294,7 @@ class TextureTurns:
             first_tried: (F,) indices of some of them.
             encoding: The images.
             method: Scores poses, or not.
-            model: The object.
+            object_model: The object.
             generator: Draws the image points.
 
         Returns:
@@ -307,25 +307,30 @@ class TextureTurns:
             learned = self.learned_weight * scores
         chosen = first_tried.expand(learned.shape).clone()
         if len(first_tried) <= _MOST:
-            return measure_texture(poses, encoding, model) + learned, chosen
-        evidence = measure_texture(poses, encoding, model, shift=0)
+            return measure_texture(poses, encoding, object_model) + learned, chosen
+        evidence = measure_texture(poses, encoding, object_model, shift=0)
         top = (evidence + learned).topk(_MOST, dim=1).indices
         rows = torch.arange(len(best), device=best.device)[:, None]
         angles = _angles(turns[first_tried], turns)
         beside = angles.topk(_BESIDE, dim=1, largest=False).indices  # itself first
         near = beside[top]  # (B, M, _BESIDE)
         around = best[:, None, None] @ turns[near]
-        fine = measure_texture(around.flatten(1, 2), encoding, model, shift=0).unflatten(
+        fine = measure_texture(around.flatten(1, 2), encoding, object_model, shift=0).unflatten(
             1, (_MOST, -1)
         )
         chosen[rows, top] = near.gather(2, fine.argmax(2, keepdim=True))[..., 0]
         evidence[rows, top] = measure_texture(
-            best[:, None] @ turns[chosen[rows, top]], encoding, model
+            best[:, None] @ turns[chosen[rows, top]], encoding, object_model
         )
         return evidence + learned, chosen
 
     def _turn_finely(
-        self, best: Tensor, chosen: Tensor, turns: Tensor, encoding: HasColor, model: ObjectModel
+        self,
+        best: Tensor,
+        chosen: Tensor,
+        turns: Tensor,
+        encoding: HasColor,
+        object_model: ObjectModel,
     ) -> Tensor:
         """Return the estimates turned by the best of all turns near those chosen.
 
@@ -334,7 +339,7 @@ class TextureTurns:
             chosen: (B, 4, 4), one of `turns` each.
             turns: (S, 4, 4).
             encoding: The images.
-            model: The object.
+            object_model: The object.
         """
         angles = _angles(chosen, turns)  # (B, S)
         most = int((angles < _APART).sum(1).max())
@@ -342,15 +347,15 @@ class TextureTurns:
             return best @ chosen
         near = turns[angles.topk(most, dim=1, largest=False).indices]  # the chosen one first
         poses = best[:, None] @ near
-        evidence = measure_texture(poses, encoding, model)
+        evidence = measure_texture(poses, encoding, object_model)
         return poses[torch.arange(len(best), device=best.device), evidence.argmax(1)]
 
 
-def list_turns(model: ObjectModel) -> tuple[Tensor, Tensor]:
+def list_turns(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
     """Return the turns that an object's shape leaves open, and which of them are tried first.
 
     Args:
-        model: The object.
+        object_model: The object.
 
     Returns:
         (S, 4, 4) object_from_object, the identity first; indices of some of them, no two of which
@@ -359,9 +364,9 @@ def list_turns(model: ObjectModel) -> tuple[Tensor, Tensor]:
     Raises:
         UserError: The object has no texture.
     """
-    turns = model.shape_symmetries
-    if model.texture is None or turns is None:
-        raise UserError(_MISSING.format(name=model.name))
+    turns = object_model.shape_symmetries
+    if object_model.texture is None or turns is None:
+        raise UserError(_MISSING.format(name=object_model.name))
     apart, kept = _angles(turns, turns) > _APART - 0.1, []
     free = torch.ones_like(apart[0])  # of those that are kept already
     while free.any():
@@ -382,7 +387,7 @@ def _turn_particles(
     turns: Tensor,
     to: Tensor,
     log_posterior: Tensor,
-    model: ObjectModel,
+    object_model: ObjectModel,
     generator: Generator,
 ) -> Tensor:
     """Return the particles, each turned from the turn it is at to one that it draws.
@@ -392,12 +397,12 @@ def _turn_particles(
         turns: (S, 4, 4).
         to: (B, S, 4, 4), the turn that stands for each: the one that was scored.
         log_posterior: (B, S) of those.
-        model: The object.
+        object_model: The object.
         generator: Draws the turns, systematically: their shares are those of the posterior.
     """
     poses, best = belief.poses, belief.best
-    x, y, z = model.center.tolist()
-    space = PoseSpace((x, y, z), model.radius)
+    x, y, z = object_model.center.tolist()
+    space = PoseSpace((x, y, z), object_model.radius)
     distance = space.distance(poses[:, :, None], (best[:, None] @ turns)[:, None])  # (B, N, S)
     nearest, at = distance.min(-1)
     back = torch.linalg.inv(turns)[at]
@@ -406,4 +411,4 @@ def _turn_particles(
     order = torch.rand(B, N, generator=generator, device=at.device).argsort(1)
     drawn = inverse_cdf(log_posterior.log_softmax(1), (order + shift) / N)
     moved = poses @ back @ to[torch.arange(B, device=at.device)[:, None], drawn]
-    return torch.where((nearest < _OWN * model.diameter)[..., None, None], moved, poses)
+    return torch.where((nearest < _OWN * object_model.diameter)[..., None, None], moved, poses)

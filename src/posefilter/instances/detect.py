@@ -167,7 +167,7 @@ def _search(
     if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
         trace = job.filter(image, with_encoding(job.method, encoding), job.generator)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
-        visible = find_visible(trace.belief.best, job.method.model, depth, K)[0]
+        visible = find_visible(trace.belief.best, job.method.object_model, depth, K)[0]
         assessment = _assess(job.method, trace.belief, image, encoding)
         # with the pixels of others, so that an answer beside what is found, of the same object, is
         # seen to have too few of its own

@@ -36,7 +36,7 @@ class TowardsObject:
         self.max_displacement = max_displacement
 
     @torch.no_grad()
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (T, B, N, 2) [px], without gradient."""
         states = torch.stack([particles.state for particles in trace.particles])
         if self.target == "center":

@@ -23,7 +23,7 @@ class OnObject:
     def __init__(self, size: int = 1) -> None:
         self.size = size
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (T, B, N) in {0, 1}."""
         counts = [particles.state.shape[1] for particles in trace.particles]
         states = torch.cat([particles.state for particles in trace.particles], dim=1)
@@ -51,9 +51,9 @@ class Quality:
         self.points = points
 
     @torch.no_grad()
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (T, B, N) in [0, 1], without gradient."""
-        points = subsample(model.points, self.points).to(batch.rgb)
-        truth, scale = batch.camera_from_object, self.scale * model.diameter
+        points = subsample(object_model.points, self.points).to(batch.rgb)
+        truth, scale = batch.camera_from_object, self.scale * object_model.diameter
         error = torch.stack([add_distance(out.pose, truth, points) for out in trace.outputs])
-        return self.on_object(trace, batch, model) * torch.exp(-error / scale)
+        return self.on_object(trace, batch, object_model) * torch.exp(-error / scale)

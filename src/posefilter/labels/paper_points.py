@@ -34,7 +34,7 @@ class PaperPoints:
         self.tolerance = tolerance
         self.surface_label, self.behind_label = surface_label, behind_label
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return labels (1, B, N).
 
         Raises:

@@ -38,7 +38,7 @@ class TruthDensity(Protocol):
     """The log density of the truth under the particles of one step."""
 
     def __call__(
-        self, particles: Particles, output: ParticleOutput, batch: Batch, model: ObjectModel
+        self, particles: Particles, output: ParticleOutput, batch: Batch, object_model: ObjectModel
     ) -> Tensor:
         """Return (B,) [nat]."""
         ...
@@ -65,7 +65,7 @@ class MaskDensity:
         self.sigma, self.max_pixels = sigma, max_pixels
 
     def __call__(
-        self, particles: Particles, output: ParticleOutput, batch: Batch, model: ObjectModel
+        self, particles: Particles, output: ParticleOutput, batch: Batch, object_model: ObjectModel
     ) -> Tensor:
         """Return (B,) [nat]."""
         pixels, valid = mask_pixels(batch.mask, self.max_pixels)
@@ -113,11 +113,13 @@ class PoseDensity:
         )
 
     def __call__(
-        self, particles: Particles, output: ParticleOutput, batch: Batch, model: ObjectModel
+        self, particles: Particles, output: ParticleOutput, batch: Batch, object_model: ObjectModel
     ) -> Tensor:
         """Return (B,) [nat]."""
-        truth = batch.camera_from_object[:, None] @ model.symmetries.to(batch.camera_from_object)
-        log_kernel = self.log_kernel(output.pose[:, None], truth[:, :, None], model.center)
+        truth = batch.camera_from_object[:, None] @ object_model.symmetries.to(
+            batch.camera_from_object
+        )
+        log_kernel = self.log_kernel(output.pose[:, None], truth[:, :, None], object_model.center)
         log_p = (particles.log_weights[:, None] + log_kernel).logsumexp((1, 2))
         return log_p - math.log(truth.shape[1])
 
@@ -152,13 +154,13 @@ class BeliefNll:
             raise UserError(f"loss.steps={steps!r} is unknown: choose last or all")
         self.terms, self.steps = dict(terms), steps
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,) [nat]; 0 where the object is not visible."""
         judged = list(zip(trace.particles, trace.outputs, strict=True))
         if self.steps == "last":
             judged = judged[-1:]
         log_p = [
-            term(particles, output, batch, model)
+            term(particles, output, batch, object_model)
             for particles, output in judged
             for term in self.terms.values()
         ]

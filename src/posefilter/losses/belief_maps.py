@@ -29,7 +29,7 @@ class BeliefMaps:
     def __init__(self, sigma: float = 1.5) -> None:
         self.sigma = sigma
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,)."""
         encoding = trace.encoding
         pixels, ahead = project_keypoints(

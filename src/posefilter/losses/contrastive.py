@@ -11,7 +11,9 @@ from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
 
 
-def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int = 64) -> Tensor:
+def pose_distance(
+    poses: Tensor, truth: Tensor, object_model: ObjectModel, points: int = 64
+) -> Tensor:
     """Return the least mean distance of corresponding points over the object's symmetries.
 
     ADD (Hinterstoisser et al. 2012) on a subset of the points. As in MSSD (Hodan et al. 2020), the
@@ -20,15 +22,16 @@ def pose_distance(poses: Tensor, truth: Tensor, model: ObjectModel, points: int 
     Args:
         poses: (B, N, 4, 4) camera_from_object.
         truth: (B, 4, 4) camera_from_object.
-        model: The object with its symmetries.
+        object_model: The object with its symmetries.
         points: Number of points.
 
     Returns:
         Distances (B, N) [m].
     """
-    few = subsample(model.points, points).to(poses.device)
+    few = subsample(object_model.points, points).to(poses.device)
     options = [
-        add_distance(poses, truth @ symmetry, few) for symmetry in model.symmetries.to(poses.device)
+        add_distance(poses, truth @ symmetry, few)
+        for symmetry in object_model.symmetries.to(poses.device)
     ]
     return torch.stack(options).amin(0)
 
@@ -42,7 +45,7 @@ class Contrastive:
 
     requires: ClassVar[Capabilities] = ("candidates",)
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the divergence of each image, (B,) >= 0.
 
         Raises:
@@ -58,7 +61,7 @@ class Contrastive:
             trace.outputs[-1].log_likelihood,
             trace.steps[-1].sigma,
         )
-        distance = pose_distance(poses, batch.camera_from_object, model)
+        distance = pose_distance(poses, batch.camera_from_object, object_model)
         target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)
         divergence = (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)
         return divergence * batch.mask.flatten(1).any(1)

@@ -32,7 +32,7 @@ class Offset:
 
     requires: ClassVar[Capabilities] = ("displacement", "pixel_space", "rollout")
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         positions = displaced_positions(trace)
         flat = positions.transpose(0, 1).flatten(1, 2)
@@ -62,7 +62,7 @@ class Chamfer:
         self.size = size
         self.max_pixels = max_pixels
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         positions = displaced_positions(trace).transpose(0, 1).flatten(1, 2)
         return (
@@ -109,9 +109,9 @@ class DirectDisplacement:
         self.label = label
         self.width = width
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        target = self.label(trace, batch, model)
+        target = self.label(trace, batch, object_model)
         displacement = torch.stack([output.displacement for output in trace.outputs])
         error = (displacement - target) / batch.rgb.shape[-1]
         zero = torch.zeros_like(error)
@@ -136,12 +136,14 @@ class Sides:
     def __init__(self, label: Label) -> None:
         self.label = label
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         height, width = batch.rgb.shape[-2:]
-        whole = box_of_pose(batch.camera_from_object, model.hull, batch.intrinsics, height, width)
+        whole = box_of_pose(
+            batch.camera_from_object, object_model.hull, batch.intrinsics, height, width
+        )
         box = (whole / width)[:, None]
-        on = self.label(trace, batch, model) > 0
+        on = self.label(trace, batch, object_model) > 0
         total = batch.rgb.new_zeros(len(batch.rgb))
         for particles, output, inside in zip(trace.particles, trace.outputs, on, strict=True):
             position = particles.state.detach() / batch.rgb.shape[-1]

@@ -12,7 +12,7 @@ from posefilter.types import Batch, ObjectModel, Trace
 
 
 def squared_distances(
-    centers: Tensor, rotations: Tensor, truth: Tensor, model: ObjectModel
+    centers: Tensor, rotations: Tensor, truth: Tensor, object_model: ObjectModel
 ) -> Tensor:
     """Return how far the pose of each center and rotation is from the truth, squared.
 
@@ -20,12 +20,12 @@ def squared_distances(
 
     (B, C, 3) [m], (M, 3, 3), (B, 4, 4) -> (B, C, M) [m^2].
     """
-    shift = (centers - origin_of(truth, model.center.to(truth))[:, None]).square().sum(-1)
+    shift = (centers - origin_of(truth, object_model.center.to(truth))[:, None]).square().sum(-1)
     seen = look_at(centers).mT @ rotation_of(truth)[:, None]
-    alike = seen[:, :, None] @ rotation_of(model.symmetries.to(truth))
+    alike = seen[:, :, None] @ rotation_of(object_model.symmetries.to(truth))
     trace = torch.einsum("bcsij,mij->bcsm", alike, rotations).amax(2)
     angle = ((trace - 1) / 2).clamp(-1, 1).acos()
-    return shift[..., None] + (model.radius * angle).square()
+    return shift[..., None] + (object_model.radius * angle).square()
 
 
 class GridPosterior:
@@ -47,12 +47,12 @@ class GridPosterior:
     def __init__(self, sigma: float = 0.15) -> None:
         self.sigma = sigma
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,)."""
         encoding = trace.encoding
         far = squared_distances(
-            encoding.centers, encoding.rotations, batch.camera_from_object, model
+            encoding.centers, encoding.rotations, batch.camera_from_object, object_model
         )
-        wanted = (-0.5 * far / (self.sigma * model.radius) ** 2).flatten(1).log_softmax(1)
+        wanted = (-0.5 * far / (self.sigma * object_model.radius) ** 2).flatten(1).log_softmax(1)
         found: Tensor = encoding.scores.flatten(1).log_softmax(1)
         return (wanted.exp() * (wanted - found)).sum(1)

@@ -48,15 +48,15 @@ class Bce:
         self.label = label
         self.steps = steps
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        log_p, y, entropy = self._compare(trace, batch, model)
+        log_p, y, entropy = self._compare(trace, batch, object_model)
         return (self.weigh(log_p.detach(), y) * entropy).sum((0, 2))
 
-    def _compare(self, trace: Trace, batch: Batch, model: ObjectModel) -> tuple[Tensor, ...]:
+    def _compare(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> tuple[Tensor, ...]:
         """Return log-likelihoods, labels and their cross-entropy, each (S, B, N)."""
         log_p = stack_log_likelihoods(trace, self.steps)
-        y = self.label(trace, batch, model)[-len(log_p) :]
+        y = self.label(trace, batch, object_model)[-len(log_p) :]
         return log_p, y, -(y * log_p + (1 - y) * log1mexp(log_p))
 
     def weigh(self, log_p: Tensor, y: Tensor) -> Tensor:
@@ -102,9 +102,9 @@ class Focal(Bce):
         self.gamma = gamma
         self.alpha = alpha
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        log_p, y, entropy = self._compare(trace, batch, model)
+        log_p, y, entropy = self._compare(trace, batch, object_model)
         side = torch.where(y > 0, self.alpha, 1 - self.alpha)
         return (side * ((y - log_p.exp()).square() + 1e-12) ** (self.gamma / 2) * entropy).mean(
             (0, 2)

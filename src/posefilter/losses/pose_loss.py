@@ -39,10 +39,10 @@ class Add:
         self.weighting = weighting
         self.points = points
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,) [m]."""
         output: ParticleOutput = trace.outputs[-1]
-        points = subsample(model.points, self.points).to(batch.rgb)
+        points = subsample(object_model.points, self.points).to(batch.rgb)
         error = self.distance(output.pose, batch.camera_from_object, points)
         if self.weighting == "mean":
             return error.mean(1)
@@ -75,13 +75,15 @@ class Confidence:
         self.weight = weight
         self.points = points
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
-        points = subsample(model.points, self.points).to(batch.rgb)
-        on = self.label(trace, batch, model) > 0
+        points = subsample(object_model.points, self.points).to(batch.rgb)
+        on = self.label(trace, batch, object_model) > 0
         total = batch.rgb.new_zeros(len(batch.rgb))
         for output, inside in zip(trace.outputs, on, strict=True):
-            error = add_distance(output.pose, batch.camera_from_object, points) / model.diameter
+            error = (
+                add_distance(output.pose, batch.camera_from_object, points) / object_model.diameter
+            )
             log_c = output.log_likelihood
             fit = error * log_c.exp() - self.weight * log_c
             fit = (fit * inside).sum(1) / inside.sum(1).clamp_min(1)
@@ -109,16 +111,16 @@ class SurfacePointLoss:
     def __init__(self, fragment_weight: float = 0.25, offset_weight: float = 0.3) -> None:
         self.fragment_weight, self.offset_weight = fragment_weight, offset_weight
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,)."""
         total = batch.rgb.new_zeros(len(batch.rgb))
         for particles, output in zip(trace.particles, trace.outputs, strict=True):
-            point, true, counts = measured_points(particles, batch, model)
+            point, true, counts = measured_points(particles, batch, object_model)
             if output.fragments is None:
                 guess = transform(invert(output.pose), point[:, :, None])[:, :, 0]
-                error = ((guess - true).square().sum(-1) + 1e-12).sqrt() / model.radius
+                error = ((guess - true).square().sum(-1) + 1e-12).sqrt() / object_model.radius
             else:
-                relative = (true - model.center.to(true)) / model.radius
+                relative = (true - object_model.center.to(true)) / object_model.radius
                 error = self._of_fragments(output.fragments, relative)
             total = total + (error * counts).sum(1) / counts.sum(1).clamp_min(1)
         return total / len(trace.outputs)
@@ -134,7 +136,7 @@ class SurfacePointLoss:
 
 
 def measured_points(
-    particles: Particles, batch: Batch, model: ObjectModel
+    particles: Particles, batch: Batch, object_model: ObjectModel
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return each particle's measured point in both frames.
 
@@ -146,5 +148,5 @@ def measured_points(
     z, on = gather_pixels(seen, nearest_pixel(particles.state)).unbind(-1)
     point = back_project(particles.state.detach(), z, batch.intrinsics)
     true = transform(invert(batch.camera_from_object), point)
-    near = within_bounds((true - model.center.to(true)) / model.radius)
+    near = within_bounds((true - object_model.center.to(true)) / object_model.radius)
     return point, true, (on > 0) & (z > 0) & near

@@ -20,8 +20,8 @@ class Regression:
     def __init__(self, label: Label, scale: float = 100.0) -> None:
         self.label, self.scale = label, scale
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the error of each image, (B,)."""
-        target = self.label(trace, batch, model)[-1]
+        target = self.label(trace, batch, object_model)[-1]
         error = ((trace.outputs[-1].log_likelihood - target) / self.scale) ** 2
         return (error * trace.particles[-1].log_weights.exp()).sum(1)

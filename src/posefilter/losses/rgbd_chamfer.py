@@ -36,7 +36,7 @@ class RgbdChamfer:
     def __init__(self, size: int = 9, max_pixels: int | None = 256, chunk: int = 1 << 23) -> None:
         self.size, self.max_pixels, self.chunk = size, max_pixels, chunk
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B,); 0 where the object is not visible."""
         image = torch.cat([batch.rgb, batch.depth], dim=1)
         pixels, valid = mask_pixels(batch.mask, self.max_pixels)

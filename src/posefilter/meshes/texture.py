@@ -19,14 +19,14 @@ _STEPS = 144  # of a turn by any angle: 2.5 degrees
 _COARSE_STEPS = 24  # where two axes leave any angle open
 
 
-def add_texture(model: ObjectModel, mesh: Mesh) -> ObjectModel:
+def add_texture(object_model: ObjectModel, mesh: Mesh) -> ObjectModel:
     """Return the object with its textured points and its shape's symmetries.
 
     A mesh whose shape cannot be examined, such as a flat one, has no symmetries but the identity.
     """
-    return model._replace(
+    return object_model._replace(
         texture=torch.from_numpy(sample_texture(mesh)),
-        shape_symmetries=torch.from_numpy(find_shape_symmetries(mesh, model.diameter)),
+        shape_symmetries=torch.from_numpy(find_shape_symmetries(mesh, object_model.diameter)),
     )
 
 

@@ -24,7 +24,7 @@ class TruthScores(NamedTuple):
     nonconformity: Tensor  # (B,) mean log density of the belief, less that at the truth [nat]
 
 
-def score_truth(belief: BeliefBatch, truth: Tensor, model: ObjectModel) -> TruthScores:
+def score_truth(belief: BeliefBatch, truth: Tensor, object_model: ObjectModel) -> TruthScores:
     """Return the density of beliefs at the truth, and the share of each that is denser.
 
     The credible set of a level p holds the truth where the rank is below p.  If truths were drawn
@@ -33,7 +33,7 @@ def score_truth(belief: BeliefBatch, truth: Tensor, model: ObjectModel) -> Truth
     Args:
         belief: B beliefs.
         truth: (B, 4, 4) true poses.
-        model: The object; its symmetries are known to the density.
+        object_model: The object; its symmetries are known to the density.
 
     Returns:
         (B,) float64 each, on the CPU.
@@ -42,8 +42,10 @@ def score_truth(belief: BeliefBatch, truth: Tensor, model: ObjectModel) -> Truth
     poses, log_weights = belief.poses.detach().cpu(), belief.log_weights.detach().cpu()
     for own, own_weights, true in zip(poses, log_weights, truth.detach().cpu(), strict=True):
         normalized = own_weights.double().log_softmax(0)
-        size = (float(model.radius), float(model.diameter))
-        density = fit_density(own, normalized, model.center.cpu(), *size, model.symmetries.cpu())
+        size = (float(object_model.radius), float(object_model.diameter))
+        density = fit_density(
+            own, normalized, object_model.center.cpu(), *size, object_model.symmetries.cpu()
+        )
         at_truth, at_own = log_density(density, true[None])[0], log_density_held_out(density)
         weights = density.log_weights.exp()
         rank, mean = weights @ (at_own > at_truth).double(), weights @ at_own

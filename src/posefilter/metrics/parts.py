@@ -18,23 +18,27 @@ _REACH = 0.1  # diameters: a pixel that is farther from every part belongs to no
 _PIXELS = 400  # of an image, at most
 
 
-def label_pixels(points: Tensor, pose: Tensor, model: ObjectModel) -> Tensor:
+def label_pixels(points: Tensor, pose: Tensor, object_model: ObjectModel) -> Tensor:
     """Return the part that is nearest to each measured point.
 
     Args:
         points: (M, 3) in the camera's frame [m].
         pose: (4, 4) camera_from_object [m].
-        model: The object, with its parts.
+        object_model: The object, with its parts.
 
     Returns:
         (M,) index of the part, -1 where all are farther than a tenth of the diameter.
     """
     local = transform(invert(pose), points)
     distance = torch.stack(
-        [torch.cdist(local, part.to(local)).amin(1) for part in (model.parts or {}).values()], dim=1
+        [
+            torch.cdist(local, part.to(local)).amin(1)
+            for part in (object_model.parts or {}).values()
+        ],
+        dim=1,
     )
     nearest = distance.min(1)
-    return torch.where(nearest.values < _REACH * model.diameter, nearest.indices, -1)
+    return torch.where(nearest.values < _REACH * object_model.diameter, nearest.indices, -1)
 
 
 class PartIoU(Metric):
@@ -44,7 +48,7 @@ class PartIoU(Metric):
     object's visible pixels with depth: each belongs to the part that is nearest at a pose.
 
     Args:
-        model: An object with parts.
+        object_model: An object with parts.
         **kwargs: Arguments of torchmetrics.Metric.
     """
 
@@ -52,9 +56,9 @@ class PartIoU(Metric):
     totals: Tensor  # (2, parts) sums of the boxes' and of the masks' IoU
     counts: Tensor  # (2, parts) how many each sum has
 
-    def __init__(self, model: ObjectModel, **kwargs: Any) -> None:
+    def __init__(self, object_model: ObjectModel, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.model, self.parts = model, dict(model.parts or {})
+        self.object_model, self.parts = object_model, dict(object_model.parts or {})
         shape = (2, len(self.parts))
         self.add_state("totals", torch.zeros(shape, dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
@@ -86,8 +90,8 @@ class PartIoU(Metric):
         at = at[:: max(1, len(at) // _PIXELS)]
         z = batch.depth[b, 0][at[:, 0], at[:, 1]]
         points = back_project(at.flip(1)[None].to(z), z[None], batch.intrinsics[b : b + 1])[0]
-        there = label_pixels(points, batch.camera_from_object[b], self.model)
-        here = label_pixels(points, pose, self.model) if good else torch.full_like(there, -2)
+        there = label_pixels(points, batch.camera_from_object[b], self.object_model)
+        here = label_pixels(points, pose, self.object_model) if good else torch.full_like(there, -2)
         for k in range(len(self.parts)):
             true, found = there == k, here == k
             if bool(true.any()):

@@ -131,7 +131,7 @@ class PoseEstimator(Module):
         raise NotImplementedError(f"{type(self).__name__} must implement measure()")
 
     @property
-    def model(self) -> ObjectModel:
+    def object_model(self) -> ObjectModel:
         """The object.
 
         Raises:
@@ -142,6 +142,11 @@ class PoseEstimator(Module):
                 "the method has no object yet: give it data, or a checkpoint that holds one"
             )
         return self._object_model
+
+    @property
+    def model(self) -> ObjectModel:
+        """The earlier name of `object_model`."""
+        return self.object_model
 
     @property
     def device(self) -> torch.device:
@@ -179,25 +184,25 @@ class PoseEstimator(Module):
             "particles_on_object": ParticlesOnObject(),
         }
         if "pose" in self.capabilities:
-            metrics["poses"] = PoseErrors([self.model])
-            metrics["bop"] = BopErrors([self.model])
-            metrics["by_visibility"] = ErrorsByVisibility([self.model])
-            metrics["belief"] = BeliefQuality([self.model])
+            metrics["poses"] = PoseErrors([self.object_model])
+            metrics["bop"] = BopErrors([self.object_model])
+            metrics["by_visibility"] = ErrorsByVisibility([self.object_model])
+            metrics["belief"] = BeliefQuality([self.object_model])
             metrics["credibility"] = Credibility()
             metrics["confidence"] = Confidence()
             metrics["apparent_size"] = ApparentSizes()
-            if self.model.parts:
-                metrics["parts"] = PartIoU(self.model)
+            if self.object_model.parts:
+                metrics["parts"] = PartIoU(self.object_model)
         return metrics
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Set the object, and forget the metrics of another.
 
         Raises:
             UserError: The method's components do not fit each other; see capabilities.py.
         """
         check_parts(self)
-        self._object_model = model
+        self._object_model = object_model
         self._scores = None
 
     def generator(self, stage: str, batch_number: int) -> Generator:
@@ -223,9 +228,9 @@ class PoseEstimator(Module):
             (B,) each; more of it speaks for the estimate.
         """
         return {
-            **measure_belief(trace.belief, self.model),
-            **measure_depth(trace.belief.best, batch, self.model),
-            **measure_print(trace.belief.best, batch, self.model),
+            **measure_belief(trace.belief, self.object_model),
+            **measure_depth(trace.belief.best, batch, self.object_model),
+            **measure_print(trace.belief.best, batch, self.object_model),
         }
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
@@ -251,7 +256,9 @@ class PoseEstimator(Module):
 
         The default is the chosen loss of one roll-out.
         """
-        return {"loss": self.loss(self.train_filter(batch, self, generator), batch, self.model)}
+        return {
+            "loss": self.loss(self.train_filter(batch, self, generator), batch, self.object_model)
+        }
 
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means, the loss that is minimized.
@@ -357,7 +364,7 @@ class PoseEstimator(Module):
 
         height, width = batch.rgb.shape[-2:]
         truth = box_of_pose(
-            batch.camera_from_object, self.model.hull, batch.intrinsics, height, width
+            batch.camera_from_object, self.object_model.hull, batch.intrinsics, height, width
         )
         self.scores["iou"].update(self.box(trace, batch), truth)
         self.scores["particles_on_object"].update(
@@ -372,7 +379,7 @@ class PoseEstimator(Module):
                 trace.belief.best, batch.camera_from_object, batch.visibility
             )
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
-            seen = score_truth(trace.belief, batch.camera_from_object, self.model)
+            seen = score_truth(trace.belief, batch.camera_from_object, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
             self.judge_confidence(trace, batch, there=True)
         if "parts" in self.scores:
@@ -407,7 +414,7 @@ class PoseEstimator(Module):
         right = torch.zeros(len(batch.rgb), dtype=torch.bool)
         if there:
             truth = batch.camera_from_object
-            errors = measure_pose_errors(trace.belief.best, truth, self.model)
+            errors = measure_pose_errors(trace.belief.best, truth, self.object_model)
             right = self.pose_tolerance.accepts(errors)
         verdict = score_verdicts(found, self.costs)
         if size is not None:  # of a wrong size none is found
@@ -424,7 +431,7 @@ class PoseEstimator(Module):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
-        return PoseBox()(trace, batch, self.model)
+        return PoseBox()(trace, batch, self.object_model)
 
     def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:
         """Return where particles are in the image, (B, N, 2) [px].
@@ -434,7 +441,7 @@ class PoseEstimator(Module):
         if not isinstance(self.space, PoseSpace):
             return particles.state
         return project(
-            origin_of(particles.state, self.model.center.to(particles.state.device)),
+            origin_of(particles.state, self.object_model.center.to(particles.state.device)),
             batch.intrinsics,
         )
 
@@ -496,7 +503,7 @@ class PoseEstimator(Module):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Save the object and the recipe, as plain tensors, numbers and strings."""
         checkpoint["recipe"] = self.recipe
-        checkpoint["object_model"] = dict(self.model._asdict())
+        checkpoint["object_model"] = dict(self.object_model._asdict())
         checkpoint["state_dict"] = {
             k: v for k, v in checkpoint["state_dict"].items() if not k.startswith("_scores.")
         }

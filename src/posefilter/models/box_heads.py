@@ -13,7 +13,7 @@ from posefilter.types import Batch, ObjectModel, Trace
 class BoxHead(Protocol):
     """Compute the object's bounding box."""
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]; mask and pose of the batch must not be used."""
         ...
 
@@ -49,7 +49,7 @@ class QuantileBox:
         self.size = size
         self.quantile = quantile
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
         state, weights = trace.particles[-1].state, trace.particles[-1].log_weights.exp()
         low = weighted_quantile(state, weights, self.quantile) - self.size / 2
@@ -63,7 +63,7 @@ class VotedBox:
     requires: ClassVar[Capabilities] = ("free_latent",)
     latent_width = 4  # left, top, right, bottom
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
         particles, predicted = trace.particles[-1], trace.outputs[-1].latent * batch.rgb.shape[-1]
         sides = torch.cat(
@@ -77,7 +77,7 @@ class PoseBox:
 
     requires: ClassVar[Capabilities] = ("pose",)
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return (B, 4) [px]."""
         height, width = batch.rgb.shape[-2:]
-        return box_of_pose(trace.belief.best, model.hull, batch.intrinsics, height, width)
+        return box_of_pose(trace.belief.best, object_model.hull, batch.intrinsics, height, width)

@@ -116,13 +116,13 @@ class CandidatePoses:
     ) -> Trace:
         """Draw and score candidates, and advance the persistent particles by a step."""
         B, device = len(batch.rgb), batch.rgb.device
-        model = method.model
+        object_model = method.object_model
         low, high = math.log(self.sigma_range[0]), math.log(self.sigma_range[1])
         sigma = torch.exp(torch.empty(B, device=device).uniform_(low, high, generator=generator))
         groups = [
             sample_around_truth(
                 batch,
-                model,
+                object_model,
                 method.space,
                 self.candidates_per_kind,
                 self.sigma_range,

@@ -85,7 +85,7 @@ class DenseCoordinates(Hypotheses):
         weights, index = weights.topk(min(self.cells, weights.shape[1]), dim=1)
         rows = index[..., None].expand(-1, -1, 3)
         source = coordinates.coordinate.detach().flatten(1, 2).gather(1, rows)
-        source = source * self.model.radius + self.model.center.to(source)
+        source = source * self.object_model.radius + self.object_model.center.to(source)
         target = cells.point.flatten(1, 2).gather(1, rows)
         depth = batch.depth[:, 0]
         paired = (self.proposals.reach, source, target, weights)
@@ -118,13 +118,13 @@ class DenseCoordinates(Hypotheses):
     @property
     def tolerance(self) -> float:
         """The distance of an inlier [m]."""
-        return self.inlier * self.model.diameter
+        return self.inlier * self.object_model.diameter
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, with what the network sees of it."""
         encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
         seen = measure_coordinates(
-            trace.belief.best, encoding.coordinates, encoding.cells, self.model
+            trace.belief.best, encoding.coordinates, encoding.cells, self.object_model
         )
         return super().collect_features(trace, batch) | seen
 
@@ -132,10 +132,10 @@ class DenseCoordinates(Hypotheses):
         """Return how large the object appears by the network's object points."""
         encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
         return measure_apparent_size(
-            trace.belief.best, encoding.coordinates, encoding.cells, self.model
+            trace.belief.best, encoding.coordinates, encoding.cells, self.object_model
         )
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Set the object of the network too."""
-        super().set_object(model)
-        self.proposals.set_object(model.points, model.center, model.radius)
+        super().set_object(object_model)
+        self.proposals.set_object(object_model.points, object_model.center, object_model.radius)

@@ -237,9 +237,9 @@ class ImageSpace(PoseEstimator):
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
         encoding = self.encode(batch)
         trace: Trace = self.train_filter(batch, _EncodedMethod(self, encoding), generator)
-        losses = {"loss": self.loss(trace, batch, self.model)}
+        losses = {"loss": self.loss(trace, batch, self.object_model)}
         for name, aux in self.aux_losses.items():
-            losses[name] = aux.weight * aux.loss(trace, batch, self.model)
+            losses[name] = aux.weight * aux.loss(trace, batch, self.object_model)
         if isinstance(encoding, ObjectnessEncoding) and self.objectness_weight:
             losses["objectness"] = self.objectness_weight * objectness_loss(
                 encoding.context, batch.mask
@@ -253,10 +253,10 @@ class ImageSpace(PoseEstimator):
             return 0.0
         return self.global_step / max(1.0, float(self.trainer.estimated_stepping_batches))
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Set the object of the pose head too."""
-        super().set_object(model)
-        self.pose_head.set_object(model)
+        super().set_object(object_model)
+        self.pose_head.set_object(object_model)
 
     def make_metrics(self) -> dict[str, nn.Module]:
         """Create the metrics, with the filter diagnostics."""
@@ -275,7 +275,7 @@ class ImageSpace(PoseEstimator):
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box that the box head computes, (B, 4) [px]."""
-        return self.box_head(trace, batch, self.model)
+        return self.box_head(trace, batch, self.object_model)
 
 
 class _EncodedMethod:
@@ -288,7 +288,7 @@ class _EncodedMethod:
             method.latent_width,
             method.measure,
         )
-        self.surface_points, self.model = method.surface_points, method.model
+        self.surface_points, self.object_model = method.surface_points, method.object_model
 
     def encode(self, batch: Batch) -> ImageEncoding:
         """Return what was encoded before."""

@@ -83,7 +83,7 @@ class Keypoints(Hypotheses):
     def encode(self, batch: Batch) -> KeypointEncoding:
         """Run the network."""
         logits = self.net(batch.rgb, batch.depth, batch.intrinsics)
-        keypoints = box_keypoints(self.model.hull).to(logits)
+        keypoints = box_keypoints(self.object_model.hull).to(logits)
         return KeypointEncoding(logits, keypoints, batch.intrinsics, batch.depth[:, 0])
 
     def propose_poses(

@@ -31,8 +31,10 @@ class PoseParticles(PoseEstimator):
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
         if self._space is None:
-            x, y, z = self.model.center.tolist()
-            self._space = PoseSpace((x, y, z), self.model.radius, points=self.model.points)
+            x, y, z = self.object_model.center.tolist()
+            self._space = PoseSpace(
+                (x, y, z), self.object_model.radius, points=self.object_model.points
+            )
         return self._space
 
     @property
@@ -40,9 +42,9 @@ class PoseParticles(PoseEstimator):
         """0: particles have no latent."""
         return 0
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Set the object, and forget the space about another's center."""
-        super().set_object(model)
+        super().set_object(object_model)
         self._space = None
 
 
@@ -80,7 +82,9 @@ class Hypotheses(PoseParticles):
         """Return the loss of the network's output, one value for each image."""
         encoding = self.encode(batch)
         none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {"loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.model)}
+        return {
+            "loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.object_model)
+        }
 
 
 def require_depth(valid: Tensor) -> None:

@@ -183,7 +183,7 @@ class PosePF(PoseParticles):
             encoding.coordinates.detach(),
             encoding.cells,
             self._center(),
-            self.model.radius,
+            self.object_model.radius,
             particles,
             generator,
         )
@@ -194,10 +194,10 @@ class PosePF(PoseParticles):
         count = self.likelihood_batch_size or len(batch.rgb)
         part = Batch(*(x[:count] for x in batch))
         candidates = self.candidate_sampler(self, encoding.first(count), part, generator)
-        losses = {"likelihood": self.loss(candidates, part, self.model)}
+        losses = {"likelihood": self.loss(candidates, part, self.object_model)}
         if encoding.coordinates is not None and encoding.cells is not None:
             assert self.proposals is not None
-            size = (self._center(), self.model.radius, float(self.proposals.reach))
+            size = (self._center(), self.object_model.radius, float(self.proposals.reach))
             fit, error = coordinate_loss(
                 encoding.coordinates, encoding.cells, batch.mask, batch.camera_from_object, *size
             )
@@ -211,14 +211,14 @@ class PosePF(PoseParticles):
         if self.proposals is None:
             return features
         seen = self._predict_coordinates(trace, batch)
-        return features | measure_coordinates(trace.belief.best, *seen, self.model)
+        return features | measure_coordinates(trace.belief.best, *seen, self.object_model)
 
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears by the proposal network; None without one."""
         if self.proposals is None:
             return None
         return measure_apparent_size(
-            trace.belief.best, *self._predict_coordinates(trace, batch), self.model
+            trace.belief.best, *self._predict_coordinates(trace, batch), self.object_model
         )
 
     def _predict_coordinates(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
@@ -228,14 +228,14 @@ class PosePF(PoseParticles):
         assert encoding.cells is not None
         return encoding.coordinates, encoding.cells
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Set the object of the networks too."""
-        super().set_object(model)
+        super().set_object(object_model)
         surface = getattr(self.likelihood, "surface", None)
         if surface is not None:
-            surface.set_object(model.points)
+            surface.set_object(object_model.points)
         if self.proposals is not None:
-            self.proposals.set_object(model.points, model.center, model.radius)
+            self.proposals.set_object(object_model.points, object_model.center, object_model.radius)
 
     def make_metrics(self) -> dict[str, nn.Module]:
         """Create the metrics, with a count of how often the truth is outscored."""
@@ -261,10 +261,10 @@ class PosePF(PoseParticles):
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
         outscored = scores[:, 0] > scores[:, 1]
         errors = (
-            error(trace.belief.best, batch.camera_from_object, self.model.points)
+            error(trace.belief.best, batch.camera_from_object, self.object_model.points)
             for error in (add, add_s)
         )
-        wrong = [outscored & (error > 0.1 * self.model.diameter) for error in errors]
+        wrong = [outscored & (error > 0.1 * self.object_model.diameter) for error in errors]
         for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
             self.scores[name].update(value.float())
 
@@ -286,7 +286,7 @@ class PosePF(PoseParticles):
         self.candidate_sampler.restore(checkpoint.get("candidate_sampler", {}))
 
     def _center(self) -> Tensor:
-        return self.model.center.to(self.device)
+        return self.object_model.center.to(self.device)
 
     def _score(
         self,
@@ -305,6 +305,12 @@ class PosePF(PoseParticles):
         )
         with bfloat16 if fast else nullcontext():
             score: Tensor = self.likelihood(
-                encoding.image, poses, sigma, self._center(), self.model.radius, pixels, generator
+                encoding.image,
+                poses,
+                sigma,
+                self._center(),
+                self.object_model.radius,
+                pixels,
+                generator,
             )
         return score.float() if fast else score

@@ -109,13 +109,13 @@ class RotationGrid(PoseParticles):
                 "model=rotation_grid learns from renders of the object's mesh: train it with a "
                 "PoseDataModule as `datamodule`, or call render() first"
             )
-        self.render(meshes.load(self.model.name))
+        self.render(meshes.load(self.object_model.name))
 
     def render(self, mesh: "Mesh") -> None:
         """Render the object in each rotation of the grid."""
         from posefilter.rendering.views import render_views  # Embree: prediction renders nothing
 
-        radius, center = self.model.radius, self.model.center
+        radius, center = self.object_model.radius, self.object_model.center
         reach, distance = self.reach * radius, self.distance * radius
         self.views = render_views(mesh, self.grid, center, reach, distance, self.net.side)
 
@@ -157,13 +157,13 @@ class RotationGrid(PoseParticles):
 
     def crop(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the crops about points.  (B, N, 3) [m] -> (B, N, 5, side, side)."""
-        return crop_views(*encoding, centers, self.reach * self.model.radius, self.net.side)
+        return crop_views(*encoding, centers, self.reach * self.object_model.radius, self.net.side)
 
     def measure(
         self, encoding: CropEncoding, particles: Particles, step: Step, generator: Generator
     ) -> ParticleOutput:
         """Score each translation by its mean likelihood over the grid, and draw a rotation."""
-        center = self.model.center.to(particles.state)
+        center = self.object_model.center.to(particles.state)
         places = origin_of(particles.state, center)
         scores = self.net.scale * self.encode_crops(encoding, places) @ self.codes.T
         mean = scores.logsumexp(-1)
@@ -184,7 +184,7 @@ class RotationGrid(PoseParticles):
 
         (B, N, 4, 4) camera_from_object [m] -> log-likelihoods (B, N).
         """
-        places = origin_of(poses, self.model.center.to(poses))
+        places = origin_of(poses, self.object_model.center.to(poses))
         codes = self.encode_crops(encoding, places)
         seen = look_at(places).mT @ rotation_of(poses)
         index, share = self.find_cells(seen)
@@ -217,25 +217,27 @@ class RotationGrid(PoseParticles):
         scores = self.net.scale * (seen @ known.T).unflatten(0, centers.shape[:2])
         encoding = TrainingEncoding(scores, centers, self.grid[cells])
         none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {"loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.model)}
+        return {
+            "loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.object_model)
+        }
 
     def draw_centers(self, batch: Batch, generator: Generator) -> Tensor:
         """Return points to crop about, (B, crops, 3) [m]: near the truth, from close to far, and
         where particles start and move to.
         """
         near = self.crops // 3
-        truth = origin_of(batch.camera_from_object, self.model.center.to(batch.depth))
+        truth = origin_of(batch.camera_from_object, self.object_model.center.to(batch.depth))
         count = self.crops - near
         others = draw_from_depth(batch.depth, batch.intrinsics, self.space, count, generator)
-        others = origin_of(others, self.model.center.to(others))
+        others = origin_of(others, self.object_model.center.to(others))
         centers = torch.cat([truth[:, None].expand(-1, near, 3), others], dim=1)
         noise = torch.randn(centers.shape, generator=generator, device=truth.device)
         spreads = [torch.logspace(-1.5, 0, n, device=truth.device) for n in (near, count)]
-        return centers + torch.cat(spreads)[:, None] * self.model.radius * noise
+        return centers + torch.cat(spreads)[:, None] * self.object_model.radius * noise
 
     def draw_cells(self, batch: Batch, generator: Generator) -> Tensor:
         """Return cells to score against: those nearest to each truth, and any.  -> (M,) int64."""
-        center = origin_of(batch.camera_from_object, self.model.center.to(batch.depth))
+        center = origin_of(batch.camera_from_object, self.object_model.center.to(batch.depth))
         seen = look_at(center).mT @ rotation_of(batch.camera_from_object)
         near = self.find_cells(seen, self.near_cells)[0].flatten()
         count = max(self.train_cells - len(near), self.train_cells // 4)

@@ -154,10 +154,10 @@ class CoordinateLoss:
 
     requires: ClassVar[Capabilities] = ("correspondences",)
 
-    def __call__(self, trace: Trace, batch: Batch, model: ObjectModel) -> Tensor:
+    def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,); the trace's encoding is `HasCoordinates`."""
         encoding: HasCoordinates = trace.encoding
-        size = (model.center.to(batch.depth), model.radius, float(encoding.reach))
+        size = (object_model.center.to(batch.depth), object_model.radius, float(encoding.reach))
         pose = batch.camera_from_object
         return coordinate_loss(encoding.coordinates, encoding.cells, batch.mask, pose, *size)[0]
 

@@ -119,7 +119,7 @@ class Gated(nn.Module):
 class _AnyObject(nn.Module):
     """A head that does not depend on the object."""
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Need nothing of the object."""
 
 
@@ -149,9 +149,9 @@ class _SurfacePointHead(nn.Module):
         self.register_buffer("center", torch.zeros(3), persistent=False)
         self.radius = 1.0
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Use the object's center and radius as origin and unit of object points."""
-        self.center, self.radius = model.center.to(self.center), model.radius
+        self.center, self.radius = object_model.center.to(self.center), object_model.radius
 
     def _pose(self, columns: Tensor, object_point: Tensor, point: Tensor) -> Tensor:
         """Return poses.
@@ -211,10 +211,12 @@ class SurfacePointFragments(_SurfacePointHead):
         self.register_buffer("centers", torch.zeros(fragments, 3))
         self.register_buffer("reach", torch.ones(()))
 
-    def set_object(self, model: ObjectModel) -> None:
+    def set_object(self, object_model: ObjectModel) -> None:
         """Compute the object's fragments, unless loaded weights have theirs."""
-        super().set_object(model)
-        init_fragments(self.centers, self.reach, model.points, model.center, model.radius)
+        super().set_object(object_model)
+        init_fragments(
+            self.centers, self.reach, object_model.points, object_model.center, object_model.radius
+        )
 
     def forward(self, raw: Tensor, point: Tensor) -> PosePrediction:
         """(B, N, 6 + 4 K), (B, N, 3) [m] -> PosePrediction."""

@@ -62,10 +62,10 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
 
 
 def _make_detection(result: Result, header: Any) -> Any:
-    belief, model = result.belief, result.object_model
+    belief, object_model = result.belief, result.object_model
     covariance = to_ros_covariance(belief.covariance, belief.mean, belief.center)
     middle = result.pose.copy()
-    points = model.points.detach().cpu().double().numpy()
+    points = object_model.points.detach().cpu().double().numpy()
     low, high = points.min(0), points.max(0)
     middle[:3, 3] += result.pose[:3, :3] @ ((low + high) / 2)
     size = dict(zip("xyz", (high - low).tolist(), strict=True))

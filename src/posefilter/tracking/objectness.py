@@ -68,5 +68,5 @@ def measure_presence(
     found = method.assess(trace, batch)
     if found is not None:
         return float(found.presence), found
-    free_space = measure_depth(trace.belief.best, batch, method.model)["free_space"]
+    free_space = measure_depth(trace.belief.best, batch, method.object_model)["free_space"]
     return min(1.0, objectness / _FULL) * min(1.0, 2 * float(free_space)), None

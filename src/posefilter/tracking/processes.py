@@ -143,7 +143,7 @@ class MultiprocessTracker:
         try:
             content = pickle.dumps(Start(self.tracks, threads), pickle.HIGHEST_PROTOCOL)
         except Exception as error:  # what a method of one's own holds may be anything
-            names = ", ".join(track.method.model.name for track in tracks)
+            names = ", ".join(track.method.object_model.name for track in tracks)
             raise UserError(
                 f"threads=: {names} cannot be tracked in several processes, since a method cannot "
                 f"be pickled ({error}); leave threads out to track in one"

@@ -54,7 +54,7 @@ def make_row(
     return TrackRow(video, frame, *ids, result, truth, *errors)
 
 
-def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, Any]:
+def compute_figures(rows: Sequence[TrackRow], object_model: ObjectModel) -> dict[str, Any]:
     """Return the figures of one object's rows, frames of one video or of several in their order.
 
     A frame counts as missed where the object is lost, and its error as infinite. A false track is
@@ -62,7 +62,7 @@ def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, A
 
     Args:
         rows: Of one object.
-        model: The object.
+        object_model: The object.
 
     Returns:
         `frames`, `lost`, `gaps` (frames until each loss ended; null where it did not), the seconds
@@ -91,21 +91,23 @@ def compute_figures(rows: Sequence[TrackRow], model: ObjectModel) -> dict[str, A
         return out
     for name in ("add", "add_s"):
         errors = [getattr(row, name) if row.result.is_tracked else math.inf for row in known]
-        out[name] = summarize(torch.tensor(errors), model.diameter)
-    wrong = [row for row in known if row.result.is_tracked and row.add_s >= 0.1 * model.diameter]
+        out[name] = summarize(torch.tensor(errors), object_model.diameter)
+    wrong = [
+        row for row in known if row.result.is_tracked and row.add_s >= 0.1 * object_model.diameter
+    ]
     absent = [row for row in rows if row.truth is None and row.result.is_tracked]
     out["false_tracks"] = len(wrong) + len(absent)
-    jitters = [measure_row_jitter(run, model) for run in _follow_ups(known)]
+    jitters = [measure_row_jitter(run, object_model) for run in _follow_ups(known)]
     shifts, turns = zip(*jitters, strict=True) if jitters else ((), ())
     out["jitter_mm"], out["jitter_deg"] = _rms(shifts), _rms(turns)
     return out
 
 
-def measure_row_jitter(pair: Sequence[TrackRow], model: ObjectModel) -> tuple[float, float]:
+def measure_row_jitter(pair: Sequence[TrackRow], object_model: ObjectModel) -> tuple[float, float]:
     """Return the jitter of two rows that follow each other, in mm and degrees."""
     poses = torch.from_numpy(np.stack([row.result.pose for row in pair]))
     truth = torch.from_numpy(np.stack([row.truth for row in pair if row.truth is not None]))
-    return measure_jitter(poses, truth.double(), model.center.cpu().double())
+    return measure_jitter(poses, truth.double(), object_model.center.cpu().double())
 
 
 def _follow_ups(rows: Sequence[TrackRow]) -> list[tuple[TrackRow, TrackRow]]:

@@ -72,9 +72,9 @@ class FrameScorer:
         return space
 
     @property
-    def model(self) -> ObjectModel:
+    def object_model(self) -> ObjectModel:
         """The object."""
-        return self.method.model
+        return self.method.object_model
 
     def encode(self, batch: Batch) -> Encoding:
         """Return the frame, which is encoded already."""

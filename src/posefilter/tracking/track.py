@@ -372,7 +372,7 @@ class Track:
         more = 2 * (motion.noise_scale(predicted.squared_innovation) - 1) * max(motion.scale[:3])
         return place_window(
             predicted.best[0].double().cpu().numpy(),
-            self.method.model,
+            self.method.object_model,
             images.intrinsics[0],
             (height, width),
             network_size(height, width, *self.size)[1] / width,
@@ -385,7 +385,7 @@ class Track:
 
     def _weigh(self, batch: Batch, trace: Trace) -> FrameEstimate:
         """Return what a frame shows, and whether the object is where the estimate puts it."""
-        belief, points = trace.belief, self.method.model.points
+        belief, points = trace.belief, self.method.object_model.points
         objectness = measure_objectness(trace.encoding.objectness, batch, belief.best[0], points)
         presence, found = measure_presence(self.method, trace, batch, objectness)
         return FrameEstimate(batch, belief, objectness, presence, found)
@@ -395,7 +395,9 @@ class Track:
         state = self.state
         if state is None:  # no more than a guess: a meter ahead
             ahead = torch.eye(4, device=self.method.device)
-            ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.model.center.to(ahead)
+            ahead[:3, 3] = ahead.new_tensor([0.0, 0.0, 1.0]) - self.method.object_model.center.to(
+                ahead
+            )
             state = begin(
                 BeliefBatch(
                     ahead[None, None], ahead.new_zeros(1, 1), ahead[None], ahead.new_zeros(1)

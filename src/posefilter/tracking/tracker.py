@@ -81,7 +81,7 @@ class Tracker:
     @property
     def objects(self) -> tuple[str, ...]:
         """The names of the objects, in the order of the results."""
-        return tuple(track.method.model.name for track in self.tracks)
+        return tuple(track.method.object_model.name for track in self.tracks)
 
     def update(self, rgb: Any, depth: Any, intrinsics: Any) -> Any:
         """Find each object in the next frame.

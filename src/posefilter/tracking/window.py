@@ -27,7 +27,7 @@ class Window(NamedTuple):
 
 def place_window(
     pose: np.ndarray,
-    model: ObjectModel,
+    object_model: ObjectModel,
     K: np.ndarray,
     size: tuple[int, int],
     scale: float,
@@ -38,7 +38,7 @@ def place_window(
 
     Args:
         pose: (4, 4) camera_from_object [m], where the object is expected.
-        model: The object.
+        object_model: The object.
         K: (3, 3) camera matrix of the photograph [px].
         size: Height and width of the photograph [px].
         scale: Seen pixels for one of the photograph's, at most; that of training.
@@ -49,10 +49,10 @@ def place_window(
         The window, cut at the photograph's edges; None where it would hold the whole photograph or
         none of it, or where the object is behind the camera.
     """
-    x, y, z = (pose[:3, :3] @ model.center.double().numpy() + pose[:3, 3]).tolist()
-    if z <= model.radius / 2:
+    x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
+    if z <= object_model.radius / 2:
         return None
-    half = reach * model.radius * float(K[0, 0]) / z
+    half = reach * object_model.radius * float(K[0, 0]) / z
     scale = min(scale, side / (2 * half))
     # a whole number of the network's cells, so that no pixel is padding
     cells = min(-(-round(2 * half * scale) // _CELL), side // _CELL)

@@ -54,7 +54,9 @@ def restore(track: Track, answer: Answer) -> TrackResult:
     """Take over what another process made of a track."""
     track.snapshot = answer.snapshot
     calibration = track.method.calibration if answer.result["features"] else None
-    return TrackResult(**answer.result, object_model=track.method.model, calibration=calibration)
+    return TrackResult(
+        **answer.result, object_model=track.method.object_model, calibration=calibration
+    )
 
 
 def main() -> None:
