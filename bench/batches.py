@@ -128,7 +128,7 @@ def main() -> None:
     keep_freed_memory()
     names = [options.only]
     meshes = open_meshes(options.meshes, None, "ycb_video", names)
-    reader = open_reader("ycb_video", options.frames, names, meshes, parts=["data"])
+    reader = open_reader("ycb_video", options.frames, names, meshes, subsets=["data"])
     frames = [frame for group in list_groups(reader) for frame in SceneVideo(reader, group, names)]
     frames = [frame for frame in frames if options.only in frame.truth][: options.size]
     estimator = posefilter.load(options.only, device="cpu")

@@ -55,7 +55,7 @@ VISIBLE = ((0.3, 0.5), (0.5, 0.8), (0.8, 1.01))
 RESAMPLED = 2000  # bootstrap samples
 TINY = (
     "data.generate.frames=30 data.generate.size=[160,120] data.generate.workers=1 "
-    "data.image_width=160 data.limit_val=2 data.limit_test=4 data.points=500 "
+    "data.image_width=160 data.limit_val=2 data.limit_test=4 data.num_model_points=500 "
     "filter.particles=8 filter.first_particles=null"
 )
 TINY_SCHEDULES = {
@@ -163,7 +163,7 @@ def list_tests(run: Run, root: Path, tiny: bool) -> Iterator[str]:
             f"data=scenes data.root={data / f'carton_clutter_{count}'} data.object=carton "
             f"data.generate.frames={frames} data.generate.frames_per_scene=2 "
             f"data.generate.seed={1000 + count} data.generate.distractors=[{count},{count}] "
-            "data.generate.occluded_share=0 data.split={train:1.0,val:train,test:train}"
+            "data.generate.occluded_fraction=0 data.split={train:1.0,val:train,test:train}"
         )
         checkpoint = str(run.folder / "checkpoints" / "best.ckpt")
         checkpoint = checkpoint.replace("=", r"\=").replace(",", r"\,")

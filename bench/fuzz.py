@@ -196,7 +196,7 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
         raise SystemExit(done.err)
     best = run_folder / "checkpoints" / "best.ckpt"
     absent = [word for word in once if not word.startswith("out=")]
-    absent += ["absent_share=1", f"out={folder / 'absent'}"]
+    absent += ["absent_fraction=1", f"out={folder / 'absent'}"]
     assert run("generate", absent, folder / "log").status == 0
     lines = {
         "train": [*small, f"out={folder}/NEW", "model=cnn_patch"],

@@ -1,7 +1,7 @@
 """Find several instances of an object in rendered scenes: how many are found, and at what cost.
 
     python generate.py out=DIR frames=36 meshes=MESHES object=003_cracker_box instances=3 seed=4242
-        lookalike_texture=own
+        lookalike_texture=same
     python bench/instances.py --root DIR --meshes MESHES --object 003_cracker_box [--limit 36]
         [--classes 5] [--draw FOLDER] [--out FILE.json]
 

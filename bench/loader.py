@@ -42,7 +42,7 @@ def measure(job: Job, cache: str, workers: int, steps: int) -> tuple[float, floa
     trainer = make_trainer(OmegaConf.merge(job.cfg.trainer, brief), [speed])
     trainer.fit(method, datamodule=data)
     found = speed.training()
-    return ready, found["train_steps_per_second"], found["waiting_share"]
+    return ready, found["train_steps_per_second"], found["waiting_fraction"]
 
 
 def main() -> None:

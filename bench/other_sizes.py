@@ -45,7 +45,7 @@ def render_command(root: Path, name: str, frames: int) -> list[str]:
     """Return what to run to render an object's scenes."""
     words = [f"out={root / name / 'data'}", f"object={name}", f"meshes={root / name / 'meshes'}"]
     words += [f"seed={SEEDS[name]}", f"frames={frames}", "frames_per_scene=2", "size=[320,240]"]
-    words += ["distractors=[3,5]", "occluded_share=0.2"]
+    words += ["distractors=[3,5]", "occluded_fraction=0.2"]
     return ["generate.py", *words]
 
 

@@ -83,7 +83,7 @@ class Way(NamedTuple):
 def read_photographs(root: str, meshes: str, names: Sequence[str], most: int) -> list[Shown]:
     """Return YCB-Video's photographs that show the objects, in order, `most` of each at most."""
     store = open_meshes(meshes, None, "ycb_video", list(names))
-    reader = open_reader("ycb_video", root, list(names), store, parts=["data"])
+    reader = open_reader("ycb_video", root, list(names), store, subsets=["data"])
     every = range(len(reader.records()))
     return [
         (name, record.group, sample)

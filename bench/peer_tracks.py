@@ -140,7 +140,7 @@ def measure(
 ) -> list[tuple[str, tuple[str, ...], list[str]]]:
     """Return the tables: ADD AUC, ADD-S AUC, milliseconds."""
     store = open_meshes(meshes, None, "ycb_video", list(names))
-    reader = open_reader("ycb_video", frames, list(names), store, parts=["data"])
+    reader = open_reader("ycb_video", frames, list(names), store, subsets=["data"])
     rows: list[tuple[list[str], dict[str, Any]]] = []
     for group in list_groups(reader):
         video = SceneVideo(reader, group, names)

@@ -50,7 +50,7 @@ def render_commands(
     frames: int = 300,
     folder: str = "data",
     first_seed: int = 1,
-    lookalike_texture: str = "own",
+    lookalike_texture: str = "same",
 ) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object.
 

@@ -55,7 +55,7 @@ def plan(tool: str, parts: Sequence[str]) -> list[Run]:
 def render_command(seed: int, tool: str) -> list[str]:
     """Return what to run to render the scenes whose target is a tool."""
     words = [f"out={ROOT / 'data' / tool}", f"object={tool}", f"seed={seed}", "frames=300"]
-    words += ["frames_per_scene=2", "size=[320,240]", "distractors=[3,7]", "lookalike_texture=own"]
+    words += ["frames_per_scene=2", "size=[320,240]", "distractors=[3,7]", "lookalike_texture=same"]
     return ["generate.py", *words, f"meshes={ROOT / 'meshes'}"]
 
 

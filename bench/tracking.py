@@ -12,7 +12,7 @@ the first four, and ± is the standard error of such a mean. Times are the proce
 process, so that other work on the machine changes them little; the ratio of the two is what to go
 by. Then the frames once more, of which six are replaced by those of another scene: how many are
 said to show the object, and after how many frames it is recovered. Sequences are folders of
-generate.py with moving= and covered_frames=: there the losses are in the frames. With
+generate.py with moving= and fully_occluded_frames=: there the losses are in the frames. With
 --together so many objects of a scene are tracked at once by one thread, by two that torch shares an
 operation's work out to, and by two processes that have an object each: in turn, by the clock, on an
 idle machine if the figures are to mean anything. Of the processor's time it is the first process'
@@ -415,7 +415,7 @@ def main() -> None:
         options.frames,
         names,
         open_meshes(options.meshes, None, "ycb_video", names),
-        parts=["data"],
+        subsets=["data"],
     )
     groups = list_groups(reader)
     every = {group: SceneVideo(reader, group, names) for group in groups}

@@ -49,8 +49,8 @@ def test_images_waiting_and_validations_are_timed_separately(
     assert validation == {
         "speed/validation_seconds": 48.0,
         "speed/validation_images_per_second": 0.5,
-        "speed/drawing_share": 0.05,
+        "speed/drawing_fraction": 0.05,
     }
     assert training["speed/train_images_per_second"] == pytest.approx(32 / 15)
     assert training["speed/train_steps_per_second"] == pytest.approx(4 / 15)
-    assert training["speed/waiting_share"] == pytest.approx(3 / 15)
+    assert training["speed/waiting_fraction"] == pytest.approx(3 / 15)

@@ -131,8 +131,8 @@ def test_every_chart_finds_what_methods_log() -> None:
         "filter/spread_px/step_00",
         "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/distance_coverage_50",
         "val/belief/mass_2cm",
-        "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_share",
-        "speed/drawing_share",
+        "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_fraction",
+        "speed/drawing_fraction",
     ]  # fmt: skip
     for charts in LAYOUT.values():
         for title, tags in charts.items():

@@ -90,7 +90,7 @@ def test_frames_without_the_object_can_be_generated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As calibrate.py asks for; there is nothing to outline in a preview."""
-    typed = ["absent_share=1", "frames=2", "size=[96,72]", "workers=1", "console=json"]
+    typed = ["absent_fraction=1", "frames=2", "size=[96,72]", "workers=1", "console=json"]
     generate(compose_job("generate", CONF, [f"out={tmp_path}/none", *typed], tmp_path))
     told = json.loads(capsys.readouterr().out)
     assert told["frames"] == 2

@@ -27,6 +27,21 @@ OLD = {
         "start": "not an argument that was renamed here",
         "loss_schedule": [{"until": 1.0, "factors": {"relevance": 0.0, "pose": 0.5}}],
     },
+    "data": {
+        "_target_": "posefilter.data.module.PoseDataModule",
+        "points": 500,
+        "model_points": None,
+        "options": {"part": "test", "parts": ["data"], "inverted": False},
+        "generate": {
+            "_target_": "posefilter.synthetic.generate.generate",
+            "occlusion": 0.75,
+            "occluded_share": 0.35,
+            "tabletop_share": 0.65,
+            "absent_share": 0.0,
+            "covered_frames": 0,
+            "lookalike_texture": "own",
+        },
+    },
     "filter": {
         "resample": {"_target_": "posefilter.filters.transport.OptimalTransport"},
         "reweight": {"_target_": "posefilter.filters.reweight.Annealed"},
@@ -42,6 +57,21 @@ NEW = {
         "loss": {"_target_": "posefilter.losses.contrastive.Contrastive"},
         "start": "not an argument that was renamed here",
         "loss_schedule": [{"until": 1.0, "factors": {"objectness": 0.0, "pose": 0.5}}],
+    },
+    "data": {
+        "_target_": "posefilter.data.module.PoseDataModule",
+        "num_model_points": 500,
+        "model_points_dir": None,
+        "options": {"split": "test", "subsets": ["data"], "inverted": False},
+        "generate": {
+            "_target_": "posefilter.synthetic.generate.generate",
+            "max_occlusion": 0.75,
+            "occluded_fraction": 0.35,
+            "tabletop_fraction": 0.65,
+            "absent_fraction": 0.0,
+            "fully_occluded_frames": 0,
+            "lookalike_texture": "same",
+        },
     },
     "filter": {
         "resample": {"_target_": "posefilter.filters.transport.SampledTransport"},

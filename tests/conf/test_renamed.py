@@ -86,6 +86,18 @@ RENAMED = {
     "callbacks.figures.every=5": "callbacks.figures.every_n_validations=5",
     "most_mb=8": "max_mb=8",
     "compact=false": "quantize=false",
+    "data.points=500": "data.num_model_points=500",
+    "data.model_points=models": "data.model_points_dir=models",
+    "data.options.part=test": "data.options.split=test",
+    "data.options.parts=[single]": "data.options.subsets=[single]",
+    "lookalike_texture=own": "lookalike_texture=same",
+    "data.generate.lookalike_texture=other": "data.generate.lookalike_texture=different",
+    "occlusion=0.5": "max_occlusion=0.5",
+    "data.generate.occlusion=0.5": "data.generate.max_occlusion=0.5",
+    "occluded_share=0.2": "occluded_fraction=0.2",
+    "data.generate.tabletop_share=1": "data.generate.tabletop_fraction=1",
+    "absent_share=1": "absent_fraction=1",
+    "covered_frames=6": "fully_occluded_frames=6",
     "budget=patch_pf/working": "the preset, with its size apart: preset/size=patch_pf",
 }
 

@@ -29,7 +29,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
         distractors=(1, 2),
         frames_per_scene=2,
         progress=False,
-        absent_share=0.5,
+        absent_fraction=0.5,
     )
     return out
 
@@ -58,8 +58,8 @@ def test_some_frames_lack_the_object_and_the_rest_is_as_it_was(
         twin = tmp_path / "whole" / file.relative_to(scenes)
         picture, other = (one.with_name(one.name.replace("json", "jpg")) for one in (file, twin))
         assert (picture.read_bytes() == other.read_bytes()) == (file not in lacking)
-    with pytest.raises(UserError, match="absent_share=2"):
-        generate(tmp_path / "no", 1, object="carton", absent_share=2, progress=False)
+    with pytest.raises(UserError, match="absent_fraction=2"):
+        generate(tmp_path / "no", 1, object="carton", absent_fraction=2, progress=False)
 
 
 def test_the_dataset_tells_them_apart(scenes: Path) -> None:

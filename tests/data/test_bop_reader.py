@@ -17,7 +17,7 @@ FRONT = pose((0.1, 0.2, 0.3), (0.06, -0.03, 0.35))
 
 def test_millimeters_become_meters(tmp_path):
     bop_scene(tmp_path / "test" / "000048", [[(2, pose()), (2, FRONT)], [(5, pose())]])
-    reader = BopReader(tmp_path, part="test")
+    reader = BopReader(tmp_path, split="test")
     assert reader.objects == ("obj_000002", "obj_000005")
     assert [(r.scene_id, r.im_id, r.obj_id, r.instance) for r in reader.records()] == [
         (48, 0, 2, 0),
@@ -132,14 +132,14 @@ def test_gray_images_and_depth_may_be_tiff(tmp_path):
     """As ITODD's are."""
     folder = tmp_path / "test" / "000001"
     bop_scene(folder, [[(5, pose())]])
-    expected = BopReader(tmp_path, part="test").read(0)
+    expected = BopReader(tmp_path, split="test").read(0)
     for old, new in (("rgb/000000.png", "gray/000000.tif"), ("depth/000000.png",) * 2):
         image = cv2.imread(str(folder / old), cv2.IMREAD_UNCHANGED)
         image = image[..., 0] if image.ndim == 3 else image
         (folder / new).parent.mkdir(exist_ok=True)
         (folder / old).unlink()
         assert cv2.imwrite(str((folder / new).with_suffix(".tif")), image)
-    sample = BopReader(tmp_path, part="test").read(0)
+    sample = BopReader(tmp_path, split="test").read(0)
     np.testing.assert_array_equal(sample.depth, expected.depth)
     np.testing.assert_array_equal(sample.rgb, expected.rgb[..., 2:].repeat(3, axis=-1))
 

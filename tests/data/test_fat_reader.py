@@ -177,7 +177,7 @@ def test_single_scene_folder_and_parts(tmp_path):
     mixed = fat_folder(tmp_path / "mixed" / "kitchen_0", {"toy": 24})
     fat_frame(mixed, 0, [("toy", 24, pose())])
     assert len(FatReader(tmp_path).records()) == 2
-    assert len(FatReader(tmp_path, parts=("mixed",)).records()) == 1
+    assert len(FatReader(tmp_path, subsets=("mixed",)).records()) == 1
     assert FatReader(folder).records()[0].group == "kitchen_0"
 
 

@@ -346,7 +346,7 @@ def test_a_spoilt_record_is_named(tmp_path: Path) -> None:
         ({"camera": "gopro"}, "camera=gopro"),
         ({"camera": (1, 2, 3)}, "four numbers"),
         ({"distractors": (5, 2)}, "distractors=5,2"),
-        ({"occlusion": 1.5}, "occlusion=1.5"),
+        ({"max_occlusion": 1.5}, "max_occlusion=1.5"),
         ({"workers": 0}, "workers=0"),
         ({"size": (8, 8)}, "size=8: must be a whole number, at least 32"),
         ({"renderer": "blender"}, "renderer=blender"),

@@ -335,16 +335,16 @@ def test_scenes_are_rendered_where_they_are_missing(tmp_path):
 
 
 def test_object_models_and_published_points(root, tmp_path):
-    dm = module(root, split={"test": 1.0}, points=500)
+    dm = module(root, split={"test": 1.0}, num_model_points=500)
     assert dm.object_model(0).points.shape == (500, 3)
     native = dm.reader.native_from_mesh("toy")
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
     (tmp_path / "toy").mkdir()
     np.savetxt(tmp_path / "toy" / "points.xyz", points @ native[:3, :3].T + native[:3, 3])
-    published = module(root, split={"test": 1.0}, model_points=tmp_path).object_model(0).points
+    published = module(root, split={"test": 1.0}, model_points_dir=tmp_path).object_model(0).points
     np.testing.assert_allclose(published, points, atol=1e-6)
     with pytest.raises(UserError, match=r"no toy/points\.xyz"):
-        module(root, model_points=tmp_path / "none").object_model(0)
+        module(root, model_points_dir=tmp_path / "none").object_model(0)
 
 
 def test_wrong_settings_are_named(root):

@@ -34,7 +34,7 @@ SETTINGS: dict[str, Any] = {
     "distractors": (2, 4),
     "frames_per_scene": 14,
     "moving": "both",
-    "covered_frames": 2,
+    "fully_occluded_frames": 2,
     "workers": 1,
     "progress": False,
 }
@@ -53,7 +53,7 @@ def test_a_path_is_smooth_and_as_fast_as_is_asked() -> None:
 
 
 def draw_one(scene: SceneSet, moves: str, tabletop: float) -> Scenario:
-    settings = SceneSettings(tabletop_share=tabletop, occlusion=0.3)
+    settings = SceneSettings(tabletop_fraction=tabletop, max_occlusion=0.3)
     rng, view = np.random.default_rng(1), View(K, H, W)
     for layout in draw(scene, settings, 12):
         found = draw_scenario(layout, MotionSettings(moves, 4.0, 1.0), 12, TEXTURE, rng)
@@ -136,8 +136,8 @@ def test_a_frame_of_a_sequence_does_not_depend_on_the_others(
     ("change", "message"),
     [
         ({"moving": "spin"}, "moving=spin: unknown; choose from none, camera, object, both"),
-        ({"moving": "none"}, "covered_frames: frames that follow each other are needed"),
-        ({"covered_frames": 99}, "covered_frames=99: a scene has 14 frames only"),
+        ({"moving": "none"}, "fully_occluded_frames: frames that follow each other are needed"),
+        ({"fully_occluded_frames": 99}, "fully_occluded_frames=99: a scene has 14 frames only"),
         ({"moving_mm": -1.0}, "moving_mm=-1"),
         ({"moving_mm": 900.0}, "no layout and path keep carton in view"),
     ],

@@ -28,12 +28,12 @@ def test_a_list_of_a_configuration_is_a_list_of_names() -> None:
         ("fat", "cameras", 0),
         ("fat", "cameras", []),
         ("fat", "cameras", ["left", "middle"]),
-        ("fat", "parts", None),
-        ("fat", "parts", "sing"),
-        ("ycb_video", "parts", 5),
-        ("ycb_video", "parts", {"data": 1}),
+        ("fat", "subsets", None),
+        ("fat", "subsets", "sing"),
+        ("ycb_video", "subsets", 5),
+        ("ycb_video", "subsets", {"data": 1}),
         ("ycb_video", "frames", 0.5),
-        ("bop", "part", 5),
+        ("bop", "split", 5),
     ],
 )
 def test_an_option_of_another_kind_is_named(

@@ -345,7 +345,7 @@ def test_a_single_bad_frame_is_listed(tmp_path, case):
         ("min_visibility", float("nan")),
         ("min_visibility", -1),
         ("min_visibility_test", 1.5),
-        ("points", 0),
+        ("num_model_points", 0),
         ("batch_size", 0),
         ("batch_size_test", 0),
         ("workers", -1),

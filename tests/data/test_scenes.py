@@ -92,7 +92,7 @@ def test_separated_never_calls_overlapping_boxes_apart() -> None:
 
 
 def test_objects_rest_on_the_table_keep_apart_and_stay_on_it(scene: SceneSet) -> None:
-    for layout in draw(scene, SceneSettings(tabletop_share=1.0), 12):
+    for layout in draw(scene, SceneSettings(tabletop_fraction=1.0), 12):
         table = layout.planes[0]
         top_from_camera = np.linalg.inv(table.camera_from_plane)
         for k, one in enumerate(layout.placed):
@@ -134,10 +134,10 @@ def visible_shares(layouts: list[Layout]) -> np.ndarray:
 @pytest.mark.parametrize("tabletop", [0.0, 1.0])
 def test_occluders_stand_in_front_when_asked(scene: SceneSet, tabletop: float) -> None:
     asked = visible_shares(
-        draw(scene, SceneSettings(occluded_share=1.0, tabletop_share=tabletop), 24)
+        draw(scene, SceneSettings(occluded_fraction=1.0, tabletop_fraction=tabletop), 24)
     )
     free = visible_shares(
-        draw(scene, SceneSettings(occluded_share=0.0, tabletop_share=tabletop), 24)
+        draw(scene, SceneSettings(occluded_fraction=0.0, tabletop_fraction=tabletop), 24)
     )
     assert ((asked > 0.2) & (asked < 0.65)).mean() > 0.6
     assert (free > 0.6).mean() > 0.85
@@ -145,13 +145,13 @@ def test_occluders_stand_in_front_when_asked(scene: SceneSet, tabletop: float) -
 
 
 def test_without_occlusion_nothing_hides_the_target(scene: SceneSet) -> None:
-    layouts = draw(scene, SceneSettings(occlusion=0.0, occluded_share=0.0), 10)
+    layouts = draw(scene, SceneSettings(max_occlusion=0.0, occluded_fraction=0.0), 10)
     # the foreseen outlines are coarse; the generator rejects the rest
     assert visible_shares(layouts).min() > 0.85
 
 
 def test_the_predicted_visibility_is_near_the_rendered_one(scene: SceneSet) -> None:
-    layouts = draw(scene, SceneSettings(occluded_share=0.6), 20)
+    layouts = draw(scene, SceneSettings(occluded_fraction=0.6), 20)
     foreseen = np.array([View(K, H, W).visible(list(layout.placed)) for layout in layouts])
     assert np.median(np.abs(foreseen - visible_shares(layouts))) < 0.06
 
@@ -193,14 +193,16 @@ def _channels(texture: np.ndarray) -> np.ndarray:
 
 
 def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="lookalike_texture=none: unknown; choose other or own"):
+    with pytest.raises(
+        UserError, match="lookalike_texture=none: unknown; choose different or same"
+    ):
         generate(tmp_path / "a", 1, object="carton", lookalike_texture="none")
     render = partial(
         generate, tmp_path / "b", 1, object="carton", size=(96, 72), workers=1, progress=False
     )
     render()
     with pytest.raises(UserError, match=r"begun with other settings \(lookalike_texture\)"):
-        render(lookalike_texture="own")
+        render(lookalike_texture="same")
     with pytest.raises(UserError, match=r"other settings \(frames_per_scene, moving, moving_mm\)"):
         render(moving="camera", moving_mm=3.0)
     with pytest.raises(UserError, match=r"other settings \(size\)"):
@@ -210,7 +212,24 @@ def test_lookalike_texture_is_checked_and_recorded(tmp_path: Path) -> None:
     plain = json.loads(record.read_text())
     del plain["settings"]["scenes"]["lookalike_texture"]
     record.write_text(json.dumps(plain))
-    assert render(lookalike_texture="own").rendered == 0
+    assert render(lookalike_texture="same").rendered == 0
+
+
+def test_a_record_by_the_names_of_before_is_of_the_same_settings(tmp_path: Path) -> None:
+    render = partial(
+        generate, tmp_path, 1, object="carton", size=(96, 72), workers=1, progress=False
+    )
+    render()
+    record = tmp_path / "_generator.json"
+    plain = json.loads(record.read_text())
+    scenes, motion = plain["settings"]["scenes"], plain["settings"]["motion"]
+    scenes["occlusion"] = scenes.pop("max_occlusion")
+    for name in ("occluded", "tabletop", "lookalike", "shadow", "absent"):
+        scenes[f"{name}_share"] = scenes.pop(f"{name}_fraction")
+    scenes["lookalike_texture"] = "other"
+    motion["covered_frames"] = motion.pop("fully_occluded_frames")
+    record.write_text(json.dumps(plain))
+    assert render().rendered == 0
 
 
 def test_the_second_camera_stands_to_the_right(scene: SceneSet) -> None:
@@ -224,7 +243,7 @@ def test_the_second_camera_stands_to_the_right(scene: SceneSet) -> None:
 
 def test_settled_objects_lie_on_the_table_and_touch_but_do_not_mix(scene: SceneSet) -> None:
     pytest.importorskip("mujoco", reason="the optional extra [sim] is not installed")
-    layouts = draw(scene, SceneSettings(tabletop_share=1.0, settle=True, distractors=(4, 6)), 6)
+    layouts = draw(scene, SceneSettings(tabletop_fraction=1.0, settle=True, distractors=(4, 6)), 6)
     tilts = 0
     for layout in layouts:
         top_from_camera = np.linalg.inv(layout.planes[0].camera_from_plane)

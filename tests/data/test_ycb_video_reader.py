@@ -63,7 +63,7 @@ def test_models_in_ycbvideos_own_frame_are_taken_as_they_are(root):
 
 
 def test_rendered_frames_with_alpha_and_float_indices(root):
-    reader = YCBVideoReader(root, NAME, parts=("data", "data_syn"))
+    reader = YCBVideoReader(root, NAME, subsets=("data", "data_syn"))
     (i,) = [i for i, r in enumerate(reader.records()) if r.name == "data_syn/000123"]
     sample = reader.read(i)
     assert sample.rgb.shape == (HEIGHT, WIDTH, 3)

@@ -45,7 +45,7 @@ def test_real_photographs_fit_their_meshes(real_data, meshes, tmp_path):
 
 
 def test_rendered_ycb_video_frames_fit_to_a_fraction_of_a_millimeter(real_data, meshes):
-    reader = YCBVideoReader(real_data / "ycbv", _SOME, meshes, parts=("data_syn",))
+    reader = YCBVideoReader(real_data / "ycbv", _SOME, meshes, subsets=("data_syn",))
     report = check_dataset(reader, meshes, limit=1)
     assert report["problems"] == []
     assert [row["frames"] for row in report["objects"]] == [1] * len(_SOME)

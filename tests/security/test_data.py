@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from posefilter.data.cache import DiskCache
-from posefilter.data.points import model_points
+from posefilter.data.points import read_model_points
 from posefilter.data.readers.decode import read_color, read_depth, read_label
 from posefilter.data.readers.registry import open_reader
 from posefilter.errors import UserError
@@ -176,7 +176,7 @@ def test_a_class_is_no_path(name: str, scenes: Path, secret: Path, watch: Any) -
         open_reader("fat", scenes)
     assert "\n" not in str(told.value)
     with watch, pytest.raises(UserError):
-        model_points(None, secret.parent / "scenes", name, np.eye(4))
+        read_model_points(None, secret.parent / "scenes", name, np.eye(4))
 
 
 def test_a_list_of_classes_is_no_list_of_paths(tmp_path: Path, watch: Any) -> None:

@@ -125,7 +125,7 @@ DATA: dict[str, dict[str, Any]] = {
     "root that is to be made": {"root": "src"},
     "linked root": {"root": "link"},
     "absolute meshes": {"meshes": "{secret}"},
-    "absolute points": {"model_points": "{secret}"},
+    "absolute points": {"model_points_dir": "{secret}"},
     "cache above": {"cache_dir": "../secret"},
     "cache on disk": {"cache": "disk"},
     "list of frames": {"options": {"frames": "{secret}/file.txt"}},

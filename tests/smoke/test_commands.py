@@ -166,7 +166,7 @@ def test_evaluate_finds_what_the_training_found_and_so_do_its_own_estimates(
     data += [
         "data.split={train: 0.6, val: 0.2, test: 0.2}",
         "data.min_visibility_test=0.3",
-        "data.points=500",
+        "data.num_model_points=500",
     ]
     typed = [*common, *data, f"estimates={tmp_path / 'a' / 'poses.csv'}", f"out={tmp_path / 'b'}"]
     assert run_command("evaluate", HOME, typed) == 0

@@ -48,7 +48,7 @@ def without(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return twelve frames that lack the carton."""
     out = tmp_path_factory.mktemp("without") / "scenes"
     few = {"distractors": (1, 2), "frames_per_scene": 4, "workers": 1, "progress": False}
-    generate(out, 12, object="carton", size=(160, 120), absent_share=1.0, **few)  # type: ignore[arg-type]
+    generate(out, 12, object="carton", size=(160, 120), absent_fraction=1.0, **few)  # type: ignore[arg-type]
     return out
 
 
@@ -103,7 +103,7 @@ def test_a_calibration_is_stored_and_not_overwritten(
         *QUIET,
     ]
     assert run_command("calibrate", HOME, few) == 2
-    assert "absent_share=1" in capfd.readouterr().err
+    assert "absent_fraction=1" in capfd.readouterr().err
 
 
 def test_an_absent_object_gets_no_pose_and_status_1(

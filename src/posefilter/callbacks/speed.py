@@ -14,7 +14,7 @@ class Speed(Callback):
     and what validations take.
 
     Training's numbers are means since they were last logged, every `log_every_n_steps` steps;
-    validations are left out of them. drawing_share: what other callbacks' figures have taken so
+    validations are left out of them. drawing_fraction: what other callbacks' figures have taken so
     far, over the time of all validations without them.
     """
 
@@ -51,7 +51,7 @@ class Speed(Callback):
         numbers = {
             "train_images_per_second": self._images / total,
             "train_steps_per_second": self._steps / total,
-            "waiting_share": self._waited / total,
+            "waiting_fraction": self._waited / total,
         }
         if torch.cuda.is_available():
             numbers["peak_memory_gib"] = torch.cuda.max_memory_allocated() / 2**30
@@ -87,7 +87,7 @@ class Speed(Callback):
             "validation_images_per_second": self._seen / seconds,
         }
         if budgets:
-            numbers["drawing_share"] = sum(b.drawn for b in budgets) / max(
+            numbers["drawing_fraction"] = sum(b.drawn for b in budgets) / max(
                 max(b.validated for b in budgets), 1e-9
             )
         self.write_down(trainer, numbers)

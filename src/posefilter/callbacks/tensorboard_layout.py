@@ -72,9 +72,9 @@ LAYOUT: dict[str, dict[str, list[str]]] = {
         "images a second, in training and in validation": [
             r"speed/(train|validation)_images_per_second$"
         ],
-        "share of the training that waits for data": [r"speed/waiting_share$"],
+        "share of the training that waits for data": [r"speed/waiting_fraction$"],
         "validation: seconds, and the share of them that is drawing": [
-            r"speed/(validation_seconds|drawing_share)$"
+            r"speed/(validation_seconds|drawing_fraction)$"
         ],
     },
 }

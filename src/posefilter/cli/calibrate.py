@@ -81,7 +81,7 @@ def calibrate(job: Job) -> None:
         raise UserError(
             f"{data.root}: {sum(map(len, absent))} frames of its validation scenes lack {name}, "
             f"and {FEWEST} are needed; render some, and name their folder: absent=DIR ("
-            f"{typed('generate', out='DIR', object=name, absent_share=1, frames=60)} meshes=...)"
+            f"{typed('generate', out='DIR', object=name, absent_fraction=1, frames=60)} meshes=...)"
         )
     shown = cfg.console != JSON
     calibration = learn(method, [data.val_dataset], absent, data.source, shown)

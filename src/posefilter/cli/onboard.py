@@ -141,7 +141,7 @@ class Onboarding:
             f"data.generate.frames={self.frames}",
             f"data.generate.workers={self.cfg.workers}",
             "data.generate.frames_per_scene=2",  # few scenes would be learned by heart
-            "data.generate.lookalike_texture=other",
+            "data.generate.lookalike_texture=different",
             f"data.generate.seed={self.cfg.seed}",
             f"data.split={_split(self.frames)}",
             f"data.limit_val={_VALIDATED}",
@@ -312,7 +312,7 @@ def calibrate(work: Onboarding) -> None:
         return
     settings = job.cfg.data
     OmegaConf.set_struct(settings, False)
-    settings.generate.update(frames=count, absent_share=1.0, seed=int(work.cfg.seed) + 1)
+    settings.generate.update(frames=count, absent_fraction=1.0, seed=int(work.cfg.seed) + 1)
     settings.root, settings.split = str(work.out / "absent"), {"val": 1.0}
     without = build_data(settings, work.cfg.console).absent_dataset("val", count)
     checkpoint = read_checkpoint(work.weights)

@@ -43,6 +43,13 @@ GROUPS = {
     "rung": "ablation",
     "deviation": "preset",
 }
+_GENERATE = {
+    "occlusion": "max_occlusion",
+    "occluded_share": "occluded_fraction",
+    "tabletop_share": "tabletop_fraction",
+    "absent_share": "absent_fraction",
+    "covered_frames": "fully_occluded_frames",
+}
 # groups and settings that are one setting now
 KEYS = {
     "normalisation": "model.net.normalization",
@@ -57,6 +64,15 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.objectness_weight",
+    "data.points": "data.num_model_points",
+    "data.model_points": "data.model_points_dir",
+    "data.options.part": "data.options.split",
+    "data.options.parts": "data.options.subsets",
+    **{
+        f"{place}{old}": f"{place}{new}"
+        for place in ("", "data.generate.")
+        for old, new in _GENERATE.items()
+    },
     "filter.looks": "filter.max_searches",
     "tracker.walk": "tracker.move_scale",
     "tracker.jump": "tracker.jump_penalty",
@@ -92,6 +108,7 @@ KEYS = {
     },
 }
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
+_LOOKALIKE_TEXTURE = {"other": "different", "own": "same"}
 _CHOICES = {
     "filter": {"pose_paper": "pose filter.particles=1000 filter.steps=100"},
     "filter/estimate": {"best": "argmax"},
@@ -135,6 +152,8 @@ _CHOICES = {
         "true": "false",
         "false": "true",
     },
+    "lookalike_texture": _LOOKALIKE_TEXTURE,
+    "data.generate.lookalike_texture": _LOOKALIKE_TEXTURE,
     "experiment": {"memorise": "memorize"},
     "console": {"plain": "json"},
     "callbacks": {"none": "checkpoints"},
@@ -236,6 +255,11 @@ ARGUMENTS = {
     "losses.rgbd_chamfer.RgbdChamfer": {"most": "max_pixels"},
     "losses.pose_loss.SurfacePointLoss": {"within": "offset_weight"},
     "labels.paper_points.PaperPoints": {"on": "surface_label", "behind": "behind_label"},
+    "data.module.PoseDataModule": {
+        "points": "num_model_points",
+        "model_points": "model_points_dir",
+    },
+    "synthetic.generate.generate": _GENERATE,
     "data.augmentation.RollAndZoom": {"about": "pivot", "any_roll": "uniform_roll_probability"},
     "data.augmentation.RandomCrop": {"anywhere": "uniform_probability"},
     "data.augmentation.RandomErasing": {"most": "max_rectangles"},
@@ -243,6 +267,10 @@ ARGUMENTS = {
     "callbacks.diagnostics.Diagnostics": {"share": "max_time_fraction"},
     "callbacks.figures.Figures": {"share": "max_time_fraction"},
 }
+# values of arguments of classes, likewise
+_VALUES = {("synthetic.generate.generate", "lookalike_texture"): _LOOKALIKE_TEXTURE}
+# options of the data module, which its readers take
+_OPTIONS = {"part": "split", "parts": "subsets"}
 _BUDGET = "the preset, with its size apart: preset/size="
 
 
@@ -256,6 +284,9 @@ def rename(override: str) -> str | None:
     if key == "budget":
         return _BUDGET + value.partition("/")[0]
     new = _rename_key(key)
+    # a name of before that, too
+    while (newer := _rename_key(new)) != new:
+        new = newer
     # its values are turned round, so that they are renamed together with their key alone
     choices = {} if key == new == "model.detach_position" else _CHOICES.get(new, {})
     values = ",".join(choices.get(one, one) for one in value.split(","))
@@ -322,9 +353,19 @@ def _upgrade(node: Any) -> Any:
         name = rename_argument(target, str(key)) or key
         if key == "factors" and isinstance(value, Mapping):  # of losses, in a stage of a training
             value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
+        if key == "options" and _below(target) == "data.module.PoseDataModule":
+            value = {_OPTIONS.get(n, n): v for n, v in value.items()} if value else value
+        values = _VALUES.get((_below(target), name), {})
+        if isinstance(value, str):
+            value = values.get(value, value)
         # both names: the old one is refused when the class is built
         out[key if name in node else name] = target if key == "_target_" else _upgrade(value)
     return out
+
+
+def _below(target: object) -> str:
+    """Return a class's place below posefilter."""
+    return str(target).removeprefix("posefilter.")
 
 
 def rename_argument(target: object, name: str) -> str | None:
@@ -334,7 +375,7 @@ def rename_argument(target: object, name: str) -> str | None:
         target: The class, as `_target_` names it.
         name: The argument, as it was called before.
     """
-    return ARGUMENTS.get(str(target).removeprefix("posefilter."), {}).get(name)
+    return ARGUMENTS.get(_below(target), {}).get(name)
 
 
 def rename_class(target: object) -> str | None:
@@ -343,5 +384,5 @@ def rename_class(target: object) -> str | None:
     Args:
         target: The class, as `_target_` named it.
     """
-    new = CLASSES.get(str(target).removeprefix("posefilter."))
+    new = CLASSES.get(_below(target))
     return new and f"posefilter.{new}"

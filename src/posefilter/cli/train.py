@@ -232,7 +232,8 @@ def places(job: Job) -> dict[str, Any]:
     """Return the folders that an evaluation is to be told: outside of the working folder no
     checkpoint decides on any.
     """
-    named = {key: job.cfg.data.get(key) for key in ("root", "meshes", "cache_dir", "model_points")}
+    folders = ("root", "meshes", "cache_dir", "model_points_dir")
+    named = {key: job.cfg.data.get(key) for key in folders}
     return {
         f"data__{key}": value
         for key, value in named.items()

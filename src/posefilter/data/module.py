@@ -18,7 +18,7 @@ from posefilter.data.decoding import FrameDecoder
 from posefilter.data.frames import FrameRecord, Reader
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import make_loader, spare_cores
-from posefilter.data.points import model_points
+from posefilter.data.points import read_model_points
 from posefilter.data.prepare import Criteria, usable
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
@@ -69,8 +69,8 @@ class PoseDataModule(LightningDataModule):
         limit_train: int | None = None,
         limit_val: int | None = None,
         limit_test: int | None = None,
-        points: int = 2000,
-        model_points: str | Path | None = None,
+        num_model_points: int = 2000,
+        model_points_dir: str | Path | None = None,
         generate: Callable[[Path], Any] | None = None,
         options: Mapping[str, Any] | None = None,
         progress: bool = True,
@@ -100,8 +100,8 @@ class PoseDataModule(LightningDataModule):
             limit_train: The first so many training frames of a fixed shuffle.
             limit_val: Likewise of val.
             limit_test: Likewise of test.
-            points: Surface points for ADD.
-            model_points: A folder with <class>/points.xyz in the dataset's own frame instead.
+            num_model_points: Surface points for ADD.
+            model_points_dir: A folder with <class>/points.xyz in the dataset's own frame instead.
             generate: Called with the root where scenes are yet to be rendered.
             options: The reader's own.
             progress: Draw bars.
@@ -133,7 +133,8 @@ class PoseDataModule(LightningDataModule):
         self._workers = spare_cores() if workers is None else workers
         self._seed, self._augment, self._on_error = seed, augment, on_error
         self._cache_kind, self._cache_dir = cache, cache_dir
-        self._points, self._model_points, self._progress = points, model_points, progress
+        self._num_model_points, self._model_points_dir = num_model_points, model_points_dir
+        self._progress = progress
         self._datasets: dict[str, FrameDataset] = {}
         self._left_out: dict[str, Counter[str]] = {}
 
@@ -203,10 +204,10 @@ class PoseDataModule(LightningDataModule):
                 f"{name}: builtin meshes are not the objects of real photographs; "
                 f"give data.meshes=DIR"
             )
-        points = model_points(
-            self._model_points, self.root, name, self.reader.native_from_mesh(name)
+        points = read_model_points(
+            self._model_points_dir, self.root, name, self.reader.native_from_mesh(name)
         )
-        return object_model(self.meshes.load(name), points=points, count=self._points)
+        return object_model(self.meshes.load(name), points=points, count=self._num_model_points)
 
     def object_to_learn(self) -> ObjectModel:
         """Return the first class as a method learns it: with the texture of its mesh.

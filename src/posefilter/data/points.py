@@ -8,7 +8,7 @@ from posefilter.errors import UserError
 from posefilter.paths import is_plain_name
 
 
-def model_points(
+def read_model_points(
     folder: str | Path | None, root: Path, name: str, native_from_mesh: np.ndarray
 ) -> np.ndarray | None:
     """Return a class's points in the mesh file's frame, None where the dataset brings none.  -> (P,
@@ -25,7 +25,7 @@ def model_points(
     )
     if path is None:
         if folder is not None:
-            raise UserError(f"{folder}: no {name}/points.xyz here (data.model_points)")
+            raise UserError(f"{folder}: no {name}/points.xyz here (data.model_points_dir)")
         return None
     try:
         native = np.loadtxt(path, dtype=np.float64, ndmin=2)

@@ -63,7 +63,7 @@ class Job:
 
     def lacks_target(self, frame: int) -> bool:
         """Tell whether the target is taken out of a frame."""
-        share = self.scenes.absent_share
+        share = self.scenes.absent_fraction
         return share > 0 and bool(np.random.default_rng([self.seed, 3, frame]).random() < share)
 
     def files(self, out: Path, frame: int) -> list[Path]:
@@ -223,7 +223,7 @@ class FrameRenderer:
         """Return whether enough of an instance of the target is visible."""
         seen, alone = int((picture.index == instance).sum()), int(picture.unoccluded[instance])
         least = 0.002 * self.job.width * self.job.height
-        return alone >= least and seen >= (1 - self.job.scenes.occlusion) * alone
+        return alone >= least and seen >= (1 - self.job.scenes.max_occlusion) * alone
 
     def _images(
         self,

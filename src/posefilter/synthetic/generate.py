@@ -44,6 +44,16 @@ _TYPED = {
     "translation_mm": "moving_mm",
     "rotation_deg": "moving_deg",
 }
+# names in records of earlier versions
+_RENAMED = {
+    "occlusion": "max_occlusion",
+    "occluded_share": "occluded_fraction",
+    "tabletop_share": "tabletop_fraction",
+    "lookalike_share": "lookalike_fraction",
+    "shadow_share": "shadow_fraction",
+    "absent_share": "absent_fraction",
+    "covered_frames": "fully_occluded_frames",
+}
 
 
 @dataclass(frozen=True)
@@ -73,22 +83,22 @@ def generate(
     stereo: bool = False,
     sensor: str = "kinect",
     camera: str | Sequence[float] = "ycb_video",
-    occlusion: float = 0.75,
-    occluded_share: float = 0.4,
+    max_occlusion: float = 0.75,
+    occluded_fraction: float = 0.4,
     distractors: tuple[int, int] = (2, 8),
-    tabletop_share: float = 0.65,
+    tabletop_fraction: float = 0.65,
     frames_per_scene: int | None = None,
     settle: bool = False,
     renderer: str = "embree",
     progress: bool = True,
     mesh_scale: float | None = None,
-    absent_share: float = 0.0,
+    absent_fraction: float = 0.0,
     instances: int = 1,
     moving: str = "none",
     moving_mm: float = 5.0,
     moving_deg: float = 1.0,
-    covered_frames: int = 0,
-    lookalike_texture: str = "other",
+    fully_occluded_frames: int = 0,
+    lookalike_texture: str = "different",
 ) -> Summary:
     """Render frames of an object into a FAT dataset, or resume one that was begun.
 
@@ -99,33 +109,34 @@ def generate(
         out: The dataset's folder.
         frames: How many frames it is to hold.
         meshes: "builtin" or a folder.
-        object: The mesh that every frame shows, but for those of `absent_share`.
+        object: The mesh that every frame shows, but for those of `absent_fraction`.
         seed: Decides every draw.
         workers: Processes that render.
         size: Width and height [px].
         stereo: Also render a right camera.
         sensor: "kinect" or "ideal".
         camera: "ycb_video", "fat", or (fx, fy, cx, cy) [px] for that size.
-        occlusion: The largest share of the object that may be hidden.
-        occluded_share: The share of frames in which something stands right in front of it.
+        max_occlusion: The largest share of the object that may be hidden.
+        occluded_fraction: The share of frames in which something stands right in front of it.
         distractors: The least and most objects beside it.
-        tabletop_share: The share of frames on a table; in the rest objects float.
+        tabletop_fraction: The share of frames on a table; in the rest objects float.
         frames_per_scene: Frames that share surroundings and distractors. None: 2, since filters
             learn few scenes by heart; 30 where something moves from frame to frame.
         settle: Let objects fall and come to rest (mujoco).
         renderer: "embree" or "opengl".
         progress: Draw a bar.
         mesh_scale: Meters a unit of the mesh files; None: 1.
-        absent_share: The share of frames that the object is taken out of, once all else is placed:
-            so that a filter can be told to say that it is not there.
+        absent_fraction: The share of frames that the object is taken out of, once all else is
+            placed: so that a filter can be told to say that it is not there.
         instances: How many of the object a frame shows.
         moving: "none": each frame is arranged anew; "camera", "object" or "both": the frames of a
             scene follow each other, and that moves smoothly.
         moving_mm: Its shift from frame to frame, root mean square [mm].
         moving_deg: Its turn likewise [degrees].
-        covered_frames: Frames in a row of each scene in which something hides the object wholly.
-        lookalike_texture: "other": distractors of the object's shape have another texture than it;
-            "own": some have its own, stretched or recolored.
+        fully_occluded_frames: Frames in a row of each scene in which something hides the object
+            wholly.
+        lookalike_texture: "different": distractors of the object's shape have another texture than
+            it; "same": some have its own, stretched or recolored.
 
     Returns:
         What was done.
@@ -136,11 +147,11 @@ def generate(
     out = Path(out)
     scenes = SceneSettings(
         distractors=(int(distractors[0]), int(distractors[1])),
-        occlusion=float(occlusion),
-        occluded_share=float(occluded_share),
-        tabletop_share=float(tabletop_share),
+        max_occlusion=float(max_occlusion),
+        occluded_fraction=float(occluded_fraction),
+        tabletop_fraction=float(tabletop_fraction),
         settle=bool(settle),
-        absent_share=float(absent_share),
+        absent_fraction=float(absent_fraction),
         instances=int(instances),
         lookalike_texture=str(lookalike_texture),
     )
@@ -160,7 +171,7 @@ def generate(
         renderer,
         scenes,
         1.0 if mesh_scale is None else float(mesh_scale),
-        MotionSettings(moving, float(moving_mm), float(moving_deg), int(covered_frames)),
+        MotionSettings(moving, float(moving_mm), float(moving_deg), int(fully_occluded_frames)),
     )
     _check(job, frames, workers)
     store = MeshStore(meshes, scale=job.mesh_scale)
@@ -234,27 +245,27 @@ def _check(job: Job, frames: int, workers: int) -> None:
         "frames_per_scene": job.frames_per_scene,
         "size": [job.width, job.height],
         "distractors": [low, high],
-        "occlusion": job.scenes.occlusion,
-        "occluded_share": job.scenes.occluded_share,
-        "tabletop_share": job.scenes.tabletop_share,
-        "absent_share": job.scenes.absent_share,
+        "max_occlusion": job.scenes.max_occlusion,
+        "occluded_fraction": job.scenes.occluded_fraction,
+        "tabletop_fraction": job.scenes.tabletop_fraction,
+        "absent_fraction": job.scenes.absent_fraction,
         "instances": job.scenes.instances,
         "mesh_scale": job.mesh_scale,
         "moving_mm": job.motion.translation_mm,
         "moving_deg": job.motion.rotation_deg,
-        "covered_frames": job.motion.covered_frames,
+        "fully_occluded_frames": job.motion.fully_occluded_frames,
     }
     check_ranges(numbers, "generate")
     if high < low:
         raise UserError(f"distractors={low},{high}: needs 0 <= min <= max")
-    if job.motion.covered_frames > job.frames_per_scene:
+    if job.motion.fully_occluded_frames > job.frames_per_scene:
         raise UserError(
-            f"covered_frames={job.motion.covered_frames}: a scene has {job.frames_per_scene} "
-            f"frames only (frames_per_scene)"
+            f"fully_occluded_frames={job.motion.fully_occluded_frames}: a scene has "
+            f"{job.frames_per_scene} frames only (frames_per_scene)"
         )
-    if job.scenes.lookalike_texture not in ("other", "own"):
+    if job.scenes.lookalike_texture not in ("different", "same"):
         raise UserError(
-            f"lookalike_texture={job.scenes.lookalike_texture}: unknown; choose other or own"
+            f"lookalike_texture={job.scenes.lookalike_texture}: unknown; choose different or same"
         )
     sensor_model(job.sensor)
     make_renderer(job.renderer)
@@ -343,9 +354,16 @@ def _as_typed(names: list[str]) -> list[str]:
     return sorted(typed - {"camera"} if "size" in typed else typed)
 
 
+def _by_todays_names(settings: dict[str, Any]) -> dict[str, Any]:
+    return {_RENAMED.get(name, name): value for name, value in settings.items()}
+
+
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return recorded settings with defaults of later ones, and the renderer's current name."""
-    defaults = {"absent_share": 0.0, "instances": 1, "lookalike_texture": "own"}
-    scenes = {**defaults, **settings.get("scenes", {})}
-    out = {"mesh_scale": 1.0, "motion": asdict(MotionSettings()), **settings, "scenes": scenes}
+    """Return recorded settings by today's names, with defaults of later ones."""
+    defaults = {"absent_fraction": 0.0, "instances": 1, "lookalike_texture": "same"}
+    scenes = {**defaults, **_by_todays_names(settings.get("scenes", {}))}
+    texture = scenes["lookalike_texture"]
+    scenes["lookalike_texture"] = {"other": "different", "own": "same"}.get(texture, texture)
+    motion = {**asdict(MotionSettings()), **_by_todays_names(settings.get("motion", {}))}
+    out = {"mesh_scale": 1.0, **settings, "scenes": scenes, "motion": motion}
     return {**out, "renderer": "opengl"} if out.get("renderer") == "moderngl" else out

@@ -31,7 +31,8 @@ class MotionSettings:
         moves: "none": each frame is arranged anew; "camera", "object" or "both".
         translation_mm: Root mean square, from one frame to the next, of what moves [mm].
         rotation_deg: The same [degrees].
-        covered_frames: Frames in a row, in the middle of each scene, in which the object is hidden.
+        fully_occluded_frames: Frames in a row, in the middle of each scene, in which the object is
+            hidden.
 
     Raises:
         UserError: A value is wrong.
@@ -40,16 +41,16 @@ class MotionSettings:
     moves: str = "none"
     translation_mm: float = 5.0
     rotation_deg: float = 1.0
-    covered_frames: int = 0
+    fully_occluded_frames: int = 0
 
     def __post_init__(self) -> None:
         """Check the choice."""
         if self.moves not in MOTIONS:
             raise UserError(f"moving={self.moves}: unknown; choose from {', '.join(MOTIONS)}")
-        if self.covered_frames and self.moves == "none":
+        if self.fully_occluded_frames and self.moves == "none":
             raise UserError(
-                "covered_frames: frames that follow each other are needed; choose moving=camera, "
-                "object or both"
+                "fully_occluded_frames: frames that follow each other are needed; choose "
+                "moving=camera, object or both"
             )
 
 
@@ -133,15 +134,15 @@ def draw_scenario(
     target = paths[1] if settings.moves in ("object", "both") else still
     if layout.tabletop:
         target = _stay_on_table(target, layout)
-    start = (frames - settings.covered_frames) // 2
+    start = (frames - settings.fully_occluded_frames) // 2
     angle = rng.uniform(0, 2 * math.pi)
     cover = Plane(np.eye(4), (1.0, 1.0), texture, float(rng.uniform(0.1, 0.4)))
     return Scenario(
         layout,
         camera,
         target,
-        cover if settings.covered_frames else None,
-        range(start, start + settings.covered_frames),
+        cover if settings.fully_occluded_frames else None,
+        range(start, start + settings.fully_occluded_frames),
         np.array([math.cos(angle), math.sin(angle)]),
     )
 

@@ -40,20 +40,21 @@ class SceneSettings:
     """The distributions that scenes are drawn from."""
 
     distractors: tuple[int, int] = (2, 8)  # least and most beside the target
-    occlusion: float = 0.75  # largest share of the target that may be hidden
+    max_occlusion: float = 0.75  # largest share of the target that may be hidden
     # share of frames in which something is put right in front of the target
-    occluded_share: float = 0.4
-    tabletop_share: float = 0.65
-    lookalike_share: float = 0.25  # chance that a distractor is a look-alike
+    occluded_fraction: float = 0.4
+    tabletop_fraction: float = 0.65
+    lookalike_fraction: float = 0.25  # chance that a distractor is a look-alike
     lookalikes: int = 4  # different ones a scene set
-    lookalike_texture: str = "other"  # than the target's; or own: some have the target's
+    lookalike_texture: str = "different"  # than the target's; or same: some have it
     classes: int = 14  # distractor classes a scene set
     distance: tuple[float, float] = (0.45, 1.4)  # [m] camera to target
     elevation_deg: tuple[float, float] = (10.0, 85.0)
     largest_truncation: float = 0.4  # share of the target's outline that may leave the frame
-    shadow_share: float = 0.7
+    shadow_fraction: float = 0.7
     settle: bool = False  # let the objects on a table fall and come to rest (mujoco)
-    absent_share: float = 0.0  # share of frames that the target is taken out of, once all is placed
+    # share of frames that the target is taken out of, once all is placed
+    absent_fraction: float = 0.0
     instances: int = 1  # of the target in a frame
 
 
@@ -123,9 +124,9 @@ def draw_scene_set(
     distractors = tuple(library.solid(name) for name in chosen)
     photos = [s.mesh.texture for s in distractors if min(s.mesh.texture.shape[:2]) >= 64]
     names = [f"{LOOKALIKE}{k:02d}" for k in range(settings.lookalikes)]
-    own = settings.lookalike_texture == "own"
+    same = settings.lookalike_texture == "same"
     lookalikes = tuple(
-        make_solid(make_lookalike(goal.mesh, name, photos, rng, own)) for name in names
+        make_solid(make_lookalike(goal.mesh, name, photos, rng, same)) for name in names
     )
     table, floor, wall = (random_texture(rng, 256, photos, w) for w in (_TABLE, _FLOOR, _FLOOR))
     tiles = (
@@ -167,14 +168,14 @@ def draw_layout(
         The layout, or None where this draw is not possible and another has to be made.
     """
     view = View(K, height, width)
-    occluded = bool(rng.random() < settings.occluded_share)
-    least = 1 - settings.occlusion
+    occluded = bool(rng.random() < settings.occluded_fraction)
+    least = 1 - settings.max_occlusion
     wanted = (
         rng.uniform(min(max(0.28, least), 0.6), 0.6)
         if occluded
         else rng.uniform(max(0.6, least), 1.0)
     )
-    tabletop = bool(rng.random() < settings.tabletop_share)
+    tabletop = bool(rng.random() < settings.tabletop_fraction)
     # not every corner of a table has room in front of the target
     for _ in range(8 if occluded else 1):
         placed, table = _draw_objects(scene, settings, view, tabletop, occluded, wanted, rng)
@@ -233,7 +234,7 @@ def _draw_objects(
         placed = settle(placed, table, rng)
         if (
             not view.holds(placed[0], settings.largest_truncation)
-            or view.visible(placed) < 1 - settings.occlusion
+            or view.visible(placed) < 1 - settings.max_occlusion
         ):
             return [], table
     return placed, table
@@ -247,7 +248,9 @@ def _draw_solids(scene: SceneSet, settings: SceneSettings, rng: np.random.Genera
     alike = [scene.lookalikes[i] for i in rng.permutation(len(scene.lookalikes))]
     out: list[Solid] = []
     while len(out) < count and (usual or alike):
-        pool = alike if alike and (not usual or rng.random() < settings.lookalike_share) else usual
+        pool = (
+            alike if alike and (not usual or rng.random() < settings.lookalike_fraction) else usual
+        )
         out.append(pool.pop())
     return out
 
@@ -289,7 +292,7 @@ def _draw_lights(up: np.ndarray, settings: SceneSettings, rng: np.random.Generat
         strengths=strengths,
         specular=float(rng.uniform(0, 0.35) * (rng.random() < 0.5)),
         shininess=float(rng.uniform(5, 40)),
-        shadows=bool(rng.random() < settings.shadow_share),
+        shadows=bool(rng.random() < settings.shadow_fraction),
         shadow_blur=float(rng.uniform(0.5, 3)),
         background=tuple(float(c) for c in random_color(rng)),  # type: ignore[arg-type]
     )

@@ -71,7 +71,7 @@ class _Entry:
 
 
 class BopReader(BaseReader):
-    """A split's folder of a BOP dataset (`test`, `train_pbr`, ...), or the dataset's with `part`
+    """A split's folder of a BOP dataset (`test`, `train_pbr`, ...), or the dataset's with `split`
     naming the split.
     """
 
@@ -80,7 +80,7 @@ class BopReader(BaseReader):
         root: str | Path,
         objects: str | Sequence[str] | None = None,
         meshes: MeshStore | None = None,
-        part: str | None = None,
+        split: str | None = None,
         mesh_frame: str | None = None,
         inverted: bool = False,
         on_error: str = "raise",
@@ -91,7 +91,7 @@ class BopReader(BaseReader):
             root: The folder of a split, or of the dataset.
             objects: `obj_000002` as the models are named, or YCB's names for YCB-V; None: all.
             meshes: For visibility.
-            part: The split, where `root` is the dataset's folder.
+            split: BOP's split, where `root` is the dataset's folder.
             mesh_frame: "bop" where meshes are the dataset's own (the default for obj_...; the mesh
                 store wants scale=0.001), "original" where they are google_16k (the default for
                 YCB's names).
@@ -105,14 +105,14 @@ class BopReader(BaseReader):
         super().__init__(root, meshes, on_error)
         if not isinstance(inverted, bool):
             raise UserError(f"data.options.inverted={inverted}: choose true or false")
-        need_text("part", part)
+        need_text("split", split)
         self._inverted = inverted
-        base = self.root / part if part else self.root
+        base = self.root / split if split else self.root
         folders = sorted(_scene_folders(base))
         if not folders:
             raise UserError(
                 f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
-                f"data.options.part)"
+                f"data.options.split)"
             )
         scenes = [(folder, self._read_scene(folder)) for folder in folders]
         wanted = [objects] if isinstance(objects, str) else objects

@@ -72,7 +72,7 @@ class FatReader(BaseReader):
         objects: str | Sequence[str] | None = None,
         meshes: MeshStore | None = None,
         cameras: Sequence[str] = ("left", "right"),
-        parts: Sequence[str] = ("single", "mixed"),
+        subsets: Sequence[str] = ("single", "mixed"),
         on_error: str = "raise",
     ) -> None:
         """List the frames.
@@ -83,7 +83,7 @@ class FatReader(BaseReader):
             meshes: For visibility, and to tell two instances of a class apart; without, frames
                 with two are left out.
             cameras: "left", "right" or both.
-            parts: "single", "mixed" or both.
+            subsets: "single", "mixed" or both.
             on_error: "raise", or "skip" broken frames and count them.
 
         Raises:
@@ -91,11 +91,11 @@ class FatReader(BaseReader):
         """
         super().__init__(root, meshes, on_error)
         self.cameras = choose_several("cameras", cameras, ("left", "right"))
-        parts = choose_several("parts", parts, ("single", "mixed"))
+        subsets = choose_several("subsets", subsets, ("single", "mixed"))
         self._native: dict[str, np.ndarray] = {}
         # a folder whose frame of the class is not the first folder's
         self._ambiguous: dict[str, Path] = {}
-        folders = sorted(scene_folders(self.root, set(parts)))
+        folders = sorted(scene_folders(self.root, set(subsets)))
         if not folders:
             raise UserError(
                 f"{self.root}: no FAT scenes here: no folder with "

@@ -42,7 +42,7 @@ class FatCamera:
     width: int
 
 
-def scene_folders(root: Path, parts: set[str], deep: int = 0) -> Iterator[Path]:
+def scene_folders(root: Path, subsets: set[str], deep: int = 0) -> Iterator[Path]:
     """Yield the folders that hold frames, not looking below them."""
     if not root.is_dir():
         raise UserError(f"{root}: no such folder (data.root)")
@@ -64,9 +64,9 @@ def scene_folders(root: Path, parts: set[str], deep: int = 0) -> Iterator[Path]:
         if (
             (root / name).is_dir()
             and not name.startswith(".")
-            and (name not in {"single", "mixed"} or name in parts)
+            and (name not in {"single", "mixed"} or name in subsets)
         ):
-            yield from scene_folders(root / name, parts, deep + 1)
+            yield from scene_folders(root / name, subsets, deep + 1)
 
 
 def mesh_name(fat_class: Any, path: Path) -> str:

@@ -59,7 +59,7 @@ class YCBVideoReader(BaseReader):
         root: str | Path,
         objects: str | Sequence[str] | None = None,
         meshes: MeshStore | None = None,
-        parts: Sequence[str] = ("data",),
+        subsets: Sequence[str] = ("data",),
         frames: str | Path | None = None,
         mesh_frame: str = "original",
         on_error: str = "raise",
@@ -70,7 +70,7 @@ class YCBVideoReader(BaseReader):
             root: The dataset's folder, its `data` or `data_syn`, or a scene's.
             objects: Classes; None: all.
             meshes: For visibility, and to tell two instances of a class apart.
-            parts: "data", "data_syn" or both.
+            subsets: "data", "data_syn" or both.
             frames: A list such as image_sets/keyframe.txt; nothing else is looked at.
             mesh_frame: "original" where meshes are YCB's google_16k, "ycb_video" where they are
                 YCB-Video's own models.
@@ -82,7 +82,7 @@ class YCBVideoReader(BaseReader):
         super().__init__(root, meshes, on_error)
         if mesh_frame not in ("original", "ycb_video"):
             raise UserError(f"data.options.mesh_frame={mesh_frame}: choose original or ycb_video")
-        parts = choose_several("parts", parts, ("data", "data_syn"))
+        subsets = choose_several("subsets", subsets, ("data", "data_syn"))
         need_text("frames", frames)
         self._mesh_frame = mesh_frame
         self._classes = read_class_names(self.root)
@@ -95,7 +95,7 @@ class YCBVideoReader(BaseReader):
         self._native = {name: self.native_from_mesh(name) for name in self.objects}
         self._distrust_builtin()
         self._entries: list[_Entry] = []
-        for scene_id, im_id, name, stem in self._frames(set(parts), frames):
+        for scene_id, im_id, name, stem in self._frames(set(subsets), frames):
             try:
                 self._entries += self._list_frame(scene_id, im_id, name, stem)
             except BadData as error:
@@ -163,12 +163,12 @@ class YCBVideoReader(BaseReader):
         return mask
 
     def _frames(
-        self, parts: set[str], listed: str | Path | None
+        self, subsets: set[str], listed: str | Path | None
     ) -> Iterator[tuple[int, int, str, Path]]:
         """Yield (scene_id, im_id, name, path without its ending) of every frame, in order."""
         if not self.root.is_dir():
             raise UserError(f"{self.root}: no such folder (data.root)")
-        folders = dict(list_scenes(self.root, parts))
+        folders = dict(list_scenes(self.root, subsets))
         if not folders:
             raise UserError(
                 f"{self.root}: no YCB-Video scenes here: no <scene>/NNNNNN-meta.mat "

@@ -51,15 +51,15 @@ def read_class_names(root: Path) -> tuple[str, ...]:
     return ycb.CLASSES
 
 
-def list_scenes(root: Path, parts: set[str]) -> Iterator[tuple[str, Path]]:
+def list_scenes(root: Path, subsets: set[str]) -> Iterator[tuple[str, Path]]:
     """Yield scenes by name: those of `data` by number, `data_syn` as one."""
     if list_stems(root):
         yield (SYNTHETIC if root.name == SYNTHETIC else root.name), root
         return
-    if SYNTHETIC in parts and (root / SYNTHETIC).is_dir():
+    if SYNTHETIC in subsets and (root / SYNTHETIC).is_dir():
         yield SYNTHETIC, root / SYNTHETIC
     data = root / "data" if (root / "data").is_dir() else root
-    if "data" in parts:
+    if "data" in subsets:
         for name in list_folder(data):
             if FRAME.fullmatch(name) and (data / name).is_dir():
                 yield name, data / name
