@@ -28,7 +28,7 @@ from posefilter.metrics.credibility import SHOWN, measure_coverage, score_truth
 from posefilter.types import Batch
 
 HOME = Path(__file__).parents[1]
-MOVES = "filter/refine=mean_shift_and_moves"
+MOVES = "filter/refine=mean_shift_and_resample_move"
 WAYS = {"default": [], "moves": [MOVES], "islands, moves": ["filter/resample=islands", MOVES]}
 HEAD = ["way", "frames", "seconds, median", "over the default", "coverage of credible sets"]
 HEAD += ["log density, mean", "median"]

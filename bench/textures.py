@@ -19,7 +19,7 @@ from posefilter.files import write_whole
 from posefilter.meshes.texture import add_texture
 from posefilter.types import ObjectModel
 
-TURNS = "posefilter.filters.texture.TextureTurns"
+TURNS = "posefilter.filters.texture.TextureRotations"
 REFINE = Path(__file__).parents[1] / "conf/filter/refine/mean_shift_icp_texture.yaml"
 
 

@@ -11,9 +11,9 @@ with any rotation and within 10 cm, and is annealed as pose_pf is.
 Ways: `search` weights as the filter does by default (`filter/reweight=current_likelihood`), which
 reads the likelihood at every step; `islands` does too, and resamples within islands
 (`filter/resample=islands`); `tempered` counts it once (`likelihood_ratio`); `drawn anew` is a last
-pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves
-that leave the posterior unchanged (`filter/refine=mean_shift_and_moves`).  `exact draws` are what a
-perfect sampler would give: their gap is the kernel density's own.
+pass of importance sampling (`filter/refine=mean_shift_and_importance`); `moved` adds moves that
+leave the posterior unchanged (`filter/refine=mean_shift_and_resample_move`).  `exact draws` are
+what a perfect sampler would give: their gap is the kernel density's own.
 
 Truths are drawn from the posterior.  `gap` is the mean log density that the exact posterior has at
 them less that of the belief, over runs and truths; `mass` is the mean error of the first mode's

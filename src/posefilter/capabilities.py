@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from posefilter.errors import UserError
 
 Capability = Literal[
-    "belief_maps",
+    "heatmaps",
     "candidates",
     "color",
     "correspondences",
@@ -40,7 +40,7 @@ Capabilities = tuple[Capability, ...]
 
 # what is needed where a name is required, after "needs"
 MEANINGS: Mapping[str, str] = {
-    "belief_maps": "training on maps of keypoints alone",
+    "heatmaps": "training on maps of keypoints alone",
     "candidates": "scored candidate poses",
     "color": "a method whose encodings keep the image's colors",
     "correspondences": "training on dense object coordinates alone",

@@ -245,7 +245,7 @@ RANGES: dict[str, Range] = {
     "refine.samples": COUNT,
     "refine.rounds": COUNT,
     "refine.sweeps": _whole(0, 10_000),
-    "refine.turn_probability": SHARE,
+    "refine.rotation_probability": SHARE,
     "refine.widening": Range(1, 1e6),
     "refine.temperature": POSITIVE,
     "refine.initial_scale": METERS,

@@ -86,6 +86,12 @@ RENAMED = {
     "callbacks.figures.every=5": "callbacks.figures.every_n_validations=5",
     "most_mb=8": "max_mb=8",
     "compact=false": "quantize=false",
+    "filter/propagate=gaussian_and_turns": "filter/propagate=gaussian_and_axis_rotations",
+    "filter/refine=mean_shift_and_moves": "filter/refine=mean_shift_and_resample_move",
+    "model.candidate_sampler.turns.probability=1": (
+        "model.candidate_sampler.rotations.probability=1"
+    ),
+    "loss=belief_maps": "loss=heatmaps",
     "data.points=500": "data.num_model_points=500",
     "data.model_points=models": "data.model_points_dir=models",
     "data.options.part=test": "data.options.split=test",

@@ -11,12 +11,18 @@ from posefilter.figures.symmetries import draw_symmetries
 from posefilter.meshes.builtin import catalog
 from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.rotational_symmetries import (
+    ANY,
+    RotationalSymmetry,
+    describe_symmetries,
+    make_group,
+    select,
+)
 from posefilter.meshes.store import MeshStore
 from posefilter.meshes.symmetries import read_symmetries, rotation_about
-from posefilter.meshes.turns import ANY, Turn, describe_symmetries, make_group, select
 
 
-def folds(turns: list[Turn], texture: bool) -> list[int]:
+def folds(turns: list[RotationalSymmetry], texture: bool) -> list[int]:
     return sorted(turn.fold for turn in select(turns, texture))
 
 
@@ -94,7 +100,7 @@ def test_the_picture_has_a_row_a_turn() -> None:
     mesh = catalog.build("brick")
     size = diameter(mesh.vertices)
     axis = np.array([0.0, 0.0, 1.0])
-    turn = Turn(axis, mesh.bounds.mean(0), 2, 0.0, 0.0, 0.05, True, True)
+    turn = RotationalSymmetry(axis, mesh.bounds.mean(0), 2, 0.0, 0.0, 0.05, True, True)
     one = draw_symmetries(mesh, [turn], make_group([turn], size), "found")
     two = draw_symmetries(mesh, [turn, turn], make_group([turn], size), "found")
     assert two.shape[0] > one.shape[0] + 200

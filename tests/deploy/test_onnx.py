@@ -19,11 +19,11 @@ from posefilter.cli import run_command
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.deploy.resizing import Resize
-from posefilter.deploy.settings import describe_filter, describe_turns
+from posefilter.deploy.settings import describe_filter, describe_rotations
 from posefilter.deploy.write import make_graphs, to_program, write_filter
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
-from posefilter.filters.texture import TextureTurns, list_turns
+from posefilter.filters.texture import TextureRotations, list_rotations
 from posefilter.geometry.pose import fit_rigid, is_rigid, make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.images import check_images, make_batch
@@ -158,8 +158,8 @@ def test_the_example_aligns_as_torch_does(
 
 @pytest.mark.parametrize("name", ["soup_can", "carton"])
 def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
-    model, turn = load(name), TextureTurns()
-    turns, coarse = list_turns(model)
+    model, turn = load(name), TextureRotations()
+    turns, coarse = list_rotations(model)
     assert (len(coarse) > 12) == (name == "soup_can")  # both ways through the stages
     R = random_rotation(1, generator=torch.Generator().manual_seed(2))[0]
     truth = make_pose(R, torch.tensor([0.0, 0, 4.5 * model.radius]) - R @ model.center)
@@ -177,7 +177,7 @@ def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
         "depth": encoding.measured_depth[0].numpy(),
         "intrinsics": encoding.intrinsics[0].numpy(),
     }
-    (described,) = describe_turns(turn, model)
+    (described,) = describe_rotations(turn, model)
     ours, particles = own.turn(
         None, image, wrong.numpy(), given.poses[0].numpy(), np.random.default_rng(0), **described
     )

@@ -14,7 +14,7 @@ from posefilter.filters.candidates import (
     sample_around_truth,
     sample_from_depth,
 )
-from posefilter.filters.propagate import HalfTurns, half_turns
+from posefilter.filters.propagate import HalfTurnRotations, half_turns
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
@@ -30,7 +30,9 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def test_candidates_hold_the_truth_and_every_kind() -> None:
     batch = scenes(3)
-    poses = sample_around_truth(batch, MODEL, SPACE, 8, (0.004, 0.25), generator(), HalfTurns(1.0))
+    poses = sample_around_truth(
+        batch, MODEL, SPACE, 8, (0.004, 0.25), generator(), HalfTurnRotations(1.0)
+    )
     assert poses.shape == (3, 1 + 4 * 8 + 4, 4, 4)
     torch.testing.assert_close(poses[:, 0], batch.camera_from_object)
     distance = SPACE.distance(poses, batch.camera_from_object[:, None])
@@ -46,7 +48,7 @@ def test_candidates_hold_the_truth_and_every_kind() -> None:
 def test_each_kind_is_as_far_from_the_truth_as_it_is_said_to_be() -> None:
     batch, count = scenes(1), 4000
     poses = sample_around_truth(
-        batch, MODEL, SPACE, count, (0.02, 0.02), generator(), HalfTurns(1.0)
+        batch, MODEL, SPACE, count, (0.02, 0.02), generator(), HalfTurnRotations(1.0)
     )
     offset = (poses - batch.camera_from_object[:, None])[0, :, :3, 3]
     nearby, shifted, turned = (
@@ -58,7 +60,7 @@ def test_each_kind_is_as_far_from_the_truth_as_it_is_said_to_be() -> None:
         torch.testing.assert_close(moved.std(0), torch.full((3,), 0.02 * share), atol=0, rtol=0.05)
     # levels are drawn log-uniformly: their median is the geometric mean of the bounds
     poses = sample_around_truth(
-        batch, MODEL, SPACE, count, (1e-4, 0.1), generator(), HalfTurns(1.0)
+        batch, MODEL, SPACE, count, (1e-4, 0.1), generator(), HalfTurnRotations(1.0)
     )
     size = (poses - batch.camera_from_object[:, None])[0, 1 : 1 + count, :3, 3].norm(dim=-1)
     # the noise is 0.6 of the level, and the length of three normal numbers has the median 1.538
@@ -154,7 +156,9 @@ def test_after_the_last_level_a_frames_own_particles_are_gone() -> None:
 def test_candidates_on_the_object_are_now_and_then_beside_it() -> None:
     """A pixel of the object has 51 times the weight of another."""
     batch, count = scenes(1), 8000
-    poses = sample_around_truth(batch, MODEL, SPACE, count, (0.01, 0.1), generator(), HalfTurns())
+    poses = sample_around_truth(
+        batch, MODEL, SPACE, count, (0.01, 0.1), generator(), HalfTurnRotations()
+    )
     pixels = project(origin_of(poses[:, 1 + count : 1 + 2 * count], MODEL.center), batch.intrinsics)
     u, v = pixels[0].round().long().unbind(-1)
     on = batch.mask[0, 0, v, u].double().mean()

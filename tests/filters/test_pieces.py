@@ -9,10 +9,10 @@ from torch import Generator, Tensor
 from posefilter.errors import UserError
 from posefilter.filters.estimate import Argmax, DensestMode, DensestPose, Mean, kernel_mass
 from posefilter.filters.propagate import (
-    AxisTurns,
+    AxisRotations,
     Compose,
     Gaussian,
-    HalfTurns,
+    HalfTurnRotations,
     Identity,
     LearnedDisplacement,
 )
@@ -87,7 +87,7 @@ def test_learned_displacement_and_chains() -> None:
 
 def test_half_turns_turn_a_share_about_the_center() -> None:
     poses = some_poses(2, 5000)
-    moved = HalfTurns(0.3)(
+    moved = HalfTurnRotations(0.3)(
         poses, torch.zeros(2, 5000, 6), step(0.1), POSES, Generator().manual_seed(0)
     )
     assert is_rigid(moved, 1e-4)
@@ -108,7 +108,9 @@ def test_half_turns_turn_a_share_about_the_center() -> None:
     assert len(kinds) == 3  # one axis keeps its sign
     assert counts.min() > 0.28 * counts.sum()
     with pytest.raises(UserError, match="pixels"):
-        HalfTurns(0.3)(torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator())
+        HalfTurnRotations(0.3)(
+            torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator()
+        )
 
 
 def test_axis_turns_are_about_the_axes_of_the_box() -> None:
@@ -119,7 +121,7 @@ def test_axis_turns_are_about_the_axes_of_the_box() -> None:
     still = torch.zeros(2, 4000, 6)
 
     def turn(share: float, any_angle: float) -> tuple[torch.Tensor, torch.Tensor]:
-        kernel = AxisTurns(share, any_angle)
+        kernel = AxisRotations(share, any_angle)
         moved = kernel(poses, still, step(0.1), space, Generator().manual_seed(0))
         assert is_rigid(moved, 1e-4)
         torch.testing.assert_close(
@@ -140,7 +142,7 @@ def test_axis_turns_are_about_the_axes_of_the_box() -> None:
     _, angle = turn(1.0, 1.0)  # angles are uniform
     assert angle.mean() == pytest.approx(math.pi / 2, abs=0.03)
     with pytest.raises(UserError, match="pixels"):
-        AxisTurns()(torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator())
+        AxisRotations()(torch.zeros(1, 2, 2), torch.zeros(1, 2, 2), step(1.0), PIXELS, Generator())
 
 
 class Poses:

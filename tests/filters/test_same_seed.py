@@ -10,7 +10,7 @@ from torch import Generator, Tensor
 
 from posefilter.filters.candidates import PersistentParticles, sample_around_truth
 from posefilter.filters.initialize import FromObjectness, Informed, UniformPixels
-from posefilter.filters.propagate import AxisTurns, Gaussian, HalfTurns
+from posefilter.filters.propagate import AxisRotations, Gaussian, HalfTurnRotations
 from posefilter.filters.refine import MeanShift
 from posefilter.filters.resample_move import ResampleMove
 from posefilter.geometry.pose import make_pose, rotation_of
@@ -65,7 +65,9 @@ def started_by(piece: Any) -> Callable[[Generator], Tensor]:
 
 def candidates(g: Generator) -> Tensor:
     space = PoseSpace((0.0, 0.0, 0.0), square().radius)
-    return sample_around_truth(scenes(2), square(), space, 4, (0.01, 0.1), g, HalfTurns(0.5))
+    return sample_around_truth(
+        scenes(2), square(), space, 4, (0.01, 0.1), g, HalfTurnRotations(0.5)
+    )
 
 
 def advanced(g: Generator) -> Tensor:
@@ -80,10 +82,10 @@ def advanced(g: Generator) -> Tensor:
     "draw",
     [
         moved_by(Gaussian(0.5)),
-        moved_by(HalfTurns(0.5)),
-        moved_by(AxisTurns(0.5, 0.5)),
+        moved_by(HalfTurnRotations(0.5)),
+        moved_by(AxisRotations(0.5, 0.5)),
         refined_by(MeanShift(2, 3), "best"),
-        refined_by(ResampleMove(4, turn_probability=0.5), "poses"),
+        refined_by(ResampleMove(4, rotation_probability=0.5), "poses"),
         started_by(UniformPixels()),
         started_by(FromObjectness()),
         started_by(Informed(UniformPixels()).train()),
@@ -98,7 +100,9 @@ def test_the_seed_decides(draw: Callable[[Generator], Tensor]) -> None:
     assert not torch.equal(one, other)
 
 
-@pytest.mark.parametrize(("kernel", "error"), [(HalfTurns(1.0), 1e-9), (AxisTurns(1.0, 0.0), 1e-6)])
+@pytest.mark.parametrize(
+    ("kernel", "error"), [(HalfTurnRotations(1.0), 1e-9), (AxisRotations(1.0, 0.0), 1e-6)]
+)
 def test_half_a_turn_of_double_precision_is_half_a_turn(kernel: Any, error: float) -> None:
     state = torch.eye(4).double().expand(1, COUNT, 4, 4)
     still, step = state.new_zeros(1, COUNT, 6), Step(0, 1, state.new_tensor(0.02))
@@ -112,7 +116,7 @@ def test_any_angle_is_as_likely_in_either_direction() -> None:
     """A uniform angle has a mean sine of 0, and no angle is likelier than its opposite."""
     state = torch.eye(4).double().expand(1, 20_000, 4, 4)
     step = Step(0, 1, state.new_tensor(0.02))
-    turned = AxisTurns(1.0, 1.0)(
+    turned = AxisRotations(1.0, 1.0)(
         state, state.new_zeros(1, 20_000, 6), step, SPACE, Generator().manual_seed(0)
     )
     skew = rotation_of(turned) - rotation_of(turned).mT  # sines of the angle, of one axis each

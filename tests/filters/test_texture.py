@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.errors import UserError
-from posefilter.filters.texture import TextureTurns, blur, list_turns, measure_texture
+from posefilter.filters.texture import TextureRotations, blur, list_rotations, measure_texture
 from posefilter.geometry.camera import project
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel, sample
 from posefilter.geometry.pose import make_pose, transform
@@ -41,7 +41,7 @@ def method(object_model: ObjectModel) -> SimpleNamespace:
 def turn(
     belief: BeliefBatch, encoding: Seen, object_model: ObjectModel, **settings: float
 ) -> BeliefBatch:
-    out = TextureTurns(**settings)(
+    out = TextureRotations(**settings)(
         belief, encoding, method(object_model), Generator().manual_seed(0)
     )  # type: ignore[arg-type]
     assert torch.equal(out.score, belief.score)
@@ -51,7 +51,7 @@ def turn(
 @pytest.mark.parametrize("name", ["soup_can", "carton", "tuna_can"])
 def test_a_print_turns_the_shape_back(name: str) -> None:
     model = load(name)
-    turns, _ = list_turns(model)
+    turns, _ = list_rotations(model)
     assert len(turns) > 1
     right = 0
     poses = draw(name, 6)
@@ -164,7 +164,7 @@ def test_particles_take_shares_of_the_turns_and_others_stay() -> None:
     assert model.texture is not None
     gray = torch.cat([model.texture[:, :6], torch.full_like(model.texture[:, 6:], 0.5)], dim=1)
     model = model._replace(texture=gray)
-    turns, _ = list_turns(model)
+    turns, _ = list_rotations(model)
     given = believe(pose, 40)
     given.poses[0, 0, :3, 3] += 1.0
     out = turn(given, look("carton", pose), model)
@@ -179,7 +179,7 @@ def test_particles_take_shares_of_the_turns_and_others_stay() -> None:
 
 def test_evidence_falls_with_the_angle() -> None:
     model, pose = load("soup_can"), draw("soup_can", 4)[2]
-    turns, coarse = list_turns(model)
+    turns, coarse = list_rotations(model)
     at = pose @ turns[coarse]
     evidence = measure_texture(at[None], look("soup_can", pose), model)[0]
     off = angle_between(at[:, :3, :3], pose[:3, :3])
@@ -187,7 +187,7 @@ def test_evidence_falls_with_the_angle() -> None:
 
 
 def test_turns_that_are_tried_first_lie_ten_degrees_apart() -> None:
-    turns, coarse = list_turns(load("soup_can"))
+    turns, coarse = list_rotations(load("soup_can"))
     assert coarse[0] == 0
     assert torch.allclose(turns[0], torch.eye(4))
     R = turns[coarse][:, :3, :3]
@@ -198,7 +198,7 @@ def test_turns_that_are_tried_first_lie_ten_degrees_apart() -> None:
 
 def test_an_object_whose_shape_leaves_nothing_open_stays() -> None:
     model, pose = load("mug"), draw("mug", 1)[0]
-    assert len(list_turns(model)[0]) == 1
+    assert len(list_rotations(model)[0]) == 1
     given = believe(pose)
     assert turn(given, look("mug", pose), model) is given
 
@@ -214,7 +214,7 @@ def test_without_a_texture_it_is_refused_in_one_line() -> None:
 @pytest.mark.parametrize("settings", [{"learned_weight": -1}, {"pixels": 0}, {"sigma": 0}])
 def test_numbers_out_of_range(settings: dict[str, float]) -> None:
     with pytest.raises(UserError, match="turns by texture need"):
-        TextureTurns(**settings)  # type: ignore[arg-type]
+        TextureRotations(**settings)  # type: ignore[arg-type]
 
 
 def test_texture_is_that_of_the_mesh() -> None:
@@ -248,7 +248,7 @@ def test_small_images_are_blurred_too() -> None:
 def test_a_turn_between_those_that_are_tried_first_is_found() -> None:
     """A turn by 7 degrees about a can's axis is found although no first turn is there."""
     model, pose = load("soup_can"), draw("soup_can", 3)[1]
-    turns, _ = list_turns(model)
+    turns, _ = list_rotations(model)
     axis = turns[1, :3, :3]
     generator = torch.stack(
         [axis[2, 1] - axis[1, 2], axis[0, 2] - axis[2, 0], axis[1, 0] - axis[0, 1]]
@@ -269,11 +269,13 @@ def test_turns_are_compared_where_their_print_fits_best(
     degrees.
     """
     model, pose = load("soup_can"), draw("soup_can", 3)[1]
-    turns, first = list_turns(model)
+    turns, first = list_rotations(model)
     angles = torch.rad2deg(angle_between(turns[:, :3, :3], torch.eye(3).expand(len(turns), 3, 3)))
     beside = int((angles - abs(degrees)).abs().argmin())
     assert beside not in first.tolist()
-    monkeypatch.setattr(TextureTurns, "_turn_finely", lambda self, best, chosen, *_: best @ chosen)
+    monkeypatch.setattr(
+        TextureRotations, "_rotate_finely", lambda self, best, chosen, *_: best @ chosen
+    )
     out = turn(believe(pose @ turns[beside], 50), look("soup_can", pose), model)
     assert torch.rad2deg(angle_between(out.best[0, :3, :3], pose[:3, :3])) < 2.6
     # and particles are where the turns were compared, not at those of the first ten degrees

@@ -30,7 +30,7 @@ def test_a_move_of_sigma_shifts_the_surface_by_sigma_either_way() -> None:
     scale = POSES.noise_scale(torch.tensor(0.02))
     torch.testing.assert_close(scale, torch.tensor([0.02, 0.02, 0.02, 0.2, 0.2, 0.2]))
     assert POSES.noise_scale(torch.tensor([0.02, 0.5])).shape == (2, 6)
-    assert POSES.noise_scale(torch.tensor(0.5))[3] == pytest.approx(POSES.max_turn)
+    assert POSES.noise_scale(torch.tensor(0.5))[3] == pytest.approx(POSES.max_rotation_std)
     T = scattered(100)
     for axis in range(6):
         tangent = torch.zeros(100, 6)

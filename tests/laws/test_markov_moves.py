@@ -73,7 +73,7 @@ def move(belief: BeliefBatch, mass: float, **options: float) -> BeliefBatch:
 def test_draws_of_the_posterior_stay_draws_of_it(turns: float) -> None:
     """Both kinds of steps, alone and together; 12,000 particles."""
     before = draw(0.7)
-    after = move(before, 0.7, sweeps=6, turn_probability=turns)
+    after = move(before, 0.7, sweeps=6, rotation_probability=turns)
     error = math.sqrt(0.7 * 0.3 / (RUNS * COUNT))
     assert float(first_share(after).mean()) == pytest.approx(0.7, abs=5 * error)
     wanted = torch.tensor([SHIFT] * 3 + [TURN] * 3).double()
@@ -85,7 +85,7 @@ def test_draws_of_the_posterior_stay_draws_of_it(turns: float) -> None:
 
 def test_masses_of_equal_modes_are_right_within_sampling_error() -> None:
     """From 7 : 3, over 200 runs: the mean, and the spread between runs, are those of draws."""
-    share = first_share(move(draw(0.7), 0.5, sweeps=30, turn_probability=0.5))
+    share = first_share(move(draw(0.7), 0.5, sweeps=30, rotation_probability=0.5))
     error = math.sqrt(0.25 / COUNT)
     assert float(share.mean()) == pytest.approx(0.5, abs=5 * error / math.sqrt(RUNS))
     assert float(share.std()) == pytest.approx(error, rel=0.35)
@@ -93,9 +93,9 @@ def test_masses_of_equal_modes_are_right_within_sampling_error() -> None:
 
 def test_a_lost_mode_is_found_by_turns_and_not_without() -> None:
     lost = draw(1.0, runs=20)
-    found = first_share(move(lost, 0.5, sweeps=15, turn_probability=0.3))
+    found = first_share(move(lost, 0.5, sweeps=15, rotation_probability=0.3))
     assert float((found < 1).double().mean()) == 1
-    without = first_share(move(lost, 0.5, sweeps=15, turn_probability=0.0))
+    without = first_share(move(lost, 0.5, sweeps=15, rotation_probability=0.0))
     assert float(without.min()) == 1
 
 
@@ -138,13 +138,15 @@ def test_a_single_particle_turns_alone() -> None:
 
 def test_steps_of_a_turn_are_about_the_axes() -> None:
     """With turns alone, a particle's rotation is a product of turns about x, y or z; one sweep."""
-    after = move(draw(1.0, width=0.0), 0.5, sweeps=1, turn_probability=1.0)
+    after = move(draw(1.0, width=0.0), 0.5, sweeps=1, rotation_probability=1.0)
     vector = twist_between(torch.eye(4).double(), after.poses, CENTER)[..., 3:]
     assert torch.allclose(exp_so3(vector), rotation_of(after.poses), atol=1e-6)
     assert int(((vector.abs() > 1e-6).sum(-1) > 1).sum()) == 0
 
 
-@pytest.mark.parametrize("wrong", [{"sweeps": -1}, {"turn_probability": 1.5}, {"temperature": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"sweeps": -1}, {"rotation_probability": 1.5}, {"temperature": 0.0}]
+)
 def test_numbers_out_of_range_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UserError, match="resample-move needs"):
         ResampleMove(**wrong)  # type: ignore[arg-type]

@@ -17,13 +17,13 @@ from posefilter.filters.resample import NoResampling
 from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Constant
 from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
-from posefilter.losses.belief_maps import BeliefMaps
+from posefilter.losses.heatmaps import Heatmaps
 from posefilter.metrics.errors import add
 from posefilter.models.dense_coordinates import DenseCoordinates
 from posefilter.models.keypoints import Keypoints
 from posefilter.models.pose_particles import Hypotheses
-from posefilter.nets.belief_maps import STRIDE, BeliefMapNet
 from posefilter.nets.coordinates import CoordinateLoss
+from posefilter.nets.heatmaps import STRIDE, HeatmapNet
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import ObjectModel, Trace
 
@@ -57,7 +57,7 @@ def make(kind: str, seed: int = 0) -> Hypotheses:
         net = ObjectCoordinateNet(WIDTHS, fragments=16)
         method = DenseCoordinates(net, loss=CoordinateLoss(), **base)
     else:
-        method = Keypoints(BeliefMapNet(WIDTHS, 32), loss=BeliefMaps(1.0), **base)
+        method = Keypoints(HeatmapNet(WIDTHS, 32), loss=Heatmaps(1.0), **base)
     method.set_object(thick())
     return method
 

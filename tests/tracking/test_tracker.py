@@ -13,12 +13,12 @@ from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import Compose
-from posefilter.filters.texture import TextureTurns
+from posefilter.filters.texture import TextureRotations
 from posefilter.geometry.rotation import random_rotation
 from posefilter.tracking.motion import ConstantVelocity
+from posefilter.tracking.rotate import RotateTogether
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import TrackLossDetector
-from posefilter.tracking.turn import TurnTogether
 from posefilter.types import BeliefBatch
 
 NONE = np.zeros_like(DEPTH)
@@ -299,7 +299,7 @@ def test_impossible_filters_and_methods_are_refused(monkeypatch: pytest.MonkeyPa
         posefilter.Tracker(estimator)
 
 
-class PlantedTurns(TextureTurns):
+class PlantedRotations(TextureRotations):
     """Say at every call that the object is a quarter turn about its axis from the estimate."""
 
     TURN = SPACE.move(torch.eye(4), torch.tensor([0, 0, 0, 0, 0, np.pi / 2]))
@@ -313,7 +313,7 @@ class PlantedTurns(TextureTurns):
         scattered = belief.poses.flip(1)  # which a track must not take over
         return belief._replace(best=belief.best @ self.TURN, poses=scattered)
 
-    def turn_nearby(self, best, encoding, method):  # type: ignore[no-untyped-def]
+    def rotate_nearby(self, best, encoding, method):  # type: ignore[no-untyped-def]
         self.nearby += 1
         self.calls += not self.few
         return None if self.few else best @ self.TURN
@@ -325,8 +325,8 @@ def test_all_particles_are_turned_with_the_estimate(few: bool) -> None:
     moved = torch.eye(4).repeat(6, 1, 1)
     moved[:, :3, :3] = poses
     belief = BeliefBatch(moved[None], torch.zeros(1, 6), moved[None, 2], torch.zeros(1))
-    turned = TurnTogether(PlantedTurns(few))(belief, None, None, torch.Generator())
-    torch.testing.assert_close(turned.poses, belief.poses @ PlantedTurns.TURN)
+    turned = RotateTogether(PlantedRotations(few))(belief, None, None, torch.Generator())
+    torch.testing.assert_close(turned.poses, belief.poses @ PlantedRotations.TURN)
     torch.testing.assert_close(turned.best, turned.poses[:, 2])
     assert turned.score is belief.score
 
@@ -334,7 +334,7 @@ def test_all_particles_are_turned_with_the_estimate(few: bool) -> None:
 @pytest.mark.parametrize(("every", "due"), [(0, []), (4, [1, 5, 9]), (8, [2, 10])])
 def test_the_print_decides_every_so_many_frames(every: int, due: list[int]) -> None:
     toy, estimator = make_toy()
-    texture = PlantedTurns(few=True)
+    texture = PlantedRotations(few=True)
     toy.filter.refine = Compose([texture])
     tracker = posefilter.Tracker(estimator, TrackerSettings(texture_every=every))
     asked = []
@@ -350,16 +350,16 @@ def test_the_print_decides_every_so_many_frames(every: int, due: list[int]) -> N
 def test_after_a_loss_the_print_decides_among_all_turns() -> None:
     """The frame before tells nothing of them, so that those nearby are not asked for."""
     toy, estimator = make_toy()
-    texture = PlantedTurns(few=False)
+    texture = PlantedRotations(few=False)
     toy.filter.refine = Compose([texture])
     tracker = posefilter.Tracker(estimator, TrackerSettings(texture_every=0))
     pose, recovered = walk_pose(1)[0], []
     for number in range(12):
         toy.truth = None if 2 <= number < 6 else pose
-        texture.TURN = PlantedTurns.TURN if number >= 6 else torch.eye(4)
+        texture.TURN = PlantedRotations.TURN if number >= 6 else torch.eye(4)
         result = tracker.update(RGB, DEPTH, K)
         if result.status == "recovered":
             recovered.append(number)
-            assert off(result, pose @ PlantedTurns.TURN) < 0.01
+            assert off(result, pose @ PlantedRotations.TURN) < 0.01
     assert len(recovered) == 1
     assert texture.nearby == 0

@@ -141,7 +141,7 @@ IMAGE_SPACE_ABLATIONS = (
 _CANDIDATES = ("model/candidate_sampler=candidates", "loss=contrastive")
 _NO_NEGATIVES = "model.candidate_sampler.particles=0"
 _DENSE = ("model/proposals=dense", "filter/initialize=from_proposals")
-_TURNS = "filter/propagate=gaussian_and_turns"
+_TURNS = "filter/propagate=gaussian_and_axis_rotations"
 
 # Of the pose-space method. A viewing ray needs candidates (labels of single points train the
 # paper's network only), context needs the dense network, and the filter's own particles need

@@ -18,10 +18,10 @@ from posefilter.meshes.files import read_mesh
 from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.inspect_mesh import MeshFacts, check_size, inspect_mesh
 from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.rotational_symmetries import describe_symmetries, make_group, select
 from posefilter.meshes.similarity import are_alike
 from posefilter.meshes.store import BUILTIN, LARGEST, SMALLEST, MeshStore, WrongUnit
 from posefilter.meshes.symmetries import read_symmetries
-from posefilter.meshes.turns import describe_symmetries, make_group, select
 from posefilter.meshes.write import write_obj
 
 _UNNAMED = ("textured", "mesh", "model", "google_16k", "meshes", "visual")

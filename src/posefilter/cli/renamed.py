@@ -64,6 +64,7 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.objectness_weight",
+    "model.candidate_sampler.turns": "model.candidate_sampler.rotations",
     "data.points": "data.num_model_points",
     "data.model_points": "data.model_points_dir",
     "data.options.part": "data.options.split",
@@ -114,7 +115,7 @@ _CHOICES = {
     "filter/estimate": {"best": "argmax"},
     "filter/initialize": {"from_relevance": "from_objectness"},
     "scheduler": {"warm_cosine": "warmup_cosine"},
-    "loss": {"contrast": "contrastive"},
+    "loss": {"contrast": "contrastive", "belief_maps": "heatmaps"},
     "model/box_head": {"spread": "quantiles"},
     "filter/resample": {
         "never": "none",
@@ -127,7 +128,8 @@ _CHOICES = {
         "tempered": "likelihood_ratio",
         "sequential": "sequential_bayes",
     },
-    "filter/propagate": {"still": "identity"},
+    "filter/propagate": {"still": "identity", "gaussian_and_turns": "gaussian_and_axis_rotations"},
+    "filter/refine": {"mean_shift_and_moves": "mean_shift_and_resample_move"},
     "model/displacement": {"held": "gated"},
     "model/encoder": {
         "resnet18": "resnet model.encoder.trunk.kind=resnet18",
@@ -185,6 +187,11 @@ CLASSES = {
     "filters.transport.Ensemble": "filters.transport.EnsembleTransform",
     "filters.transport.OptimalTransport": "filters.transport.SampledTransport",
     "filters.initialize.FromRelevance": "filters.initialize.FromObjectness",
+    "filters.propagate.AxisTurns": "filters.propagate.AxisRotations",
+    "filters.propagate.HalfTurns": "filters.propagate.HalfTurnRotations",
+    "filters.texture.TextureTurns": "filters.texture.TextureRotations",
+    "losses.belief_maps.BeliefMaps": "losses.heatmaps.Heatmaps",
+    "nets.belief_maps.BeliefMapNet": "nets.heatmaps.HeatmapNet",
     "filters.propagate.Chain": "filters.propagate.Compose",
     "filters.refine.Chain": "filters.refine.Compose",
     "filters.reweight.Annealed": "filters.reweight.CurrentLikelihood",
@@ -204,8 +211,8 @@ ARGUMENTS = {
     "filters.loop.ParticleFilter": {"looks": "max_searches"},
     "filters.propagate.Compose": {"pieces": "components"},
     "filters.propagate.Gaussian": {"factor": "noise_scale"},
-    "filters.propagate.HalfTurns": {"share": "probability"},
-    "filters.propagate.AxisTurns": {
+    "filters.propagate.HalfTurnRotations": {"share": "probability"},
+    "filters.propagate.AxisRotations": {
         "share": "probability",
         "any_angle": "uniform_angle_probability",
     },
@@ -217,6 +224,7 @@ ARGUMENTS = {
         "start": "initial_scale",
         "end": "final_scale",
     },
+    "filters.resample_move.ResampleMove": {"turn_probability": "rotation_probability"},
     "filters.schedule.Geometric": {"start": "initial_sigma", "stop": "final_sigma"},
     "filters.agreement.Agreement": {
         "rounds": "iterations",
@@ -232,6 +240,7 @@ ARGUMENTS = {
     },
     "models.candidate_samplers.CandidatePoses": {
         "each": "candidates_per_kind",
+        "turns": "rotations",
         "proposed": "proposals",
         "own_level": "persistent_sigma_probability",
         "sigma": "sigma_range",

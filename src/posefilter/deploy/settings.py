@@ -8,7 +8,7 @@ from posefilter.errors import UserError
 from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.icp import PointToPlaneIcp
-from posefilter.filters.texture import TextureTurns, list_turns, read_print
+from posefilter.filters.texture import TextureRotations, list_rotations, read_print
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
@@ -110,8 +110,8 @@ def _describe_move(move: Any, method: PoseEstimator) -> list[dict[str, Any]]:
         return [{"kind": "displacement"}]
     if isinstance(move, propagate.Gaussian):
         return [{"kind": "gaussian", "noise_scale": move.noise_scale}]
-    half = isinstance(move, propagate.HalfTurns)
-    if isinstance(method, PosePF) and (half or isinstance(move, propagate.AxisTurns)):
+    half = isinstance(move, propagate.HalfTurnRotations)
+    if isinstance(method, PosePF) and (half or isinstance(move, propagate.AxisRotations)):
         any_angle = getattr(move, "uniform_angle_probability", 0.0)
         axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         axes = axes if half else method.space.axes.tolist()
@@ -123,7 +123,9 @@ def _describe_move(move: Any, method: PoseEstimator) -> list[dict[str, Any]]:
                 "axes": axes,
             }
         ]
-    raise _refuse(move, "propagate", "gaussian", "gaussian_and_turns", "learned", "identity")
+    raise _refuse(
+        move, "propagate", "gaussian", "gaussian_and_axis_rotations", "learned", "identity"
+    )
 
 
 def _describe_estimate(one: Any) -> dict[str, Any]:
@@ -154,15 +156,15 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
         surface = one.choose_points(method.object_model.points).tolist()
         own = {name: getattr(one, name) for name in names}
         return [{"kind": "icp", **own, "surface": surface}]
-    if isinstance(one, TextureTurns) and isinstance(method, PosePF):
-        return describe_turns(one, method.object_model)
+    if isinstance(one, TextureRotations) and isinstance(method, PosePF):
+        return describe_rotations(one, method.object_model)
     choices = ("mean_shift_icp_texture", "mean_shift_icp", "mean_shift", "rescore", "none")
     raise _refuse(one, "refine", *choices)
 
 
-def describe_turns(one: TextureTurns, object_model: ObjectModel) -> list[dict[str, Any]]:
+def describe_rotations(one: TextureRotations, object_model: ObjectModel) -> list[dict[str, Any]]:
     """Return what turns by texture need; nothing where the shape leaves no turn open."""
-    turns, coarse = list_turns(object_model)
+    turns, coarse = list_rotations(object_model)
     if len(turns) == 1:
         return []
     own = read_print(object_model)

@@ -7,8 +7,8 @@ import numpy as np
 
 from posefilter.figures.canvas import AXES, arrange_grid, draw_lines, draw_row
 from posefilter.meshes.mesh import Mesh, diameter
+from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry
 from posefilter.meshes.symmetries import rotation_about
-from posefilter.meshes.turns import ANY, Turn
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.surfaces import Instance, Lights
 
@@ -20,7 +20,7 @@ _VIEW = np.array([[0.8, 0.6, 0.0], [0.24, -0.32, -0.9165], [-0.55, 0.7333, -0.4]
 
 
 def draw_symmetries(
-    mesh: Mesh, found: Sequence[Turn], symmetries: np.ndarray, source: str
+    mesh: Mesh, found: Sequence[RotationalSymmetry], symmetries: np.ndarray, source: str
 ) -> np.ndarray:
     """Draw a row a turn: the object with the turn's axis, and turned.
 
@@ -55,14 +55,14 @@ def draw_symmetries(
     return arrange_grid(rows, 1, gap=0)
 
 
-def describe_turn(turn: Turn) -> str:
+def describe_turn(turn: RotationalSymmetry) -> str:
     """Return a turn in words: `half turn about (0.00, 0.00, 1.00)`."""
     kind = {ANY: "any turn", 2: "half turn", 3: "third of a turn", 4: "quarter turn"}[turn.fold]
     axis = ", ".join(f"{x:.2f}" for x in turn.axis + 0.0)
     return f"{kind} about ({axis})"
 
 
-def _measure(turn: Turn) -> str:
+def _measure(turn: RotationalSymmetry) -> str:
     texture = "same texture" if turn.texture else "another texture"
     return (
         f"surface {1000 * max(turn.distance, 0):.1f} mm off, farthest "
@@ -93,7 +93,7 @@ def _render(renderer: EmbreeRenderer, mesh: Mesh, pose: np.ndarray, K: np.ndarra
 
 
 def _draw_axis(
-    tile: np.ndarray, turn: Turn, camera: np.ndarray, K: np.ndarray, length: float
+    tile: np.ndarray, turn: RotationalSymmetry, camera: np.ndarray, K: np.ndarray, length: float
 ) -> None:
     ends = turn.point + np.array([[-0.4], [0.4]]) * length * turn.axis
     points: Any = ends @ camera[:3, :3].T + camera[:3, 3]

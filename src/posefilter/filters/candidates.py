@@ -53,7 +53,7 @@ def sample_around_truth(
     per_kind: int,
     sigma: Sequence[float],
     generator: Generator,
-    turns: Propagate,
+    rotations: Propagate,
 ) -> Tensor:
     """Draw the candidates that need the truth.
 
@@ -69,7 +69,7 @@ def sample_around_truth(
         per_kind: Candidates of a kind.
         sigma: Lowest and highest noise level [m]; levels are drawn log-uniformly.
         generator: Source of randomness.
-        turns: The kernel that turns the truth, such as half turns of every particle.
+        rotations: The kernel that turns the truth, such as half turns of every particle.
 
     Returns:
         Poses (B, 1 + 4 per_kind + per_kind // 2, 4, 4), camera_from_object.
@@ -94,7 +94,7 @@ def sample_around_truth(
         center,
     )
     still = copies.new_zeros(B, per_kind, space.dimensions)
-    turned = turns(copies, still, Step(0, 1, size[:, 0]), space, generator)
+    turned = rotations(copies, still, Step(0, 1, size[:, 0]), space, generator)
     flipped = perturb(turned, size * 0.3, space, generator)
     return torch.cat([truth, nearby, on_object, anywhere, rotated, flipped], dim=1)
 

@@ -63,7 +63,7 @@ class LearnedDisplacement:
         return space.move(state, displacement)
 
 
-class HalfTurns:
+class HalfTurnRotations:
     """Rotate a share of the poses by pi about a random axis of the object through its center.
 
     A move between the modes of nearly symmetric objects.
@@ -84,7 +84,7 @@ class HalfTurns:
         return half_turns(state, space, generator, self.probability)
 
 
-class AxisTurns:
+class AxisRotations:
     """Rotate a share of the poses about a random axis of the object's smallest box.
 
     By pi, or by any angle: a move between the modes of what is nearly symmetric, such as the faces

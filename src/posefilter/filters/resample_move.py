@@ -22,7 +22,7 @@ from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
-from posefilter.filters.propagate import AxisTurns
+from posefilter.filters.propagate import AxisRotations
 from posefilter.filters.refine import require_scorer
 from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.pose_statistics import twist_between
@@ -54,7 +54,7 @@ class ResampleMove:
 
     Args:
         sweeps: Steps of each particle.
-        turn_probability: Probability that a step is a turn about an axis.
+        rotation_probability: Probability that a step is a rotation about an axis.
         uniform_angle_probability: Probability that a turn's angle is uniform rather than pi.
         temperature: T; 1 takes the likelihood at its word, more makes the belief wider.
         sigma: Noise level of the likelihood [m].
@@ -69,20 +69,20 @@ class ResampleMove:
     def __init__(
         self,
         sweeps: int = 12,
-        turn_probability: float = 0.2,
+        rotation_probability: float = 0.2,
         uniform_angle_probability: float = 0.7,
         temperature: float = 1.0,
         sigma: float = 0.004,
         pixels: int = 256,
     ) -> None:
-        shares = (turn_probability, uniform_angle_probability)
+        shares = (rotation_probability, uniform_angle_probability)
         if sweeps < 0 or not all(0 <= share <= 1 for share in shares) or not temperature > 0:
             raise UserError(
                 f"refine: resample-move needs sweeps >= 0, probabilities between 0 and 1 and "
                 f"temperature > 0, got {sweeps}, {shares} and {temperature}"
             )
-        self.sweeps, self.turn_probability = sweeps, turn_probability
-        self.turns = AxisTurns(1.0, uniform_angle_probability)
+        self.sweeps, self.rotation_probability = sweeps, rotation_probability
+        self.rotations = AxisRotations(1.0, uniform_angle_probability)
         self.temperature, self.sigma, self.pixels = temperature, sigma, pixels
 
     @torch.no_grad()
@@ -148,11 +148,11 @@ class ResampleMove:
         self, poses: Tensor, others: Tensor, space: PoseSpace, generator: Generator
     ) -> Tensor:
         """Return a proposal for each pose.  (B, N, 4, 4), (B, M, 4, 4) -> (B, N, 4, 4)."""
-        turned = self.turns(poses, poses, None, space, generator)  # type: ignore[arg-type]
+        turned = self.rotations(poses, poses, None, space, generator)  # type: ignore[arg-type]
         step = draw_differences(others, poses.shape[1], space, generator)
         chance = torch.rand(poses.shape[:2], generator=generator, device=poses.device)
-        turns = chance < self.turn_probability
-        return torch.where(turns[..., None, None], turned, space.move(poses, step))
+        rotated = chance < self.rotation_probability
+        return torch.where(rotated[..., None, None], turned, space.move(poses, step))
 
 
 def draw_differences(poses: Tensor, count: int, space: PoseSpace, generator: Generator) -> Tensor:

@@ -191,7 +191,7 @@ def _half_width(sigma: float) -> int:
     return max(1, round(3 * sigma))
 
 
-class TextureTurns:
+class TextureRotations:
     """Turn the estimate, and the particles, as the print says.
 
     The turns that move the object's shape onto itself are what the depth leaves open. Each has the
@@ -232,7 +232,7 @@ class TextureTurns:
         """
         object_model, colored = self._check(encoding, method)
         first = belief.best
-        turns, first_tried = list_turns(object_model)
+        turns, first_tried = list_rotations(object_model)
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
@@ -240,14 +240,14 @@ class TextureTurns:
             first, turns, first_tried, colored, method, object_model, generator
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
-        best = self._turn_finely(first, chosen, turns, colored, object_model)
-        poses = _turn_particles(
+        best = self._rotate_finely(first, chosen, turns, colored, object_model)
+        poses = _rotate_particles(
             belief, turns[first_tried], turns[tried], log_posterior, object_model, generator
         )
         return belief._replace(best=best, poses=poses)
 
     @torch.no_grad()
-    def turn_nearby(self, best: Tensor, encoding: Encoding, method: Method) -> Tensor | None:
+    def rotate_nearby(self, best: Tensor, encoding: Encoding, method: Method) -> Tensor | None:
         """Return estimates (B, 4, 4) turned by less than ten degrees, where the shape leaves any
         angle open; None where it leaves a few turns open, or none.
 
@@ -257,11 +257,11 @@ class TextureTurns:
             UserError: As when called.
         """
         object_model, colored = self._check(encoding, method)
-        turns, first_tried = list_turns(object_model)
+        turns, first_tried = list_rotations(object_model)
         if len(first_tried) <= _MOST:
             return None
         here = torch.eye(4).expand_as(best).to(best)
-        return self._turn_finely(best, here, turns.to(best), colored, object_model)
+        return self._rotate_finely(best, here, turns.to(best), colored, object_model)
 
     @staticmethod
     def _check(encoding: Encoding, method: Method) -> tuple[ObjectModel, HasColor]:
@@ -324,7 +324,7 @@ class TextureTurns:
         )
         return evidence + learned, chosen
 
-    def _turn_finely(
+    def _rotate_finely(
         self,
         best: Tensor,
         chosen: Tensor,
@@ -351,7 +351,7 @@ class TextureTurns:
         return poses[torch.arange(len(best), device=best.device), evidence.argmax(1)]
 
 
-def list_turns(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
+def list_rotations(object_model: ObjectModel) -> tuple[Tensor, Tensor]:
     """Return the turns that an object's shape leaves open, and which of them are tried first.
 
     Args:
@@ -382,7 +382,7 @@ def _angles(a: Tensor, b: Tensor) -> Tensor:
     return torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
 
 
-def _turn_particles(
+def _rotate_particles(
     belief: BeliefBatch,
     turns: Tensor,
     to: Tensor,

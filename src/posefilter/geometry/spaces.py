@@ -47,14 +47,16 @@ class PoseSpace:
         center: The object's center in its own frame [m].
         radius: Radius of its bounding sphere [m].
         dimensions: Width of a tangent vector.
-        max_turn: Largest standard deviation of a rotation [rad].
+        max_rotation_std: Largest standard deviation of a rotation [rad].
         points: (P, 3) surface points of the object [m], for `axes`.
     """
 
     center: tuple[float, float, float]
     radius: float
     dimensions: int = 6
-    max_turn: float = 1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
+    max_rotation_std: float = (
+        1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
+    )
     points: Tensor | None = field(default=None, compare=False, repr=False)
 
     @cached_property
@@ -83,7 +85,7 @@ class PoseSpace:
 
         (*) -> (*, 6) as [m, m, m, rad, rad, rad].
         """
-        turn = (sigma / self.radius).clamp(max=self.max_turn)
+        turn = (sigma / self.radius).clamp(max=self.max_rotation_std)
         return torch.stack([sigma] * 3 + [turn] * 3, dim=-1)
 
     def mean(self, state: Tensor, weights: Tensor) -> Tensor:

@@ -24,8 +24,8 @@ from posefilter.meshes.mesh import (
     surface_colors,
     surface_points,
 )
+from posefilter.meshes.rotational_symmetries import ANY, RotationalSymmetry, are_parallel
 from posefilter.meshes.symmetries import rotation_about
-from posefilter.meshes.turns import ANY, Turn, are_parallel
 
 FOLDS = (2, 3, 4)
 # Allowed beyond what two samplings of one surface differ by, in diameters: of the mean distance,
@@ -51,7 +51,7 @@ class _Surface(NamedTuple):
     diameter: float
 
 
-def find_symmetries(mesh: Mesh, seed: int = 0) -> list[Turn]:
+def find_symmetries(mesh: Mesh, seed: int = 0) -> list[RotationalSymmetry]:
     """Return the turns that leave the shape of a mesh as it is; of each, whether the texture too.
 
     Args:
@@ -63,14 +63,14 @@ def find_symmetries(mesh: Mesh, seed: int = 0) -> list[Turn]:
     """
     surface = _sample(mesh, seed)
     center = surface.points.mean(0)  # every symmetry leaves the centroid as it is
-    found: list[Turn] = []
+    found: list[RotationalSymmetry] = []
     for axis in _candidate_axes(mesh, surface.points - center):
         for fold in (ANY, *FOLDS):
             turn = _try(surface, axis, center, fold)
             if turn is not None and turn.shape:
                 found.append(turn)
     found.sort(key=lambda turn: turn.distance)
-    kept: list[Turn] = []
+    kept: list[RotationalSymmetry] = []
     for turn in found:
         if not any(turn.fold == k.fold and are_parallel(turn.axis, k.axis) for k in kept):
             kept.append(turn)
@@ -109,7 +109,9 @@ def _candidate_axes(mesh: Mesh, centered: np.ndarray) -> list[np.ndarray]:
     return [*principal, *box]
 
 
-def _try(surface: _Surface, axis: np.ndarray, center: np.ndarray, fold: int) -> Turn | None:
+def _try(
+    surface: _Surface, axis: np.ndarray, center: np.ndarray, fold: int
+) -> RotationalSymmetry | None:
     """Refine and judge a turn; None where it is far from a symmetry."""
     angles = _ANY_ANGLES if fold == ANY else (2 * np.pi / fold,)
     start = rotation_about(axis, angles[0], center)
@@ -125,7 +127,9 @@ def _try(surface: _Surface, axis: np.ndarray, center: np.ndarray, fold: int) -> 
     color = max(float(np.quantile(_color_change(surface, turn), 0.95)) for turn in exact)
     limit = surface.diameter
     shape = distance <= MEAN_EXCESS * limit and far <= FAR_EXCESS * limit
-    return Turn(axis, point, fold, distance, far, color, shape, shape and color <= MOST_COLOR)
+    return RotationalSymmetry(
+        axis, point, fold, distance, far, color, shape, shape and color <= MOST_COLOR
+    )
 
 
 def _excess(after: np.ndarray, before: np.ndarray, of: Callable[[np.ndarray], Any]) -> float:
@@ -178,7 +182,7 @@ def _axis_of(transform: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np
     return (axis if axis @ towards >= 0 else -axis), point
 
 
-def _is_implied(turn: Turn, turns: Sequence[Turn]) -> bool:
+def _is_implied(turn: RotationalSymmetry, turns: Sequence[RotationalSymmetry]) -> bool:
     """Tell whether any turn about the same axis does, and as well, what a discrete one does."""
     return turn.fold != ANY and any(
         one.fold == ANY and are_parallel(one.axis, turn.axis) and (one.texture or not turn.texture)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from posefilter.errors import UserError
 from posefilter.meshes.find_symmetries import find_symmetries
 from posefilter.meshes.mesh import Mesh, sample_surface, surface_colors, surface_points
-from posefilter.meshes.turns import ANY, make_group, select
+from posefilter.meshes.rotational_symmetries import ANY, make_group, select
 from posefilter.types import ObjectModel
 
 _POINTS = 800

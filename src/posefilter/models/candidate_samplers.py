@@ -15,7 +15,7 @@ from posefilter.filters.candidates import (
 )
 from posefilter.filters.estimate import select_particle
 from posefilter.filters.loop import make_particles
-from posefilter.filters.propagate import HalfTurns
+from posefilter.filters.propagate import HalfTurnRotations
 from posefilter.geometry.camera import back_project, rays
 from posefilter.geometry.pose import invert, transform
 from posefilter.protocols import Encoding, Propagate
@@ -85,7 +85,7 @@ class CandidatePoses:
         levels: Steps of the persistent particles from there to the lowest level.
         persistent_sigma_probability: Probability that an image is scored at the noise level of its
             persistent particles, rather than at one drawn from `sigma_range`.
-        turns: Kernel that turns the truth, for hard negatives. By default half turns about the
+        rotations: Kernel that turns the truth, for hard negatives. By default half turns about the
             axes of the mesh's frame.
     """
 
@@ -100,13 +100,13 @@ class CandidatePoses:
         initial_sigma: float = 0.05,
         levels: int = 12,
         persistent_sigma_probability: float = 0.5,
-        turns: Propagate | None = None,
+        rotations: Propagate | None = None,
     ) -> None:
         self.candidates_per_kind, self.proposals = candidates_per_kind, proposals
         self.sigma_range = (float(sigma_range[0]), float(sigma_range[1]))
         self.persistent_sigma_probability = persistent_sigma_probability
         self.initial_sigma = float(initial_sigma)
-        self.turns = turns or HalfTurns(1.0)
+        self.rotations = rotations or HalfTurnRotations(1.0)
         self.persistent = (
             PersistentParticles(particles, levels, self.sigma_range[0]) if particles else None
         )
@@ -127,7 +127,7 @@ class CandidatePoses:
                 self.candidates_per_kind,
                 self.sigma_range,
                 generator,
-                self.turns,
+                self.rotations,
             )
         ]
         proposes = "propose_poses" in method.capabilities

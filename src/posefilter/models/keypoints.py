@@ -1,4 +1,4 @@
-"""A baseline without a filter: belief maps of the box's corners, and a pose from their peaks.
+"""A baseline without a filter: heatmaps of the box's corners, and a pose from their peaks.
 
 As DOPE has it (Tremblay et al. 2018): a network predicts a map for each corner of the object's
 bounding box and for its center, the maps' peaks are found, and perspective-n-point (EPnP, Lepetit
@@ -24,7 +24,7 @@ from posefilter.geometry.keypoints import (
 from posefilter.geometry.lookup import sample
 from posefilter.geometry.pose import pose_about
 from posefilter.models.pose_particles import Hypotheses
-from posefilter.nets.belief_maps import STRIDE, BeliefMapNet
+from posefilter.nets.heatmaps import STRIDE, HeatmapNet
 from posefilter.types import Batch
 
 _LEAST = 0.01  # height of a peak
@@ -47,7 +47,7 @@ class KeypointEncoding(NamedTuple):
 
 
 class Keypoints(Hypotheses):
-    """Belief maps and perspective-n-point.
+    """Heatmaps and perspective-n-point.
 
     The first hypothesis is OpenCV's RANSAC over the highest peaks of all maps. Each other one is a
     fit to some keypoints, drawn by the height of their highest peak, at peaks drawn by height.
@@ -61,7 +61,7 @@ class Keypoints(Hypotheses):
     """
 
     provides: ClassVar[Capabilities] = (
-        "belief_maps",
+        "heatmaps",
         "depth",
         "pose",
         "pose_space",
@@ -71,7 +71,7 @@ class Keypoints(Hypotheses):
 
     def __init__(
         self,
-        net: BeliefMapNet,
+        net: HeatmapNet,
         peaks: int = 3,
         subset: int = 6,
         inlier_px: float = 4.0,

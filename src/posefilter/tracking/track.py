@@ -19,7 +19,7 @@ from posefilter.filters.refine import Compose
 from posefilter.filters.resample import Multinomial, Systematic
 from posefilter.filters.reweight import CurrentLikelihood
 from posefilter.filters.schedule import Geometric
-from posefilter.filters.texture import TextureTurns
+from posefilter.filters.texture import TextureRotations
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.images import Images
@@ -32,10 +32,10 @@ from posefilter.tracking.frame import Frame
 from posefilter.tracking.kld import bin_poses, count_needed
 from posefilter.tracking.objectness import measure_objectness, measure_presence
 from posefilter.tracking.predict import FromBelief
+from posefilter.tracking.rotate import RotateTogether
 from posefilter.tracking.scoring import FrameScorer, check_method
 from posefilter.tracking.settings import FilterSettings, TrackerSettings
 from posefilter.tracking.track_loss import LOST, TRACKED, TrackLossDetector
-from posefilter.tracking.turn import TurnTogether
 from posefilter.tracking.window import Window, place_window
 from posefilter.types import Batch, BeliefBatch, Particles, Trace
 
@@ -233,7 +233,7 @@ class Track:
         elif window is not None:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
         encoding, start = self.method.encode(batch), predicted.belief.state
-        turns = [TurnTogether(one) for one in self._texture_turns if self._texture_is_due]
+        turns = [RotateTogether(one) for one in self._texture_rotations if self._texture_is_due]
         refine = self._refine(settings.quadratic_fits, turns)
         return self._filter(batch, encoding, start, follow, refine, against)
 
@@ -252,7 +252,7 @@ class Track:
         drawn = Multinomial()(begun, search.min_particles, self.space, self.generator)
         start = inherit(begun.state, drawn)
         # as in a single image: the frame before does not tell how the object is turned
-        refine = self._refine(settings.quadratic_fits, self._texture_turns)
+        refine = self._refine(settings.quadratic_fits, self._texture_rotations)
         return self._filter(batch, encoding, start, search, refine)
 
     def _filter(
@@ -300,8 +300,8 @@ class Track:
         return getattr(own, "components", (own,))
 
     @property
-    def _texture_turns(self) -> list[TextureTurns]:
-        return [one for one in self._own_refine if isinstance(one, TextureTurns)]
+    def _texture_rotations(self) -> list[TextureRotations]:
+        return [one for one in self._own_refine if isinstance(one, TextureRotations)]
 
     def _correct(
         self, predicted: State | None, belief: BeliefBatch | None, status: str

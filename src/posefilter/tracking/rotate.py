@@ -3,12 +3,12 @@
 import torch
 from torch import Generator
 
-from posefilter.filters.texture import TextureTurns
+from posefilter.filters.texture import TextureRotations
 from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
 
-class TurnTogether:
+class RotateTogether:
     """Turn the estimate as the print says, and all particles by the same turn.
 
     In a single image particles spread over the turns that its print leaves open. In a track the
@@ -20,7 +20,7 @@ class TurnTogether:
         texture: Decides the turn.
     """
 
-    def __init__(self, texture: TextureTurns) -> None:
+    def __init__(self, texture: TextureRotations) -> None:
         self.texture = texture
 
     @torch.no_grad()
@@ -28,7 +28,7 @@ class TurnTogether:
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief, turned; the score stays."""
-        best = self.texture.turn_nearby(belief.best, encoding, method)
+        best = self.texture.rotate_nearby(belief.best, encoding, method)
         if best is None:
             best = self.texture(belief, encoding, method, generator).best
         turn = torch.linalg.inv(belief.best) @ best  # in the object's frame

@@ -1,4 +1,4 @@
-"""The loss of belief maps is a sum of divergences of coins, and so known in closed form."""
+"""The loss of heatmaps is a sum of divergences of coins, and so known in closed form."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import Bernoulli, kl_divergence
 
 from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
-from posefilter.losses.belief_maps import BeliefMaps
+from posefilter.losses.heatmaps import Heatmaps
 
 STRIDE = 2
 
@@ -35,10 +35,10 @@ def test_it_is_the_divergence_of_each_cell(batch, model, make_trace, keypoints: 
     logits = torch.randn(1, 2, 5, 10, dtype=torch.float64)
     trace = make_trace(torch.zeros(1, 1, 2))._replace(encoding=Encoding(logits, keypoints))
     cells = kl_divergence(Bernoulli(probs=target), Bernoulli(logits=logits))
-    found = BeliefMaps(1.5)(trace, batch, model)
+    found = Heatmaps(1.5)(trace, batch, model)
     torch.testing.assert_close(found, cells.sum((2, 3)).mean(1))
     # a wider Gaussian is another target
-    assert BeliefMaps(3.0)(trace, batch, model).item() != pytest.approx(found.item(), rel=1e-3)
+    assert Heatmaps(3.0)(trace, batch, model).item() != pytest.approx(found.item(), rel=1e-3)
 
 
 def test_without_an_opinion_an_empty_map_costs_a_bit_a_cell(
@@ -48,5 +48,5 @@ def test_without_an_opinion_an_empty_map_costs_a_bit_a_cell(
     behind[:, 2, 3] = -1
     logits = torch.zeros(1, 2, 5, 10, dtype=torch.float64)
     trace = make_trace(torch.zeros(1, 1, 2))._replace(encoding=Encoding(logits, keypoints))
-    lost = BeliefMaps()(trace, batch._replace(camera_from_object=behind), model)
+    lost = Heatmaps()(trace, batch._replace(camera_from_object=behind), model)
     assert lost.tolist() == pytest.approx([50 * math.log(2)])

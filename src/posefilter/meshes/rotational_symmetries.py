@@ -14,7 +14,7 @@ _PARALLEL = np.cos(np.deg2rad(10.0))
 _MOST_ELEMENTS = 60  # of a finite group of turns that is not of one axis
 
 
-class Turn(NamedTuple):
+class RotationalSymmetry(NamedTuple):
     """A turn that was tried, and how well it fits.
 
     Attributes:
@@ -39,7 +39,7 @@ class Turn(NamedTuple):
     texture: bool
 
 
-def select(turns: Sequence[Turn], texture: bool = True) -> list[Turn]:
+def select(turns: Sequence[RotationalSymmetry], texture: bool = True) -> list[RotationalSymmetry]:
     """Return the turns that generate a mesh's symmetries.
 
     Args:
@@ -62,7 +62,7 @@ def select(turns: Sequence[Turn], texture: bool = True) -> list[Turn]:
     return [*continuous, *(across[:1] if len(continuous) == 1 else [])]
 
 
-def make_group(turns: Sequence[Turn], size: float, steps: int = 36) -> np.ndarray:
+def make_group(turns: Sequence[RotationalSymmetry], size: float, steps: int = 36) -> np.ndarray:
     """Return every product of turns.
 
     Args:
@@ -77,7 +77,7 @@ def make_group(turns: Sequence[Turn], size: float, steps: int = 36) -> np.ndarra
     return symmetry_group(list_discrete(turns, size), continuous, steps)
 
 
-def list_discrete(turns: Sequence[Turn], size: float) -> list[np.ndarray]:
+def list_discrete(turns: Sequence[RotationalSymmetry], size: float) -> list[np.ndarray]:
     """Return every product of the discrete turns but the identity, (4, 4) each.
 
     Where the products of turns about several axes do not close, as they do in a group, those of the
@@ -91,7 +91,9 @@ def list_discrete(turns: Sequence[Turn], size: float) -> list[np.ndarray]:
     return group[1:]
 
 
-def describe_symmetries(turns: Sequence[Turn], size: float, scale: float = 1.0) -> dict[str, Any]:
+def describe_symmetries(
+    turns: Sequence[RotationalSymmetry], size: float, scale: float = 1.0
+) -> dict[str, Any]:
     """Return symmetries in the BOP challenge's format.
 
     Args:
@@ -117,7 +119,7 @@ def are_parallel(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(abs(a @ b) > _PARALLEL)
 
 
-def _drop_divisors(turns: Sequence[Turn]) -> list[Turn]:
+def _drop_divisors(turns: Sequence[RotationalSymmetry]) -> list[RotationalSymmetry]:
     """Leave out half turns about an axis that has quarter turns."""
     return [
         turn

@@ -1,4 +1,6 @@
-"""A network of belief maps: for each keypoint of the object's box, where in the image is it?"""
+"""A network of heatmaps, which DOPE calls belief maps: for each keypoint of the object's box, where
+in the image is it?
+"""
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +13,7 @@ STRIDE = 4  # pixels a cell
 _RARE = -4.0  # logit of a new network: hardly any cell is near a keypoint
 
 
-class BeliefMapNet(UNet):
+class HeatmapNet(UNet):
     """The U-Net of the other methods with maps of stride 4.
 
     Args:

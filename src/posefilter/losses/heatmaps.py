@@ -1,4 +1,4 @@
-"""The loss of belief maps."""
+"""The loss of heatmaps."""
 
 from typing import ClassVar
 
@@ -11,7 +11,7 @@ from posefilter.geometry.keypoints import draw_gaussians, project_keypoints
 from posefilter.types import Batch, ObjectModel, Trace
 
 
-class BeliefMaps:
+class Heatmaps:
     """Cross-entropy of each cell against a Gaussian about the keypoint, summed over each map.
 
     Keypoints out of the frame have an empty map; hidden ones are drawn as any other. DOPE has the
@@ -24,7 +24,7 @@ class BeliefMaps:
         sigma: Standard deviation of the Gaussian [cells].
     """
 
-    requires: ClassVar[Capabilities] = ("belief_maps",)
+    requires: ClassVar[Capabilities] = ("heatmaps",)
 
     def __init__(self, sigma: float = 1.5) -> None:
         self.sigma = sigma
