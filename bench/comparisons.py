@@ -47,7 +47,7 @@ SCHEDULES = {
 }
 # half of the preset's particles and no mean shift, for time: it changes the test alone
 OF_MODEL = {
-    "pose_pf": "filter.particles=100 filter.first_particles=200 filter.steps=8 "
+    "pose_pf": "filter.particles=100 filter.initial_particles=200 filter.steps=8 "
     "filter/refine=rescore data/augment=strong"  # as the others have it
 }
 DISTRACTORS, CLUTTERED = (0, 8, 16), 60  # images each
@@ -56,7 +56,7 @@ RESAMPLED = 2000  # bootstrap samples
 TINY = (
     "data.generate.frames=30 data.generate.size=[160,120] data.generate.workers=1 "
     "data.image_width=160 data.limit_val=2 data.limit_test=4 data.num_model_points=500 "
-    "filter.particles=8 filter.first_particles=null"
+    "filter.particles=8 filter.initial_particles=null"
 )
 TINY_SCHEDULES = {
     "learning_curve": "trainer.max_steps=2 trainer.val_check_interval=2",

@@ -74,7 +74,7 @@ def draw_image(width: int) -> Batch:
 def measure(method: PoseEstimator, batch: Batch, particles: int, steps: int, points: int) -> Cost:
     """Return what one estimate takes."""
     own: Any = method
-    own.filter.particles = own.filter.first_particles = particles
+    own.filter.particles = own.filter.initial_particles = particles
     own.filter.steps = steps
     if hasattr(own, "pixels"):
         own.pixels = points

@@ -281,9 +281,12 @@ def list_pose_space() -> list[Line]:
     return [
         *list_pose_rows("seed=0"),
         Line("pose_filter", f"filter.particles={counts}", working, "kept"),
-        Line("pose_filter", f"filter.first_particles={counts}", working, "first"),
+        Line("pose_filter", f"filter.initial_particles={counts}", working, "first"),
         Line(
-            "pose_filter", f"filter.first_particles=null filter.particles={counts}", working, "both"
+            "pose_filter",
+            f"filter.initial_particles=null filter.particles={counts}",
+            working,
+            "both",
         ),
         Line("pose_filter", "filter.steps=1,2,3,5,10,20,50", working, "steps"),
         Line("pose_filter", "filter.particles=100,400 filter.steps=10,30", paper, "paper"),

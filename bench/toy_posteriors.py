@@ -138,7 +138,7 @@ def run(posterior: Posterior, particles: int, seed: int, way: str) -> tuple[Beli
         propagate=Gaussian(0.5),
         estimate=Argmax(),
         refine=make_refine(way, particles),
-        first_particles=8 * particles,
+        initial_particles=8 * particles,
     )
     toy = Toy(posterior)
     found = filter(None, toy, generator).belief  # type: ignore[arg-type]

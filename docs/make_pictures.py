@@ -58,7 +58,7 @@ SEARCH = {
             "depth_offset": [0.1, 0.9],
         },
         "steps": 20,
-        "first_particles": 3000,
+        "initial_particles": 3000,
     },
 }
 WIDTH, QUALITY = 1400, 82  # of the written pictures: [px] at most, and of JPEG

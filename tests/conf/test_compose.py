@@ -270,7 +270,7 @@ class TestBuilding:
         with pytest.raises(UserError, match="did you mean 'Adam'"):
             instantiate({"_target_": "torch.optim.AdamV"}, "optimizer")
         node = {
-            "_target_": "posefilter.filters.resample.BelowESS",
+            "_target_": "posefilter.filters.resample.AdaptiveResampling",
             "resampler": {},
             "threshhold": 1,
         }

@@ -90,7 +90,7 @@ REFUSED = {
         "data.limit_val": (0, 10**21),
         "data.generate.frames": (0,),
         "filter.particles": (0, 10**9),
-        "filter.first_particles": (0,),
+        "filter.initial_particles": (0,),
         "filter.steps": (0,),
         "filter.schedule.initial_sigma": (0, -1, math.nan),
         "model.likelihood.width": (0, 10**9),

@@ -121,7 +121,7 @@ def test_without_a_mesh_the_hull_is_shown_closed_and_outwards() -> None:
 @pytest.mark.parametrize("model", ["pose_pf", "pixel_pf", "patch_pf"])
 def test_every_method_with_a_pose_can_be_shown(model: str, tmp_path: Path) -> None:
     few = ["filter.particles=12", "filter.steps=3", "filter/refine=none"]
-    few += ["filter.first_particles=16"] if model == "pose_pf" else []
+    few += ["filter.initial_particles=16"] if model == "pose_pf" else []
     job = compose_job("train", CONF, [f"model={model}", *few], tmp_path)
     method = build_method(recipe(job), toy.square()).eval()
     batch = toy.scenes(1)

@@ -13,7 +13,7 @@ from posefilter.filters.estimate import Mean
 from posefilter.filters.loop import make_particles
 from posefilter.filters.modes import find_modes, find_pose_modes
 from posefilter.filters.refine import Gradient, MeanShift, Rescore
-from posefilter.filters.resample import BelowESS, Islands, Soft, Systematic
+from posefilter.filters.resample import AdaptiveResampling, Islands, Soft, Systematic
 from posefilter.filters.resample_move import ResampleMove, draw_differences
 from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.geometry.pose import make_pose
@@ -95,7 +95,9 @@ def test_resampling_begins_below_the_threshold() -> None:
     log_w = torch.tensor([[0.5, 0.5, 0.0, 0.0]]).log()
     particles = make_particles(torch.zeros(1, 4, 2), 0)._replace(log_weights=log_w)
     for threshold, resampled in ((0.49, False), (0.51, True)):
-        new = BelowESS(Systematic(), threshold)(particles, 4, PIXELS, Generator().manual_seed(0))
+        new = AdaptiveResampling(Systematic(), threshold)(
+            particles, 4, PIXELS, Generator().manual_seed(0)
+        )
         assert (new.ancestors.tolist() != [[0, 1, 2, 3]]) == resampled
 
 

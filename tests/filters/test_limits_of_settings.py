@@ -31,8 +31,8 @@ def make_islands(size: int) -> Islands:
 @pytest.mark.parametrize(
     ("make", "legal", "wrong"),
     [
-        (make_filter, {"particles": 1, "first_particles": 2}, {"particles": 0}),
-        (make_filter, {"first_particles": 1}, {"first_particles": 0}),
+        (make_filter, {"particles": 1, "initial_particles": 2}, {"particles": 0}),
+        (make_filter, {"initial_particles": 1}, {"initial_particles": 0}),
         (make_filter, {"steps": 1}, {"steps": 0}),
         (Agreement, {"hypotheses": 1}, {"hypotheses": 0}),
         (Agreement, {"top_fragments": 1}, {"top_fragments": 0}),

@@ -13,7 +13,7 @@ from posefilter.filters.estimate import Argmax, Mean
 from posefilter.filters.loop import ParticleFilter, inherit
 from posefilter.filters.propagate import Compose, Gaussian, Identity, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import BelowESS, NoResampling, Soft, Systematic
+from posefilter.filters.resample import AdaptiveResampling, NoResampling, Soft, Systematic
 from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.filters.transport import EnsembleTransform, SampledTransport
@@ -76,7 +76,13 @@ def build(
 GOALS = torch.tensor([[1.0, 2.0], [-1.0, 0.5], [0.0, 0.0]])
 every = pytest.mark.parametrize(
     "resample",
-    [Systematic(), Soft(), BelowESS(Systematic()), SampledTransport(), EnsembleTransform()],
+    [
+        Systematic(),
+        Soft(),
+        AdaptiveResampling(Systematic()),
+        SampledTransport(),
+        EnsembleTransform(),
+    ],
     ids=lambda x: type(x).__name__,
 )
 
@@ -177,11 +183,11 @@ def test_a_latent_follows_its_particle() -> None:
 
 
 def test_the_first_step_may_have_more_particles() -> None:
-    trace = build(first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
+    trace = build(initial_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
     assert [particles.state.shape[1] for particles in trace.particles] == [300, 50, 50, 50]
     assert trace.particles[1].ancestors.max() >= 50
-    with pytest.raises(UserError, match="first_particles"):
-        build(NoResampling(), first_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
+    with pytest.raises(UserError, match="initial_particles"):
+        build(NoResampling(), initial_particles=300)(None, Hill(GOALS), Generator().manual_seed(0))
     with pytest.raises(UserError, match="particles=0"):
         build(particles=0)
 
@@ -253,9 +259,9 @@ def test_a_dead_filter_says_so(bad: float) -> None:
 
 
 def test_annealed_weights_are_the_last_scores_alone() -> None:
-    trace = build(BelowESS(Systematic(), 0.3), reweight=CurrentLikelihood(), estimate=Argmax())(
-        None, Hill(GOALS), Generator().manual_seed(0)
-    )
+    trace = build(
+        AdaptiveResampling(Systematic(), 0.3), reweight=CurrentLikelihood(), estimate=Argmax()
+    )(None, Hill(GOALS), Generator().manual_seed(0))
     torch.testing.assert_close(
         trace.particles[-1].log_weights, trace.outputs[-1].log_likelihood.log_softmax(1)
     )

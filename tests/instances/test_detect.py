@@ -51,7 +51,7 @@ class Toy:
 class SimpleFilter:
     """What the search needs of a filter."""
 
-    particles = first_particles = 8
+    particles = initial_particles = 8
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
         seen = method.encode(batch)[0] * (batch.depth[0, 0] > 0)

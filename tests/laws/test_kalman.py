@@ -13,7 +13,7 @@ from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Compose, Gaussian, LearnedDisplacement
 from posefilter.filters.refine import NoRefine
 from posefilter.filters.resample import (
-    BelowESS,
+    AdaptiveResampling,
     Multinomial,
     NoResampling,
     Soft,
@@ -134,8 +134,8 @@ def errors(trace: Trace) -> Tensor:
         (Stratified(), 1500, 32),
         (Multinomial(), 1500, 32),
         (Soft(0.7), 3000, 32),
-        (BelowESS(Systematic(), 0.5), 1500, 32),
-        (BelowESS(Soft(0.5), 0.5), 3000, 32),
+        (AdaptiveResampling(Systematic(), 0.5), 1500, 32),
+        (AdaptiveResampling(Soft(0.5), 0.5), 3000, 32),
         (NoResampling(), 20000, 8),
         (SampledTransport(0.02, 25), 80, 16),
     ],
@@ -185,7 +185,7 @@ class Greedy(Systematic):
         {"resample": Greedy()},
         {"resample": Systematic(), "propagate": LearnedDisplacement()},
         {"resample": Systematic(), "propagate": Gaussian(1.0)},
-        {"resample": BelowESS(Systematic(), 0.05), "reweight": CurrentLikelihood()},
+        {"resample": AdaptiveResampling(Systematic(), 0.05), "reweight": CurrentLikelihood()},
     ],
     ids=["weights forgotten", "greedy draw", "no noise", "no drift", "weights replaced"],
 )

@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.loop import inherit, make_particles
 from posefilter.filters.resample import (
-    BelowESS,
+    AdaptiveResampling,
     InverseCDF,
     Islands,
     Multinomial,
@@ -34,7 +34,7 @@ RESAMPLERS = {
     "stratified": Stratified(),
     "multinomial": Multinomial(),
     "soft": Soft(0.5),
-    "below ess": BelowESS(Systematic(), 0.5),
+    "adaptive": AdaptiveResampling(Systematic(), 0.5),
     "islands": Islands(Systematic(), 8),
     "sampled transport": SampledTransport(),
     "ensemble transform": EnsembleTransform(),
@@ -137,13 +137,13 @@ def test_effective_size_at_both_ends() -> None:
     torch.testing.assert_close(sizes, torch.tensor([50.0, 1.0, 2.0]))
 
 
-def test_below_ess_decides_for_each_image() -> None:
+def test_adaptive_resampling_decides_for_each_image() -> None:
     rich, poor = torch.zeros(1, 20), torch.cat([torch.full((1, 1), 6.0), torch.zeros(1, 19)], 1)
     particles = cloud_of(2, 20)._replace(
         log_weights=torch.log_softmax(torch.cat([rich, poor]) + 0.1 * torch.randn(2, 20), 1)
     )
     for inner in (Systematic(), EnsembleTransform()):
-        resampled = BelowESS(inner, 0.5)(particles, 20, SPACE, Generator().manual_seed(0))
+        resampled = AdaptiveResampling(inner, 0.5)(particles, 20, SPACE, Generator().manual_seed(0))
         assert torch.equal(resampled.ancestors[0], torch.arange(20))
         assert torch.equal(resampled.log_weights[0], particles.log_weights[0])
         assert torch.equal(inherit(particles.state, resampled, SPACE)[0], particles.state[0])
@@ -156,7 +156,7 @@ def test_never_keeps_all_and_refuses_another_size() -> None:
     resampled = NoResampling()(particles, 20, SPACE, Generator())
     assert torch.equal(resampled.ancestors, torch.arange(20).expand(2, 20))
     assert torch.equal(resampled.log_weights, particles.log_weights)
-    with pytest.raises(UserError, match="first_particles"):
+    with pytest.raises(UserError, match="initial_particles"):
         NoResampling()(particles, 10, SPACE, Generator())
 
 

@@ -12,7 +12,7 @@ from posefilter.filters.estimate import Argmax
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.propagate import Gaussian
 from posefilter.filters.refine import NoRefine
-from posefilter.filters.resample import BelowESS, Systematic
+from posefilter.filters.resample import AdaptiveResampling, Systematic
 from posefilter.filters.reweight import CurrentLikelihood, LikelihoodRatio, SequentialBayes
 from posefilter.filters.schedule import Constant, Geometric
 from posefilter.geometry.spaces import PixelSpace
@@ -58,7 +58,7 @@ def run(reweight: Reweight, schedule: Constant | Geometric) -> Trace:
         start,
         schedule,
         reweight,
-        BelowESS(Systematic(), 0.7),
+        AdaptiveResampling(Systematic(), 0.7),
         Gaussian(FACTOR),
         Argmax(),
         NoRefine(),

@@ -21,7 +21,7 @@ HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
 ONE_MODE = SCENE.parent / "scene0003_0"  # random numbers do not choose between two
 NAME = "003_cracker_box"
-FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "filter/refine=none"]
+FEW = ["filter.particles=40", "filter.initial_particles=60", "filter.steps=3", "filter/refine=none"]
 
 
 def read_scene(number: int = 0, scene: Path = SCENE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

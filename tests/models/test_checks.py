@@ -69,7 +69,7 @@ def test_agreement_serves_both_pose_methods_before_they_know_their_object(
 def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: Path) -> None:
     small = [
         "filter.particles=8",
-        "filter.first_particles=null",
+        "filter.initial_particles=null",
         "filter.steps=1",
         "filter/refine=none",
     ]
@@ -116,13 +116,13 @@ def test_votes_need_four_numbers_to_remember(tmp_path: Path) -> None:
         one_line(refusal, f"model.net.latent_width={width}", "model/box_head=votes needs 4")
 
 
-WIDE = ["filter.particles=8", "filter.first_particles=20", "filter.steps=2"]
+WIDE = ["filter.particles=8", "filter.initial_particles=20", "filter.steps=2"]
 LEGAL = [
-    "model/train_rollout=short filter.first_particles=20 filter.steps=2",
-    "model/train_rollout=full filter.first_particles=null filter.steps=2",
-    "model/train_rollout=full filter.first_particles=8 filter.steps=2",
+    "model/train_rollout=short filter.initial_particles=20 filter.steps=2",
+    "model/train_rollout=full filter.initial_particles=null filter.steps=2",
+    "model/train_rollout=full filter.initial_particles=8 filter.steps=2",
     # one cloud is of one size, whatever it is
-    "model/train_rollout=full filter.first_particles=20 filter.steps=1",
+    "model/train_rollout=full filter.initial_particles=20 filter.steps=1",
 ]
 
 
@@ -134,8 +134,8 @@ def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_
         method.training_losses(batch, method.generator("train", 0))
     one_line(
         refusal,
-        "filter.first_particles=20",
-        "filter.first_particles=null",
+        "filter.initial_particles=20",
+        "filter.initial_particles=null",
         "model/train_rollout=short",
     )
     with torch.no_grad():  # a wide search is fine where nothing is taught
@@ -147,9 +147,9 @@ def test_all_steps_of_a_training_rollout_have_as_many_particles(model: str, tmp_
         assert all(loss.isfinite().all() for loss in losses.values())
 
 
-def test_first_particles_of_a_training_filter_are_named_by_their_key(tmp_path: Path) -> None:
+def test_initial_particles_of_a_training_filter_are_named_by_their_key(tmp_path: Path) -> None:
     wide = [
-        "model.train_filter.first_particles=200",
+        "model.train_filter.initial_particles=200",
         "model.train_filter.resample._target_=posefilter.filters.resample.Systematic",
     ]
     method = images(tmp_path, "model=patch_pf", *wide)
@@ -157,7 +157,9 @@ def test_first_particles_of_a_training_filter_are_named_by_their_key(tmp_path: P
     with pytest.raises(UserError) as refusal:
         check_particle_counts(method.train_filter, "model.train_filter")
     one_line(
-        refusal, "model.train_filter.first_particles=200", "model.train_filter.first_particles=null"
+        refusal,
+        "model.train_filter.initial_particles=200",
+        "model.train_filter.initial_particles=null",
     )
 
 
@@ -172,7 +174,11 @@ NUMBERS = {
     "model=patch_pf filter.estimate.top_fragments=0": ["estimate", "top_fragments=0", "1 or more"],
     "model=patch_pf filter.estimate.hypotheses=0": ["estimate", "hypotheses=0", "1 or more"],
     "model=patch_pf filter.estimate.scale_m=0": ["estimate", "scale_m=0", "above 0"],
-    "model.candidate_sampler.levels=1": ["model.candidate_sampler", "levels=1", "2 or more"],
+    "model.candidate_sampler.sigma_levels=1": [
+        "model.candidate_sampler",
+        "sigma_levels=1",
+        "2 or more",
+    ],
     "model.candidate_sampler.particles=-1": [
         "model.candidate_sampler",
         "particles=-1",
@@ -228,7 +234,7 @@ def test_the_least_that_is_legal_takes_a_step(typed: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "typed",
     [
-        "model.candidate_sampler.levels=2",
+        "model.candidate_sampler.sigma_levels=2",
         "model.candidate_sampler.particles=0",
         "model.candidate_sampler.particles=1",
     ],

@@ -48,7 +48,7 @@ def working(initialize: object = None) -> PosePF:
         PoseLikelihood(width=48, blocks=2, octaves=3, sigma=SIGMA, context=4),
         CandidatePoses(candidates_per_kind=6, proposals=4, particles=6, sigma_range=SIGMA),
         ObjectCoordinateNet((16, 24, 32, 32), fragments=16, features=4),
-        filter=ParticleFilter(100, 6, *pieces, first_particles=200),
+        filter=ParticleFilter(100, 6, *pieces, initial_particles=200),
         loss=Contrastive(),
         optimizer=partial(torch.optim.AdamW, lr=3e-3),
     )

@@ -53,7 +53,7 @@ def make(render: bool = True) -> RotationGrid:
         CropEncoder((16, 24, 32, 48), 32, 16),
         GRID,
         train_cells=64,
-        filter=ParticleFilter(60, 4, *pieces, Argmax(), refine, first_particles=200),
+        filter=ParticleFilter(60, 4, *pieces, Argmax(), refine, initial_particles=200),
         loss=GridPosterior(0.2),
         optimizer=partial(torch.optim.AdamW, lr=3e-3),
     )

@@ -42,7 +42,7 @@ from posefilter.ros.messages import (
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0000_0"
 NAME = "003_cracker_box"
-FEW = ["filter.particles=40", "filter.first_particles=60", "filter.steps=3", "filter/refine=none"]
+FEW = ["filter.particles=40", "filter.initial_particles=60", "filter.steps=3", "filter/refine=none"]
 TOPICS = Topics("/rgb", "/depth", "/info")
 TYPED = ["color=/rgb", "depth=/depth", "camera_info=/info"]
 

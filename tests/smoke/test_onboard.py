@@ -24,7 +24,7 @@ TOY = [
     "console=json",
     "settings=['data.image_width=160','data.generate.size=[160,120]','data.batch_size=2',"
     "'data.batch_size_test=2','data.workers=0','data.limit_train=8','filter.particles=16',"
-    "'filter.first_particles=null','filter.steps=2','data.generate.distractors=[1,1]',"
+    "'filter.initial_particles=null','filter.steps=2','data.generate.distractors=[1,1]',"
     "'data.num_model_points=200','logger=none','data.limit_val=1','data.generate.frames_per_scene=3',"
     + ",".join(f"'{setting}'" for setting in SMALL_POSE_PF)
     + "]",

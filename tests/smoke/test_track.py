@@ -28,7 +28,12 @@ from posefilter.tracking.settings import TrackerSettings
 
 HOME = Path(__file__).parents[2]
 SCENE = HOME / "docs" / "scenes" / "003_cracker_box" / "mixed" / "scene0003_0"
-FEW = ["filter.particles=100", "filter.first_particles=300", "filter.steps=5", "filter/refine=none"]
+FEW = [
+    "filter.particles=100",
+    "filter.initial_particles=300",
+    "filter.steps=5",
+    "filter/refine=none",
+]
 COMMON = ["checkpoint=003_cracker_box", "console=json", "threads=1", *FEW]
 CAMERA = "intrinsics=533.39,533.74,156.24,120.41"
 

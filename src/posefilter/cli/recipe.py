@@ -45,7 +45,7 @@ LIMITS = {
     "frames": 10_000_000,
     "warmup_steps": 10**12,
     "particles": 100_000,
-    "first_particles": 100_000,
+    "initial_particles": 100_000,
 }
 _KEY = re.compile(r"[\w./@#-]{1,100}")
 _REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}")

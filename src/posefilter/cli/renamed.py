@@ -75,11 +75,16 @@ KEYS = {
         for old, new in _GENERATE.items()
     },
     "filter.looks": "filter.max_searches",
-    "tracker.walk": "tracker.move_scale",
+    "filter.first_particles": "filter.initial_particles",
+    "model.train_filter.first_particles": "model.train_filter.initial_particles",
+    "model.candidate_sampler.levels": "model.candidate_sampler.sigma_levels",
+    "tracker.walk": "tracker.noise_scale",
+    "tracker.move_scale": "tracker.noise_scale",
+    "tracker.kld_cell": "tracker.kld_bin_size",
     "tracker.jump": "tracker.jump_penalty",
     "tracker.epsilon": "tracker.kld_epsilon",
     "tracker.quantile": "tracker.kld_quantile",
-    "tracker.cell": "tracker.kld_cell",
+    "tracker.cell": "tracker.kld_bin_size",
     "tracker.look_around": "tracker.whole_image_every",
     "tracker.side": "tracker.window_side",
     "tracker.reach": "tracker.window_scale",
@@ -119,6 +124,7 @@ _CHOICES = {
     "model/box_head": {"spread": "quantiles"},
     "filter/resample": {
         "never": "none",
+        "below_ess": "adaptive",
         "transport": "optimal_transport_sampled",
         "ensemble": "optimal_transport",
         "guided": "auxiliary",
@@ -160,7 +166,7 @@ _CHOICES = {
     "console": {"plain": "json"},
     "callbacks": {"none": "checkpoints"},
     "debug": {"trace": "traceback"},
-    "sweep": {"ladder": "ablation", "ladder_detect": "ablation_detect"},
+    "sweep": {"ladder": "ablation", "ladder_detect": "ablation_detect", "iterations": "steps"},
     "ablation": {
         "s4_lesson": "s4_displacement_loss",
         "s5_place": "s5_position",
@@ -193,6 +199,7 @@ CLASSES = {
     "losses.belief_maps.BeliefMaps": "losses.heatmaps.Heatmaps",
     "nets.belief_maps.BeliefMapNet": "nets.heatmaps.HeatmapNet",
     "filters.propagate.Chain": "filters.propagate.Compose",
+    "filters.resample.BelowESS": "filters.resample.AdaptiveResampling",
     "filters.refine.Chain": "filters.refine.Compose",
     "filters.reweight.Annealed": "filters.reweight.CurrentLikelihood",
     "filters.reweight.Sequential": "filters.reweight.SequentialBayes",
@@ -208,7 +215,10 @@ _LOSSES = {"relevance": "objectness"}
 _OBJECTNESS = {"relevance": "objectness_weight", "relevance_weight": "objectness_weight"}
 # arguments of classes, by today's place of the class below posefilter
 ARGUMENTS = {
-    "filters.loop.ParticleFilter": {"looks": "max_searches"},
+    "filters.loop.ParticleFilter": {
+        "looks": "max_searches",
+        "first_particles": "initial_particles",
+    },
     "filters.propagate.Compose": {"pieces": "components"},
     "filters.propagate.Gaussian": {"factor": "noise_scale"},
     "filters.propagate.HalfTurnRotations": {"share": "probability"},
@@ -241,6 +251,7 @@ ARGUMENTS = {
     "models.candidate_samplers.CandidatePoses": {
         "each": "candidates_per_kind",
         "turns": "rotations",
+        "levels": "sigma_levels",
         "proposed": "proposals",
         "own_level": "persistent_sigma_probability",
         "sigma": "sigma_range",

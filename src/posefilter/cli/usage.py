@@ -27,16 +27,16 @@ _SECTIONS = {
     "train": {
         "data.root": "folder of the dataset; with data=scenes, where scenes are rendered",
         "data.object": "name of the object in the dataset",
-        "filter.particles": "number of particles; filter.steps: of iterations",
+        "filter.particles": "number of particles; filter.steps: number of filter steps",
         "trainer.max_steps": "number of training steps",
         "optimizer.lr": "learning rate",
     },
     "evaluate": {
         "data.root": "folder of the dataset",
         "data.meshes": "builtin, or a folder of meshes",
-        "filter.particles": "number of particles; filter.steps: of iterations",
+        "filter.particles": "number of particles; filter.steps: number of filter steps",
     },
-    "predict": {"filter.particles": "number of particles; filter.steps: of iterations"},
+    "predict": {"filter.particles": "number of particles; filter.steps: number of filter steps"},
     "track": {
         "data.root": "folder of the dataset, where data= is given",
         "tracker.motion.translation_mm": "how far an object may move between two frames",

@@ -36,7 +36,7 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         "center": object_model.center.tolist(),
         "radius": float(object_model.radius),
         "diameter": float(object_model.diameter),
-        "first_particles": own.first_particles,
+        "first_particles": own.initial_particles,
         "particles": own.particles,
         "levels": [float(level) for level in own.schedule(own.steps)],
         "points": method.pixels if isinstance(method, PosePF) else None,

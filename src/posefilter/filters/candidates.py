@@ -122,7 +122,7 @@ class PersistentParticles(nn.Module):
         super().__init__()
         if particles < 1 or levels < 2:
             raise UserError(
-                f"model.candidate_sampler: levels={levels} must be 2 or more, "
+                f"model.candidate_sampler: sigma_levels={levels} must be 2 or more, "
                 f"particles={particles} 1 "
                 f"or more, or 0 for none"
             )

@@ -62,7 +62,7 @@ class ParticleFilter(nn.Module):
         propagate: Moves the resampled states.
         estimate: Chooses one pose of the last particles.
         refine: Improves the estimate, or replaces the particles.
-        first_particles: Number of particles at the first step; `particles` if None.
+        initial_particles: Number of particles at the first step; `particles` if None.
         max_searches: How often an image is searched at most, while a calibrated answer is doubtful
             (confidence/second_look.py); 1 to 3.
 
@@ -81,20 +81,20 @@ class ParticleFilter(nn.Module):
         propagate: Propagate,
         estimate: Estimate,
         refine: Refine,
-        first_particles: int | None = None,
+        initial_particles: int | None = None,
         max_searches: int = 3,
     ) -> None:
         super().__init__()
-        first = particles if first_particles is None else first_particles
+        first = particles if initial_particles is None else initial_particles
         if min(particles, steps, first) < 1:
             raise UserError(
-                f"filter: particles={particles}, first_particles={first_particles} and "
+                f"filter: particles={particles}, initial_particles={initial_particles} and "
                 f"steps={steps} must be 1 or more"
             )
         if not 1 <= max_searches <= 3:
             raise UserError(f"filter.max_searches={max_searches}: must be 1, 2 or 3")
         self.particles, self.steps, self.max_searches = particles, steps, max_searches
-        self.first_particles = first
+        self.initial_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
         self.estimate, self.refine = estimate, refine
@@ -122,7 +122,7 @@ class ParticleFilter(nn.Module):
             FloatingPointError: All weights of an image are zero, or not numbers.
         """
         encoding = method.encode(batch)
-        state = self.initialize(batch, encoding, method, self.first_particles, generator)
+        state = self.initialize(batch, encoding, method, self.initial_particles, generator)
         particles = make_particles(state, method.latent_width)
         inherited = torch.zeros_like(particles.log_weights)
         steps = self.make_steps(state)

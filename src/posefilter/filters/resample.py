@@ -139,14 +139,14 @@ class NoResampling:
         if count != M:
             raise UserError(
                 f"filter/resample=none cannot turn {M} particles into {count}: leave "
-                f"filter.first_particles out"
+                f"filter.initial_particles out"
             )
         return Resampled(
             torch.arange(M, device=particles.state.device).expand(B, M), particles.log_weights
         )
 
 
-class BelowESS:
+class AdaptiveResampling:
     """Adaptive resampling: only where the effective sample size is low (Liu and Chen 1995).
 
     Each image of a batch is treated independently. If the number of particles changes, all images

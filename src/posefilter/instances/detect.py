@@ -28,14 +28,14 @@ class SearchSettings:
 
     Attributes:
         particles: Of the filter that follows one instance, at most.
-        first_particles: Of its first step, at most.
+        initial_particles: Of its first step, at most.
         spare: Searches beyond the instances asked for, while an answer is doubtful.
         share: Of its visible pixels, that an answer must have for itself.
         worth: Mean probability of the network's surest cells, below which there is no more to find.
     """
 
     particles: int = 80
-    first_particles: int = 320
+    initial_particles: int = 320
     spare: int = 1
     share: float = 0.5
     worth: float = 0.3
@@ -139,7 +139,7 @@ def _begin(
 ) -> _Job:
     small = copy.copy(method.filter)
     small.particles = min(small.particles, settings.particles)
-    small.first_particles = min(small.first_particles, settings.first_particles)
+    small.initial_particles = min(small.initial_particles, settings.initial_particles)
     return _Job(number, method, batch, count, small, method.generator("predict", 0))
 
 

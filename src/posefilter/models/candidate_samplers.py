@@ -82,7 +82,7 @@ class CandidatePoses:
         sigma_range: Lowest and highest noise level [m].
         initial_sigma: Noise level at which persistent particles start from proposals, as they do
             at test time [m]. Without proposals they start from depth, at the highest level.
-        levels: Steps of the persistent particles from there to the lowest level.
+        sigma_levels: Steps of the persistent particles from there to the lowest level.
         persistent_sigma_probability: Probability that an image is scored at the noise level of its
             persistent particles, rather than at one drawn from `sigma_range`.
         rotations: Kernel that turns the truth, for hard negatives. By default half turns about the
@@ -98,7 +98,7 @@ class CandidatePoses:
         particles: int = 16,
         sigma_range: tuple[float, float] = (0.004, 0.25),
         initial_sigma: float = 0.05,
-        levels: int = 12,
+        sigma_levels: int = 12,
         persistent_sigma_probability: float = 0.5,
         rotations: Propagate | None = None,
     ) -> None:
@@ -108,7 +108,7 @@ class CandidatePoses:
         self.initial_sigma = float(initial_sigma)
         self.rotations = rotations or HalfTurnRotations(1.0)
         self.persistent = (
-            PersistentParticles(particles, levels, self.sigma_range[0]) if particles else None
+            PersistentParticles(particles, sigma_levels, self.sigma_range[0]) if particles else None
         )
 
     def __call__(

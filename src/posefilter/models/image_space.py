@@ -323,10 +323,10 @@ def check_particle_counts(rolled: ParticleFilter, name: str) -> None:
     Raises:
         UserError: They differ; losses stack the steps into one tensor.
     """
-    if rolled.steps > 1 and rolled.first_particles != rolled.particles:
+    if rolled.steps > 1 and rolled.initial_particles != rolled.particles:
         raise UserError(
-            f"{name}.first_particles={rolled.first_particles}: training needs as many as "
-            f"{name}.particles={rolled.particles}; choose {name}.first_particles=null or "
+            f"{name}.initial_particles={rolled.initial_particles}: training needs as many as "
+            f"{name}.particles={rolled.particles}; choose {name}.initial_particles=null or "
             f"model/train_rollout=short (evaluate.py takes any)"
         )
 

@@ -64,7 +64,7 @@ class TrackerSettings:
         follow: The filter while the object is tracked.
         probe: The filter that probes the whole image for an object that is lost.
         search: The filter of a search, which starts from the best of a probe.
-        move_scale: Standard deviation of the move between two steps, over the noise level.
+        noise_scale: Standard deviation of the move between two steps, over the noise level.
         quadratic_fits: Fits of a quadratic to the likelihood about the mode's mean that end a
             frame; 0: the mean as it is.
         fit_pixels: Image points that a pose is scored from in these fits.
@@ -77,7 +77,7 @@ class TrackerSettings:
             tracked [nat]; so that it does not flip between faces that look alike.
         kld_epsilon: Kullback-Leibler divergence that KLD sampling allows [nat].
         kld_quantile: Probability that it stays below.
-        kld_cell: Side of the cells that it counts [m].
+        kld_bin_size: Side of the cells that it counts [m].
         whole_image_every: Every so many frames the network sees the whole image, so that proposals
             come from everywhere; 0: never.
         window_side: Largest side of the window about the object that it sees otherwise [px].
@@ -101,7 +101,7 @@ class TrackerSettings:
     follow: FilterSettings = FilterSettings(32, 300, 8, 1, 0.008, 0.008, 64)
     probe: FilterSettings = FilterSettings(32, 32, 64, 1, 0.02, 0.02, 32)
     search: FilterSettings = FilterSettings(64, 64, 64, 6, 0.04, 0.004, 32)
-    move_scale: float = 0.4
+    noise_scale: float = 0.4
     quadratic_fits: int = 1
     fit_pixels: int = 128
     icp_prior: float = 0.004
@@ -109,7 +109,7 @@ class TrackerSettings:
     jump_penalty: float = 5.0
     kld_epsilon: float = 0.15
     kld_quantile: float = 0.95
-    kld_cell: float = 0.03
+    kld_bin_size: float = 0.03
     whole_image_every: int = 4
     window_side: int = 320
     window_scale: float = 1.25
@@ -125,10 +125,10 @@ class TrackerSettings:
         """Check the numbers."""
         check_whole(self, quadratic_fits=0, fit_pixels=1, patience=1, probe_every=1)
         check_whole(self, whole_image_every=0, window_side=64, search_every=0, texture_every=0)
-        least = min(self.move_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
+        least = min(self.noise_scale, self.smoothing_noise, self.jump_penalty, self.icp_prior)
         if not (least >= 0 and self.window_scale >= 1):
             raise UserError(
-                "tracker: move_scale, smoothing_noise, jump_penalty and icp_prior must be 0 or "
+                "tracker: noise_scale, smoothing_noise, jump_penalty and icp_prior must be 0 or "
                 "more, window_scale 1 or more"
             )
         if not 0 <= self.search_above <= 1:
@@ -138,7 +138,8 @@ class TrackerSettings:
                 f"tracker: lost_below={self.lost_below} and found_above={self.found_above} must "
                 f"lie in [0, 1], the second no lower"
             )
-        if not (self.kld_epsilon > 0 and self.kld_cell > 0 and 0 < self.kld_quantile < 1):
+        if not (self.kld_epsilon > 0 and self.kld_bin_size > 0 and 0 < self.kld_quantile < 1):
             raise UserError(
-                "tracker: kld_epsilon and kld_cell must be above 0, kld_quantile between 0 and 1"
+                "tracker: kld_epsilon and kld_bin_size must be above 0, kld_quantile between "
+                "0 and 1"
             )

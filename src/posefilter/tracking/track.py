@@ -196,7 +196,7 @@ class Track:
         scale = motion.noise_scale(state.squared_innovation)
         drawn = Multinomial()(state.belief, wanted.max_particles, self.space, self.generator)
         draws = motion(inherit(state.belief.state, drawn), drift, scale, self.space, self.generator)
-        cells = bin_poses(draws[0], expected[0], self.space, settings.kld_cell)
+        cells = bin_poses(draws[0], expected[0], self.space, settings.kld_bin_size)
         least, epsilon, quantile = wanted.min_particles, settings.kld_epsilon, settings.kld_quantile
         count = count_needed(cells, epsilon, quantile, least)
         return state._replace(belief=make_particles(draws[:, :count], 0), best=expected)
@@ -273,7 +273,7 @@ class Track:
             schedule=Geometric(filter_settings.initial_sigma, filter_settings.final_sigma),
             reweight=CurrentLikelihood(),
             resample=Systematic(),
-            propagate=Gaussian(self.settings.move_scale),
+            propagate=Gaussian(self.settings.noise_scale),
             estimate=ModeMean(_MODE),
             refine=refine,
         )
