@@ -34,7 +34,7 @@ def calibrate_command(file: Path, root: Path, frames: int) -> list[str]:
     """Return what to run to calibrate one file, in place."""
     words = ["data=fat", f"data.root={root / 'data'}", f"data.meshes={root / 'meshes'}"]
     words += ["data.split={val: 1.0}", "data.min_visibility_test=0.1", f"frames={frames}"]
-    return ["calibrate.py", f"checkpoint={file}", *words, "replace=true", "threads=1"]
+    return ["calibrate.py", f"checkpoint={file}", *words, "overwrite=true", "threads=1"]
 
 
 def list_commands(files: Sequence[Path], root: Path, frames: int, each: int) -> list[list[str]]:

@@ -210,14 +210,14 @@ def make_lines(folder: Path) -> dict[str, list[str]]:
             "progress=false",
         ],
         "check_data": [
-            "console=json", f"data.root={data}", "data.object=carton", "limit=2",
+            "console=json", f"data.root={data}", "data.object=carton", "max_frames=2",
             f"out={folder}/NEW",
         ],
         "report": ["console=json", f"run={run_folder}", f"out={folder}/NEW"],
         "export": ["console=json", f"checkpoint={best}", f"out={folder}/NEW.ckpt"],
         "track": [
             *quiet, f"checkpoint={best}", f"frames={folder}/video", f"out={folder}/NEW",
-            "intrinsics=180,180,80,60", "depth_scale=10000", "video=gif",
+            "intrinsics=180,180,80,60", "depth_scale=10000", "save_video=gif",
         ],
         "calibrate": [
             *quiet, f"checkpoint={best}", f"data.root={data}", f"absent={folder / 'absent'}",

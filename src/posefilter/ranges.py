@@ -75,7 +75,7 @@ RANGES: dict[str, Range] = {
     "seed": SEED,
     "threads": _whole(1, 256),
     "mesh_scale": Range(0, 1e6, above=True),
-    "clutter_scale": Range(0, 1e6, above=True),
+    "distractor_scale": Range(0, 1e6, above=True),
     # data
     "split_seed": LONG_SEED,
     "min_visibility": SHARE,
@@ -121,7 +121,7 @@ RANGES: dict[str, Range] = {
     "generate.moving_deg": Range(0, 180),
     "generate.fully_occluded_frames": COUNT_OR_NONE,
     # other commands
-    "check_data.limit": COUNT,
+    "check_data.max_frames": COUNT,
     "predict.instances": _whole(1, 100),
     "depth_scale": UNITS,
     "cost_false_alarm": POSITIVE,
@@ -131,7 +131,7 @@ RANGES: dict[str, Range] = {
     "pose_tolerance.rotation_deg": POSITIVE,
     "pose_tolerance.add": POSITIVE,
     "pose_tolerance.add_s": POSITIVE,
-    "convert_bag.tolerance": Range(0, 10),
+    "convert_bag.max_time_difference": Range(0, 10),
     "evaluate.absent_frames": COUNT_OR_NONE,
     "calibrate.frames": _whole(10, 1_000_000),
     "track.stride": COUNT,

@@ -33,5 +33,5 @@ def test_each_file_is_calibrated_in_place_after_the_scenes_are_rendered(
     assert [words[0] for words in commands] == ["generate.py"] * 14 + ["calibrate.py"] * 2
     for file, words in zip(files, commands[-2:], strict=True):
         assert f"checkpoint={file.resolve()}" in words
-        assert {"frames=400", "replace=true", "data.split={val: 1.0}"} <= {*words}
+        assert {"frames=400", "overwrite=true", "data.split={val: 1.0}"} <= {*words}
         assert not any(word.startswith("out=") for word in words)

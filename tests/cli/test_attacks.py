@@ -51,8 +51,8 @@ LINES = {
     ),
     "a word for true": (
         "calibrate",
-        ["checkpoint=003_cracker_box", "replace=no"],
-        "replace=no: choose true or false",
+        ["checkpoint=003_cracker_box", "overwrite=no"],
+        "overwrite=no: choose true or false",
     ),
     "a list as an optimizer": (
         "train",
@@ -97,12 +97,12 @@ LINES = {
     ),
     "a number for settings": (
         "onboard",
-        ["mesh=carton", "settings=5"],
-        "settings=5: must be a list",
+        ["mesh=carton", "train_overrides=5"],
+        "train_overrides=5: must be a list",
     ),
     "a mapping among settings": (
         "onboard",
-        ["mesh=carton", "settings=[{a: 1}]"],
+        ["mesh=carton", "train_overrides=[{a: 1}]"],
         "must be a list, such as",
     ),
     "an equals sign": (

@@ -127,6 +127,6 @@ def test_a_checkpoint_of_a_training_that_runs_is_not_calibrated_in_place(
     shutil.copy(HOME / "weights" / "003_cracker_box.ckpt", file)
     before = file.read_bytes()
     holder(tmp_path / "run")
-    assert run_command("calibrate", HOME, [f"checkpoint={file}", "replace=true"]) == 2
+    assert run_command("calibrate", HOME, [f"checkpoint={file}", "overwrite=true"]) == 2
     assert f"{tmp_path / 'run'}: is in use by another run" in capfd.readouterr().err
     assert file.read_bytes() == before

@@ -25,8 +25,8 @@ from posefilter.meshes.write import write_obj
 
 def settings(mesh: Path | str, **more: object) -> DictConfig:
     given = {
-        "mesh": str(mesh), "name": None, "mesh_scale": None, "clutter": "builtin",
-        "clutter_scale": None, "seed": 0,
+        "mesh": str(mesh), "name": None, "mesh_scale": None, "distractor_meshes": "builtin",
+        "distractor_scale": None, "seed": 0,
     }  # fmt: skip
     return OmegaConf.create({**given, **more})
 
@@ -66,7 +66,7 @@ def test_given_symmetries_beat_those_that_are_found(
     half = [-1, 0, 0, 10.0, 0, -1, 0, 20.0, 0, 0, 1, 0, 0, 0, 0, 1]  # about z, in millimeters
     file.write_text(json.dumps({"symmetries_discrete": [half]}))
     mesh = catalog.build("brick")
-    cfg = settings("brick", clutter=tmp_path / "few")
+    cfg = settings("brick", distractor_meshes=tmp_path / "few")
     write_obj(catalog.build("bowl"), tmp_path / "few" / "bowl")
     write_meshes(mesh, cfg, tmp_path / "meshes")
     store = tmp_path / "meshes"
@@ -82,7 +82,7 @@ def test_given_symmetries_beat_those_that_are_found(
     file.write_text(json.dumps({"another": {"symmetries_discrete": [half]}}))
     with pytest.raises(UserError, match=r"given\.json: declares none of brick"):
         find_and_draw(mesh, str(file), 0.001, tmp_path)
-    with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose found"):
+    with pytest.raises(UserError, match=r"symmetries=nowhere: no such file; or choose auto"):
         find_and_draw(mesh, "nowhere", None, tmp_path)
 
 
@@ -110,7 +110,7 @@ def test_builtin_clutter_like_the_object_is_left_out(tmp_path: Path) -> None:
     assert left_out(replace(own, vertices=1.4 * own.vertices)) == []
     # what is given stays: it stands beside the object
     write_obj(brick, tmp_path / "given" / "brick")
-    assert left_out(own, clutter=tmp_path / "given") == []
+    assert left_out(own, distractor_meshes=tmp_path / "given") == []
 
 
 def test_a_unit_that_makes_an_object_too_small_is_named(tmp_path: Path) -> None:
@@ -124,11 +124,11 @@ def test_a_unit_that_makes_an_object_too_small_is_named(tmp_path: Path) -> None:
 def test_clutter_may_be_in_another_unit(tmp_path: Path) -> None:
     brick = catalog.build("brick")
     write_obj(replace(brick, vertices=1000 * brick.vertices), tmp_path / "around" / "other")
-    cfg = settings("brick", clutter=tmp_path / "around")
-    told = r"probably in millimeters; give clutter_scale=0\.001$"
+    cfg = settings("brick", distractor_meshes=tmp_path / "around")
+    told = r"probably in millimeters; give distractor_scale=0\.001$"
     with pytest.raises(UserError, match=told):
         write_meshes(brick, cfg, tmp_path / "meshes")
-    cfg.clutter_scale = 0.001
+    cfg.distractor_scale = 0.001
     write_meshes(brick, cfg, tmp_path / "meshes")
     found = MeshStore(tmp_path / "meshes").load("other")
     np.testing.assert_allclose(found.bounds, brick.bounds, atol=1e-6)

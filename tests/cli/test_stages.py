@@ -50,6 +50,15 @@ def test_a_costly_stage_is_not_begun_anew(tmp_path: Path) -> None:
         stages.run("train", {"steps": 6, "seed": 0}, lambda: None, costly=True)
 
 
+def test_settings_of_a_record_have_the_names_of_today(tmp_path: Path) -> None:
+    file = tmp_path / "record.json"
+    before = {"clutter": "builtin", "clutter_scale": None, "settings": ["filter.particles=8"]}
+    stage = {"done": True, "settings": before, "seconds": 1.5}
+    file.write_text(json.dumps({"stages": {"render": stage}, "values": {}}))
+    now = {"distractor_meshes": "builtin", "train_overrides": ["filter.particles=8"]}
+    assert Stages(file).is_done("render", {**now, "distractor_scale": None})
+
+
 STAGE = {"done": True, "settings": {}, "seconds": 1.5}
 
 

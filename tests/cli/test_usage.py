@@ -39,6 +39,17 @@ def test_every_choice_of_a_training_is_listed() -> None:
     assert "[pose_pf]" in describe_command("train", CONF)  # the default is marked
 
 
+def test_what_is_listed_is_what_is_typed() -> None:
+    shown = describe_command("report", CONF)
+    assert "sweep=null" in shown
+    assert "sweep_folder" not in shown
+
+
+def test_the_variants_are_told_apart() -> None:
+    shown = " ".join(describe_command("train", CONF).split())
+    assert "variant paper [working] (paper: as published; working: with" in shown
+
+
 def test_only_what_a_command_has_is_listed() -> None:
     shown = describe_command("predict", CONF)
     assert "filter/refine" in shown

@@ -101,7 +101,7 @@ REMEDIES = [
     "model/displacement=unbounded model.displacement.unit=10",
     "model/displacement=unbounded model.displacement.unit=learned",
     "loss/aux/displacement=none",
-    "loss/aux/displacement=towards model.aux_losses.displacement.loss.label.target=center",
+    "loss/aux/displacement=towards_object model.aux_losses.displacement.loss.label.target=center",
     "loss/aux/likelihood=none",
     "loss/aux/likelihood=focal",
     "loss/schedule=three_stages",

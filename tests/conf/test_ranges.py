@@ -105,7 +105,7 @@ REFUSED = {
     },
     "track": {"depth_scale": (0.1, 0)},
     "generate": {"frames": (0, -1), "workers": (0,), "max_occlusion": (1, math.nan), "size": (8,)},
-    "check_data": {"limit": (0, -1, 10**21)},
+    "check_data": {"max_frames": (0, -1, 10**21)},
     "export": {"points": (0,), "max_mb": (0, None)},
     "onboard": {"budget_minutes": (0, None, math.nan), "steps": (0,), "workers": (0,)},
     "evaluate": {"threads": (0,)},

@@ -28,14 +28,15 @@ RENAMED = {
     "pose_code=fragments": "model/pose_head=fragments",
     "bounds=votes": "model/box_head=votes",
     "motion=held": "model/displacement=gated",
-    "lesson=candidates": "model/candidate_sampler=candidates",
+    "lesson=candidates": "model/candidate_sampler=poses",
     "proposals=none": "model/proposals=none",
     "train_filter=short": "model/train_rollout=short",
     "model/train_rollout=truncated": "model/train_rollout=short",
     "train_filter.steps=3": "model.train_filter.steps=3",
-    "motion_lesson=towards": "loss/aux/displacement=towards",
+    "motion_lesson=towards": "loss/aux/displacement=towards_object",
     "aux_displacement=center": (
-        "loss/aux/displacement=towards model.aux_losses.displacement.loss.label.target=center"
+        "loss/aux/displacement=towards_object "
+        "model.aux_losses.displacement.loss.label.target=center"
     ),
     "likelihood_lesson=focal": "loss/aux/likelihood=focal",
     "pose_lesson=own_point": "loss/aux/pose=surface_point",
@@ -47,7 +48,7 @@ RENAMED = {
     "normalisation=batch": "model.net.normalization=batch",
     "net.width=16": "model.net.width=16",
     "net=latent": "model/net=latent",
-    "glimpse=smooth": "model/glimpse=smooth",
+    "glimpse=smooth": "model/glimpse=bilinear",
     "patch=6": "model.glimpse.size=6",
     "augment=whole": "data/augment=strong_full_image",
     "data/augment=camera_whole": "data/augment=camera_full_image",
@@ -104,6 +105,12 @@ RENAMED = {
     "tracker.move_scale=0.4": "tracker.noise_scale=0.4",
     "tracker.cell=0.03": "tracker.kld_bin_size=0.03",
     "tracker.kld_cell=0.03": "tracker.kld_bin_size=0.03",
+    "model/likelihood=contrastive": "model/likelihood=pointwise",
+    "likelihood=contrastive,paper": "model/likelihood=pointwise,paper",
+    "loss/aux/likelihood=balanced": "loss/aux/likelihood=balanced_bce",
+    "loss/aux/displacement=towards": "loss/aux/displacement=towards_object",
+    "model/glimpse=smooth": "model/glimpse=bilinear",
+    "model/candidate_sampler=candidates": "model/candidate_sampler=poses",
     "data.points=500": "data.num_model_points=500",
     "data.model_points=models": "data.model_points_dir=models",
     "data.options.part=test": "data.options.split=test",
@@ -118,6 +125,37 @@ RENAMED = {
     "covered_frames=6": "fully_occluded_frames=6",
     "budget=patch_pf/working": "the preset, with its size apart: preset/size=patch_pf",
 }
+
+OF_COMMANDS = {
+    "calibrate replace=true": "overwrite=true",
+    "check_data limit=null": "max_frames=null",
+    "convert_bag keep=true": "copy_messages=true",
+    "convert_bag tolerance=0.02": "max_time_difference=0.02",
+    "generate occlusion=0.5": "max_occlusion=0.5",
+    "generate lookalike_texture=other": "lookalike_texture=different",
+    "onboard settings=['filter.particles=200']": "train_overrides=['filter.particles=200']",
+    "onboard clutter=DIR": "distractor_meshes=DIR",
+    "onboard clutter_scale=0.001": "distractor_scale=0.001",
+    "onboard symmetries=found": "symmetries=auto",
+    "predict view=true": "save_rerun=true",
+    "track view=true": "save_rerun=true",
+    "track video=gif": "save_video=gif",
+}
+
+
+@pytest.mark.parametrize("typed", OF_COMMANDS)
+def test_an_old_name_of_a_command_is_answered_by_it(
+    typed: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    command, argument = typed.split(maxsplit=1)
+    assert run_command(command, HOME, [argument]) == 2
+    assert capfd.readouterr().err == f"{command}: {argument}: is now {OF_COMMANDS[typed]}\n"
+    assert rename(OF_COMMANDS[typed], command) is None
+
+
+def test_a_name_of_another_command_is_left_alone() -> None:
+    assert rename("limit=3", "track") is None
+    assert rename("data.options={keep: true}", "train") is None
 
 
 @pytest.mark.parametrize("typed", RENAMED)

@@ -178,7 +178,7 @@ def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):
     missing = check_dataset(reader, meshes)
     assert "004_sugar_box: no mesh of this name" in missing["problems"][0]
     assert missing["objects"][0]["silhouette_iou"] is None
-    with pytest.raises(UserError, match="limit=0"):
+    with pytest.raises(UserError, match="max_frames=0"):
         check_dataset(reader, meshes, limit=0)
 
 

@@ -50,7 +50,7 @@ def test_without_the_library_one_line_says_how_to_get_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"view=true: .* pip install -e '\.\[viz\]'\)$"):
+    with pytest.raises(UserError, match=r"save_rerun=true: .* pip install -e '\.\[viz\]'\)$"):
         check_viewer()
     with pytest.raises(UserError, match="rerun-sdk is missing"):
         record(shown(), tmp_path / "view.rrd")

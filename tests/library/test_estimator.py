@@ -119,7 +119,7 @@ def test_several_checkpoints_give_one_list_and_one_overlay(
     assert picture.shape[0] > height  # the legend
     plain = cv2.resize(rgb[..., ::-1], (width, height), interpolation=cv2.INTER_CUBIC)
     assert (np.abs(picture[:height].astype(int) - plain).max(-1) > 60).mean() > 0.002
-    assert run_command("predict", arguments=[*typed, "view=true"]) == 2
+    assert run_command("predict", arguments=[*typed, "save_rerun=true"]) == 2
     assert not (tmp_path / "pose.json").exists()
 
 

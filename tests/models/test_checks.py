@@ -77,7 +77,7 @@ def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: 
         tmp_path,
         "filter/initialize=from_depth",
         "model/proposals=none",
-        "model/likelihood=contrastive",
+        "model/likelihood=pointwise",
         *small,
     ).eval()
     assert isinstance(method.filter.estimate, Argmax)
@@ -246,7 +246,7 @@ def test_the_fewest_persistent_particles_and_levels_teach(typed: str, tmp_path: 
         typed,
         "model/proposals=none",
         "filter/initialize=from_depth",
-        "model/likelihood=contrastive",
+        "model/likelihood=pointwise",
     ).train()
     for visit in range(3):
         losses = method.training_losses(batch, method.generator("train", visit))
@@ -281,7 +281,7 @@ def test_hidden_puts_two_layers_before_the_outputs() -> None:
             (
                 "loss/aux/likelihood=quality",
                 "model=cnn_patch",
-                "loss/aux/likelihood=balanced, focal or none",
+                "loss/aux/likelihood=balanced_bce, focal or none",
             ),
         ),
         (

@@ -36,7 +36,7 @@ from posefilter.models.loss_schedule import Auxiliary, Stage, factors_at
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
 from posefilter.nets.context import ConvEncoder, NoContext
-from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
+from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import (
     AbsoluteQuaternion,
     Bounded,
@@ -85,7 +85,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
 
     parts: dict[str, Any] = {
         "net": net,
-        "glimpse": SmoothGlimpse(size),
+        "glimpse": BilinearGlimpse(size),
         "encoder": ConvEncoder((16, 24, 32, 32), 32),
         "pose_head": NoPose() if detects else SurfacePointSixD(),
         "displacement": Bounded(0.3),
@@ -201,7 +201,7 @@ def test_no_gradient_of_a_patch_reaches_the_displacement_through_an_integer_cut(
 
     bce = Bce(OnObject())
     assert not reaches(paper(PixelPF, 1, loss=bce))
-    assert reaches(paper(PixelPF, 1, loss=bce, glimpse=SmoothGlimpse(1)))
+    assert reaches(paper(PixelPF, 1, loss=bce, glimpse=BilinearGlimpse(1)))
     # it is told its location, and can learn to flee to where the answer is no
     assert reaches(paper(PatchPF, 3, loss=bce))
     assert not reaches(paper(PatchPF, 3, loss=bce, truncate=1))

@@ -19,7 +19,7 @@ from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
-from posefilter.nets.glimpse import SmoothGlimpse
+from posefilter.nets.glimpse import BilinearGlimpse
 from posefilter.nets.heads import SurfacePointSixD, Unbounded
 
 
@@ -57,7 +57,7 @@ def learns(method: ImageSpace, part: str) -> bool:
         (lambda: paper(PatchPF, 3), {"latent", "likelihood", "displacement", "pose"}),
         # the canary: with smooth glimpses alone, every network of the first method learns
         (
-            lambda: paper(PixelPF, 1, glimpse=SmoothGlimpse(1)),
+            lambda: paper(PixelPF, 1, glimpse=BilinearGlimpse(1)),
             {"latent", "likelihood", "displacement", "pose"},
         ),
     ],
@@ -88,7 +88,7 @@ def test_a_detached_position_blocks_the_likelihoods_gradient_of_the_displacement
                 PatchPF,
                 3,
                 loss=Bce(OnObject(3)),
-                glimpse=SmoothGlimpse(3),
+                glimpse=BilinearGlimpse(3),
                 detach_position=stopped,
             )
         )

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse, sample
+from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut, sample
 
 
 def image_and_pixels(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -30,7 +30,7 @@ def test_integer_cut_is_a_slice_of_the_zero_padded_array(size: int) -> None:
 @pytest.mark.parametrize("size", [1, 3, 6, 9])
 def test_smooth_glimpse_equals_integer_cut_at_whole_pixels_and_only_there(size: int) -> None:
     image, pixels = image_and_pixels(1)
-    cut, smooth = IntegerCut(size), SmoothGlimpse(size)
+    cut, smooth = IntegerCut(size), BilinearGlimpse(size)
     torch.testing.assert_close(smooth(image, pixels), cut(image, pixels), atol=2e-5, rtol=0)
     between = pixels + 0.4
     assert (smooth(image, between) - cut(image, between)).abs().max() > 0.05
@@ -39,7 +39,7 @@ def test_smooth_glimpse_equals_integer_cut_at_whole_pixels_and_only_there(size: 
 def test_only_the_smooth_glimpse_has_a_gradient_of_its_position() -> None:
     ramp = torch.arange(30.0).expand(1, 1, 20, 30) * 2
     pixels = torch.tensor([[[10.3, 8.6]]], requires_grad=True)
-    SmoothGlimpse(3)(ramp, pixels).sum().backward()
+    BilinearGlimpse(3)(ramp, pixels).sum().backward()
     # 9 samples x slope 2
     torch.testing.assert_close(pixels.grad, torch.tensor([[[18.0, 0.0]]]), atol=1e-3, rtol=0)
     assert not IntegerCut(3)(ramp, pixels).requires_grad

@@ -121,7 +121,15 @@ def read_bag(path: Path) -> Iterator[tuple[str, int, bytes]]:
 
 def test_detections_are_the_librarys_results(tmp_path: Path, capfd) -> None:
     bag, out = write_scene(tmp_path / "in", (5, 3, 40)), tmp_path / "found.mcap"
-    typed = [str(bag), str(out), f"checkpoint={NAME}", *TYPED, *FEW, "console=json", "keep=true"]
+    typed = [
+        str(bag),
+        str(out),
+        f"checkpoint={NAME}",
+        *TYPED,
+        *FEW,
+        "console=json",
+        "copy_messages=true",
+    ]
     assert run_command("convert_bag", HOME, typed) == 0
     assert '"images": 2' in capfd.readouterr().out
     stored = [*read_bag(out)]
@@ -301,7 +309,7 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     cases = [
         ([str(bag)], ["color=/nothing"], "/rgb (sensor_msgs/msg/Image)"),
         ([str(bag)], ["color=/info"], "has type sensor_msgs/msg/CameraInfo"),
-        ([str(bag)], [], "no color image has depth within tolerance=0.01"),
+        ([str(bag)], [], "no color image has depth within max_time_difference=0.01"),
         ([str(broken)], [], "bag="),
         ([str(tmp_path / "no.mcap")], [], "no such file"),
         ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),

@@ -233,7 +233,9 @@ def test_an_exported_checkpoint_predicts(trained: Path, tmp_path: Path, tiny_sce
     ]
     can_view = importlib.util.find_spec("rerun") is not None  # the optional extra [viz]
     assert (
-        run_command("predict", HOME, [*typed, "meshes=builtin", f"view={str(can_view).lower()}"])
+        run_command(
+            "predict", HOME, [*typed, "meshes=builtin", f"save_rerun={str(can_view).lower()}"]
+        )
         == 0
     )
     assert (out / "view.rrd").is_file() == can_view
@@ -265,7 +267,7 @@ def test_a_view_that_cannot_be_written_is_refused_before_the_work(
         "find_spec",
         lambda name, *rest: None if name == "rerun" else found(name, *rest),
     )
-    assert run_command("predict", HOME, [f"view={view}", f"out={tmp_path}"]) == 2
+    assert run_command("predict", HOME, [f"save_rerun={view}", f"out={tmp_path}"]) == 2
     assert [told in line for line in capfd.readouterr().err.splitlines()] == [True]
 
 

@@ -93,7 +93,7 @@ def test_a_calibration_is_stored_and_not_overwritten(
     assert stored["source"] == "scenes"
     again = [f"checkpoint={calibrated}", f"data.root={tiny_scenes}", *QUIET]
     assert run_command("calibrate", HOME, again) == 2
-    assert "replace=true" in capfd.readouterr().err
+    assert "overwrite=true" in capfd.readouterr().err
     assert run_command("calibrate", HOME, [*again, "filter.particles=9"]) == 2
     assert "export.py" in capfd.readouterr().err
     few = [

@@ -22,7 +22,7 @@ TOY = [
     "threads=1",
     "workers=1",
     "console=json",
-    "settings=['data.image_width=160','data.generate.size=[160,120]','data.batch_size=2',"
+    "train_overrides=['data.image_width=160','data.generate.size=[160,120]','data.batch_size=2',"
     "'data.batch_size_test=2','data.workers=0','data.limit_train=8','filter.particles=16',"
     "'filter.initial_particles=null','filter.steps=2','data.generate.distractors=[1,1]',"
     "'data.num_model_points=200','logger=none','data.limit_val=1','data.generate.frames_per_scene=3',"
@@ -41,7 +41,7 @@ def test_it_goes_on_after_an_interruption(
 ) -> None:
     out = tmp_path / "brick"
     write_obj(catalog.build("bowl"), tmp_path / "few" / "bowl")
-    typed = [*TOY, f"clutter={tmp_path / 'few'}", f"out={out}"]
+    typed = [*TOY, f"distractor_meshes={tmp_path / 'few'}", f"out={out}"]
 
     def interrupted(run: object) -> dict:
         raise Stopped(2)

@@ -20,7 +20,7 @@ TOY = {  # what is added to each command so that all of them together take less 
         "distractors=[1,2]",
         "workers=1",
     ],
-    "check_data": ["limit=3"],
+    "check_data": ["max_frames=3"],
     "train": [
         "debug=smoke",
         "threads=1",

@@ -190,7 +190,7 @@ def test_what_was_tracked_before_a_kill_is_kept(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
-    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "video=none"]
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "save_video=none"]
     assert run_interrupted(typed, patched, call, signal.SIGKILL) == -signal.SIGKILL
     lines, poses = out / "poses.partial.jsonl", out / "poses.partial.csv"
     left = {file: file.read_bytes() for file in (lines, poses)}
@@ -288,7 +288,7 @@ def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     out = tmp_path / "out"
-    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "view=true"]
+    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "save_rerun=true"]
     assert run_command("track", HOME, typed) == 2
     assert "rerun-sdk is missing" in "".join(capsys.readouterr())
     assert not out.exists()
@@ -297,7 +297,14 @@ def test_without_the_viewers_library_a_view_is_refused_before_anything_is_done(
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs the extra [viz]")
 def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    typed = [*COMMON, f"frames={folder}", CAMERA, f"out={out}", "view=true", "video=none"]
+    typed = [
+        *COMMON,
+        f"frames={folder}",
+        CAMERA,
+        f"out={out}",
+        "save_rerun=true",
+        "save_video=none",
+    ]
     assert run_command("track", HOME, typed) == 0
     assert (out / "view.rrd").stat().st_size > 10_000
 
@@ -306,7 +313,7 @@ def test_a_view_of_the_tracks_is_written(folder: Path, tmp_path: Path) -> None:
 def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None:
     """Its frames are of one scene each: a video of one frame is a single estimate."""
     root = SCENE.parents[1]
-    typed = [*COMMON, "data=fat", f"data.root={root}", "scene=scene0003_0", "video=gif"]
+    typed = [*COMMON, "data=fat", f"data.root={root}", "scene=scene0003_0", "save_video=gif"]
     assert run_command("track", HOME, [*typed, f"out={tmp_path}"]) == 0
     (line,) = [json.loads(line) for line in (tmp_path / "poses.jsonl").read_text().splitlines()]
     metrics = json.loads((tmp_path / "metrics.json").read_text())["003_cracker_box"]
@@ -331,7 +338,7 @@ def test_a_scene_of_a_dataset_is_tracked_with_its_errors(tmp_path: Path) -> None
         ),
         (["frames=FOLDER", CAMERA, "on_error=stop"], "on_error=stop: choose raise or skip"),
         (["frames=FOLDER", CAMERA, "stride=0"], "stride=0: must be a whole number"),
-        (["frames=FOLDER", CAMERA, "video=avi"], "video=avi: choose mp4, gif, none"),
+        (["frames=FOLDER", CAMERA, "save_video=avi"], "save_video=avi: choose mp4, gif, none"),
         (["frames=FOLDER", CAMERA, "fps=1e-9"], "fps=1e-09: must be a number, at least 0.1"),
         (["frames=FOLDER", CAMERA, "tracker=null"], "tracker=null: track requires a value"),
         (["frames=FOLDER/rgb", CAMERA], "has no folder rgb/"),

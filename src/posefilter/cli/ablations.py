@@ -31,8 +31,8 @@ def _chain_from(parent: str, *rows: tuple[str, ...]) -> tuple[Ablation, ...]:
     return tuple(Ablation(row[0], row[1], p, row[2:]) for p, row in zip(parents, rows, strict=True))
 
 
-_BALANCED = "loss/aux/likelihood=balanced"
-_TOWARDS = "loss/aux/displacement=towards"
+_BALANCED = "loss/aux/likelihood=balanced_bce"
+_TOWARDS = "loss/aux/displacement=towards_object"
 _DETACHED = "model.detach_position=true"
 _LAYER = "model.net.normalization=layer"
 _SMALL_NOISE = ("filter/propagate=learned_and_gaussian", "filter/schedule=pixels")
@@ -42,7 +42,7 @@ IMAGE_SPACE_ABLATIONS = (
     Ablation("working", "All modifications.", "variant=working"),
     *_build_on(
         "paper",
-        ("s1_glimpse", "Paper, with bilinear glimpses.", "model/glimpse=smooth"),
+        ("s1_glimpse", "Paper, with bilinear glimpses.", "model/glimpse=bilinear"),
         ("s2_bounded", "Paper, with bounded displacement.", "model/displacement=bounded"),
         ("s3_balanced", "Paper, with a class-balanced loss on the likelihood.", _BALANCED),
         ("s4_displacement_loss", "Paper, with a loss on the displacement itself.", _TOWARDS),
@@ -60,7 +60,7 @@ IMAGE_SPACE_ABLATIONS = (
     *_chain_from(
         "paper",
         ("c1_normalization", "Paper, with normalization that does not mix particles.", _LAYER),
-        ("c2_glimpse", "Also bilinear glimpses.", "model/glimpse=smooth"),
+        ("c2_glimpse", "Also bilinear glimpses.", "model/glimpse=bilinear"),
         ("c3_bounded", "Also bounded displacement.", "model/displacement=bounded"),
         ("c4_balanced", "Also a class-balanced loss on the likelihood.", _BALANCED),
         ("c5_displacement_loss", "Also a loss on the displacement itself.", _TOWARDS),
@@ -138,7 +138,7 @@ IMAGE_SPACE_ABLATIONS = (
     ),
 )  # fmt: skip
 
-_CANDIDATES = ("model/candidate_sampler=candidates", "loss=contrastive")
+_CANDIDATES = ("model/candidate_sampler=poses", "loss=contrastive")
 _NO_NEGATIVES = "model.candidate_sampler.particles=0"
 _DENSE = ("model/proposals=dense", "filter/initialize=from_proposals")
 _TURNS = "filter/propagate=gaussian_and_axis_rotations"
@@ -167,7 +167,7 @@ POSE_SPACE_ABLATIONS = (
          "highest, in place of labels.", *_CANDIDATES, _NO_NEGATIVES),
         ("pose_pf_c2_network",
          "Also a likelihood that is given the viewing ray and the noise level.",
-         "model/likelihood=contrastive"),
+         "model/likelihood=pointwise"),
         ("pose_pf_c3_negatives", "Also wrong poses of the filter's own.",
          "model.candidate_sampler.particles=16"),
         ("pose_pf_c4_schedule", "Also a noise level that falls.", "filter/schedule=geometric"),

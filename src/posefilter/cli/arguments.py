@@ -164,7 +164,7 @@ def _written(value: str) -> bool:
     return re.search(r"\\[=,]", value) is not None
 
 
-def check_choices(arguments: list[str], conf: Path) -> None:
+def check_choices(arguments: list[str], conf: Path, command: str | None = None) -> None:
     """Raise UserError where a group is given a value instead of the name of one of its files, where
     a choice is typed as a setting, and for names that have changed: Hydra stumbles over them.
     """
@@ -182,7 +182,11 @@ def check_choices(arguments: list[str], conf: Path) -> None:
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
         if key == "preset" and value != "null":
             check_preset(value, [conf, *config_folders(arguments)])
-        now = None if own and (conf / group / f"{value}.yaml").is_file() else rename(argument)
+        now = (
+            None
+            if own and (conf / group / f"{value}.yaml").is_file()
+            else rename(argument, command)
+        )
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)

@@ -59,7 +59,7 @@ def calibrate(job: Job) -> None:
     if out.exists():  # a training that still runs may write a better one meanwhile, which is kept
         hold(file.parent.parent if file.parent.name == "checkpoints" else file.parent)
     checkpoint = read_checkpoint(cfg.checkpoint)
-    check_out(checkpoint, file, out, cfg.replace)
+    check_out(checkpoint, file, out, cfg.overwrite)
     method = method_of(checkpoint, lightning=False)
     name = method.object_model.name
     if "pose" not in method.capabilities:
@@ -97,7 +97,7 @@ def check_out(checkpoint: dict[str, Any], file: Path, out: Path, replace: bool) 
     if out.exists() and not same:
         raise UserError(f"out={out}: already exists")
     if same and checkpoint.get("calibration") is not None and not replace:
-        raise UserError(f"{file}: is calibrated already; replace=true calibrates it anew")
+        raise UserError(f"{file}: is calibrated already; overwrite=true calibrates it anew")
 
 
 def collect_frames(

@@ -29,7 +29,7 @@ def check_data(job: Job) -> None:
     options = instantiate(cfg.data.options, "data.options") or {}
     reader = open_reader(cfg.data.source, cfg.data.root, cfg.data.object, store, "skip", **options)
     report = check_dataset(
-        reader, store, limit=cfg.limit, out=job.folder, progress=cfg.console != JSON
+        reader, store, limit=cfg.max_frames, out=job.folder, progress=cfg.console != JSON
     )
     if cfg.console != JSON:
         print(format_report(report))

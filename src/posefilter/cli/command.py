@@ -110,13 +110,13 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
             return 0
         arguments = without_trace(arguments, name)
         arguments = without_deletion(arguments)
-        check_choices(arguments, conf)
+        check_choices(arguments, conf, name)
         if {"--cfg", "-c"} & {*arguments} and {*MULTIRUN} & {*arguments}:
             raise UserError("--cfg shows the settings of one job; leave -m out")
         arguments = bracketed(arguments)
         record = keep_record(arguments)
         arguments = with_resumed(arguments)
-        check_choices(arguments, conf)  # a resumed run's too
+        check_choices(arguments, conf, name)  # a resumed run's too
         arguments = quoted(loosen(arguments, name)) + logging_for(arguments)
         arguments = told_apart(maximized(options_first(arguments)), name, conf)
         sys.argv = [sys.argv[0], *defer_settings(arguments, conf)]
@@ -308,7 +308,7 @@ def compose_config(name: str, overrides: list[str]) -> DictConfig:
     if not (conf / f"{name}.yaml").is_file():
         raise UserError(f"command={name}: there is none; choose {', '.join(COMMANDS)}")
     try:
-        check_choices(overrides, conf)
+        check_choices(overrides, conf, name)
         return compose_job(name, conf, loosen(bracketed(overrides), name), Path()).cfg
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error, name, conf, overrides)) from error

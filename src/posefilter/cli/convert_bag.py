@@ -31,7 +31,7 @@ def convert_bag(job: Job) -> None:
     if out.exists():
         raise UserError(f"out={out}: already exists; choose another")
     topics = Topics(str(cfg.color), str(cfg.depth), str(cfg.camera_info))
-    with BagReader(Path(str(cfg.bag)), topics, float(cfg.tolerance)) as reader:
+    with BagReader(Path(str(cfg.bag)), topics, float(cfg.max_time_difference)) as reader:
         settle(cfg.threads, cfg.seed)
         methods = methods_of(cfg.checkpoint, changes(cfg))
         estimator = Estimator(methods, costs=read_costs(cfg))
@@ -45,10 +45,11 @@ def convert_bag(job: Job) -> None:
                 images += 1
             if not images:
                 raise UserError(
-                    f"bag={cfg.bag}: no color image has depth within tolerance={cfg.tolerance} s, "
+                    f"bag={cfg.bag}: no color image has depth within "
+                    f"max_time_difference={cfg.max_time_difference} s, "
                     f"after a first camera_info"
                 )
-            if cfg.keep:
+            if cfg.copy_messages:
                 writer.copy(reader.reader.connections, reader.messages())
     if reader.distorted:
         say(

@@ -54,7 +54,7 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             # within a mapping, the cause names the key: tracker={rounds: 2}
             key = str(getattr(error.__cause__, "full_key", None) or found[1])
             key = re.sub(r"\[(\d+)\]", r".\1", key)
-            new = rename(key)
+            new = rename(key, name)
             if new is not None:
                 return f"{key}: is now {new}"
             cfg = compose_without(found[1], name, conf, arguments)

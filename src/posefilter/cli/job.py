@@ -20,10 +20,11 @@ _NEEDED = {
     "train": ("model", "loss", "data", "filter", "optimizer", "trainer", "callbacks", "seed"),
     "predict": ("depth_scale", "seed", "out", "cost_false_alarm", "cost_miss", "cost_unsure"),
     "convert_bag": (
-        *("color", "depth", "camera_info", "detections", "tolerance", "track", "keep", "seed"),
+        *("color", "depth", "camera_info", "detections", "track", "seed"),
+        *("max_time_difference", "copy_messages"),
         *("cost_false_alarm", "cost_miss", "cost_unsure"),
     ),
-    "calibrate": ("frames", "seed", "replace"),
+    "calibrate": ("frames", "seed", "overwrite"),
     "track": ("stride", "fps", "seed", "out", "tracker"),
     "generate": ("seed",),
     "check_data": ("data", "out"),

@@ -114,6 +114,7 @@ class Onboarding:
         """What stages depend on beside settings: the mesh, and the symmetries that are in use."""
         file = self.out / "meshes" / self.mesh.name / "symmetries.json"
         own = str(self.cfg.symmetries)
+        own = "found" if own == "auto" else own  # as records of earlier versions have it
         if Path(own).is_file():
             own = Path(own).read_text()
         return {
@@ -155,7 +156,7 @@ class Onboarding:
             words.append("warm_start=[" + ",".join(f"'{one}'" for one in start) + "]")
         elif start is not None:
             words.append(f"warm_start='{start}'")
-        words += [*map(str, self.cfg.settings), *more]
+        words += [*map(str, self.cfg.train_overrides), *more]
         composed = compose_job("train", find_conf(), words, folder)
         return Job(composed.cfg, composed.choices, words, folder, "train", True)
 
@@ -229,7 +230,7 @@ def store_meshes(work: Onboarding) -> None:
     facts, like = write_meshes(work.mesh, work.cfg, work.out / "meshes")
     concerns = list_concerns(facts)
     if like:
-        concerns.append(f"left out of the clutter, since like the object: {', '.join(like)}")
+        concerns.append(f"left out of the distractors, since like the object: {', '.join(like)}")
     work.stages.keep(facts=facts._asdict(), concerns=concerns)
     size = " x ".join(f"{x:.0f}" for x in facts.size_mm)
     sentence = f"{work.mesh.name}: {size} mm, {facts.faces} triangles"
@@ -243,7 +244,7 @@ def use_symmetries(work: Onboarding) -> None:
     picture = work.out / "symmetries.png"
     sentence = f"{found}: {picture}; if that is wrong, give symmetries=none|geometry|FILE"
     declared = None
-    if str(work.cfg.symmetries) == "found":
+    if str(work.cfg.symmetries) == "auto":
         with suppress(UserError):  # a hint; the file is not asked for
             source = Path(str(work.cfg.mesh))
             declared = find_declared(source, work.mesh.name, work.cfg.mesh_scale)
@@ -384,14 +385,15 @@ def _plain(value: Any) -> Any:
     return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
-_TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "settings", "seed")
+_DISTRACTORS = ("distractor_meshes", "distractor_scale")
+_TRAINED = ("used", "frames", "budget_minutes", "steps", "warm_start", "train_overrides", "seed")
 STAGES = (
-    Stage("mesh", "checking the mesh", ("mesh", "name", "clutter", "clutter_scale"), store_meshes),
+    Stage("mesh", "checking the mesh", ("mesh", "name", *_DISTRACTORS), store_meshes),
     Stage("symmetries", "finding symmetries", ("mesh", "symmetries"), use_symmetries),
     Stage(
         "render",
         "rendering",
-        ("mesh", "name", "clutter", "clutter_scale", "seed", "frames"),
+        ("mesh", "name", *_DISTRACTORS, "seed", "frames"),
         render,
         True,
     ),

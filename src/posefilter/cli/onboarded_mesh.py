@@ -70,7 +70,7 @@ def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> tuple[MeshFacts, 
     """Write the object, and what stands beside it, into a folder of meshes in meters.
 
     A builtin mesh that is like the object in size, shape and color is left out: the network would
-    learn to reject the object. What a user gives as clutter stays.
+    learn to reject the object. What a user gives as distractors stays.
 
     Returns:
         What is known of the object's mesh, and the names of the builtin ones that are left out.
@@ -78,19 +78,19 @@ def write_meshes(mesh: Mesh, cfg: DictConfig, folder: Path) -> tuple[MeshFacts, 
     if folder.is_dir():
         shutil.rmtree(folder)
     write_obj(mesh, folder / mesh.name)
-    clutter = str(cfg.clutter)
-    given = cfg.mesh_scale if cfg.clutter_scale is None else cfg.clutter_scale
-    scale = 1.0 if given is None or clutter == BUILTIN else float(given)
-    store = MeshStore(clutter, scale=scale)
+    around = str(cfg.distractor_meshes)
+    given = cfg.mesh_scale if cfg.distractor_scale is None else cfg.distractor_scale
+    scale = 1.0 if given is None or around == BUILTIN else float(given)
+    store = MeshStore(around, scale=scale)
     names = [name for name in store.names() if name != mesh.name]
-    like = [name for name in names if clutter == BUILTIN and are_alike(store.load(name), mesh)]
+    like = [name for name in names if around == BUILTIN and are_alike(store.load(name), mesh)]
     names = [name for name in names if name not in like]
     order = np.random.default_rng(cfg.seed).permutation(len(names))[:_MOST_CLUTTER]
     for index in sorted(order.tolist()):
         try:
             write_obj(store.load(names[index]), folder / names[index])
         except WrongUnit as error:
-            raise UserError(f"{error.finding}; give clutter_scale={error.scale:g}") from error
+            raise UserError(f"{error.finding}; give distractor_scale={error.scale:g}") from error
     return inspect_mesh(mesh), like
 
 
@@ -110,7 +110,7 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
 
     Args:
         mesh: The object.
-        wanted: `found`, `geometry`, `none`, or a file in the BOP challenge's format.
+        wanted: `auto`, `geometry`, `none`, or a file in the BOP challenge's format.
         scale: Meters a unit of that file; None: 1.
         out: The folder that holds `meshes`; gets `symmetries.png`.
 
@@ -121,8 +121,8 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         UserError: The file is not there or not in the format.
     """
     size, turns = diameter(mesh.vertices), find_symmetries(mesh)
-    if wanted in ("found", "geometry"):
-        used = select(turns, texture=wanted == "found")
+    if wanted in ("auto", "geometry"):
+        used = select(turns, texture=wanted == "auto")
         entry = describe_symmetries(used, size)
         group = make_group(used, size, _STEPS)
         found = ", ".join(map(describe_turn, used)) or "no symmetries"
@@ -130,7 +130,7 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
         entry, group, found = {"symmetries_discrete": []}, np.eye(4)[None], "no symmetries"
     else:
         if not Path(wanted).is_file():
-            raise UserError(f"symmetries={wanted}: no such file; or choose found, geometry or none")
+            raise UserError(f"symmetries={wanted}: no such file; or choose auto, geometry or none")
         group = read_symmetries(Path(wanted), mesh.name, scale or 1.0, _STEPS)
         if len(group) == 1:
             raise UserError(
@@ -142,7 +142,7 @@ def find_and_draw(mesh: Mesh, wanted: str, scale: float | None, out: Path) -> st
     file = out / "meshes" / mesh.name / "symmetries.json"
     write_whole(file, json.dumps(entry, indent=1) + "\n")
     source = {
-        "found": "found on shape and texture",
+        "auto": "found on shape and texture",
         "geometry": "found on the shape alone",
         "none": "left out by symmetries=none",
     }.get(wanted, f"of {Path(wanted).name}")

@@ -88,7 +88,7 @@ def predict_one(job: Job) -> list[Result]:
     result.belief.save(belief_file)
     answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
-    if cfg.view:
+    if cfg.save_rerun:
         record_view(run, shape, folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
@@ -99,8 +99,8 @@ def predict_one(job: Job) -> list[Result]:
         "numbers": "belief.npz",
     }
     files |= {"band": "band.png"} if band.is_file() else {}
-    files |= {"view": VIEW} if cfg.view else {}
-    following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.view else []
+    files |= {"view": VIEW} if cfg.save_rerun else {}
+    following = [f"rerun {shlex.quote(str(folder / VIEW))}"] if cfg.save_rerun else []
     ended(
         cfg.console,
         "predicted",

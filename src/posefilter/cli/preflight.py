@@ -22,7 +22,7 @@ _FOLDERS = {
     "track": ("frames", "meshes", "data.root", "data.meshes"),
     "train": ("data.root", "data.meshes"),
 }
-_SWITCHES = {"calibrate": ("replace",), "convert_bag": ("track", "keep")}
+_SWITCHES = {"calibrate": ("overwrite",), "convert_bag": ("track", "copy_messages")}
 # by the class of a logger: the package that it needs, which is an extra of ours by the same name
 _LOGGERS = {
     "lightning.pytorch.loggers.MLFlowLogger": "mlflow",
@@ -44,7 +44,7 @@ def check_files(command: str, cfg: DictConfig) -> None:
         UserError: A file or folder is missing; the message names the setting.
     """
     if command == "predict":
-        _check_view(cfg.view, is_several(cfg.checkpoint) or cfg.instances is not None)
+        _check_rerun(cfg.save_rerun, is_several(cfg.checkpoint) or cfg.instances is not None)
     if command == "track":
         _check_video(cfg)
     if command == "train":
@@ -66,9 +66,11 @@ def check_files(command: str, cfg: DictConfig) -> None:
             raise UserError(str(error).replace("checkpoint=", "warm_start=")) from error
     if command == "onboard":
         _check_mesh(cfg.mesh)
-        more = cfg.settings
+        more = cfg.train_overrides
         if not (isinstance(more, ListConfig) and all(isinstance(one, str) for one in more)):
-            raise UserError(f"settings={more}: must be a list, such as ['filter.particles=200']")
+            raise UserError(
+                f"train_overrides={more}: must be a list, such as ['filter.particles=200']"
+            )
     for key in _NEEDED.get(command, ()):
         if cfg[key] is None:
             raise UserError(
@@ -104,8 +106,8 @@ def _check_bag(cfg: DictConfig) -> None:
 
 def _check_video(cfg: DictConfig) -> None:
     """Raise UserError where there is no video to be tracked, or none that can be written."""
-    if cfg.video not in _VIDEOS:
-        raise UserError(f"video={cfg.video}: choose {', '.join(_VIDEOS)}")
+    if cfg.save_video not in _VIDEOS:
+        raise UserError(f"save_video={cfg.save_video}: choose {', '.join(_VIDEOS)}")
     if cfg.on_error not in ("raise", "skip"):
         raise UserError(f"on_error={cfg.on_error}: choose raise or skip")
     _find_all(cfg.checkpoint)
@@ -141,13 +143,13 @@ def _check_loggers(loggers: Any) -> None:
             raise missing_package(f"logger={name}", package, package)
 
 
-def _check_view(view: Any, several: bool) -> None:
+def _check_rerun(wanted: Any, several: bool) -> None:
     """Raise UserError where the 3-D view cannot be written."""
-    if not isinstance(view, bool):
-        raise UserError(f"view={view}: choose true or false")
-    if view and several:
-        raise UserError("view=true: shows one object; give one checkpoint")
-    if view:
+    if not isinstance(wanted, bool):
+        raise UserError(f"save_rerun={wanted}: choose true or false")
+    if wanted and several:
+        raise UserError("save_rerun=true: shows one object; give one checkpoint")
+    if wanted:
         from posefilter.figures.recording import check_viewer  # slow to import, rarely asked for
 
         check_viewer()

@@ -69,11 +69,7 @@ KEYS = {
     "data.model_points": "data.model_points_dir",
     "data.options.part": "data.options.split",
     "data.options.parts": "data.options.subsets",
-    **{
-        f"{place}{old}": f"{place}{new}"
-        for place in ("", "data.generate.")
-        for old, new in _GENERATE.items()
-    },
+    **{f"data.generate.{old}": f"data.generate.{new}" for old, new in _GENERATE.items()},
     "filter.looks": "filter.max_searches",
     "filter.first_particles": "filter.initial_particles",
     "model.train_filter.first_particles": "model.train_filter.initial_particles",
@@ -113,12 +109,27 @@ KEYS = {
         )
     },
 }
+# settings of single commands
+COMMANDS = {
+    "calibrate": {"replace": "overwrite"},
+    "check_data": {"limit": "max_frames"},
+    "convert_bag": {"keep": "copy_messages", "tolerance": "max_time_difference"},
+    "generate": _GENERATE,
+    "onboard": {
+        "settings": "train_overrides",
+        "clutter": "distractor_meshes",
+        "clutter_scale": "distractor_scale",
+    },
+    "predict": {"view": "save_rerun"},
+    "track": {"video": "save_video", "view": "save_rerun"},
+}
 _NODES = {"model/train_rollout": "model.train_filter", "loss/schedule": "model.loss_schedule"}
 _LOOKALIKE_TEXTURE = {"other": "different", "own": "same"}
 _CHOICES = {
     "filter": {"pose_paper": "pose filter.particles=1000 filter.steps=100"},
     "filter/estimate": {"best": "argmax"},
     "filter/initialize": {"from_relevance": "from_objectness"},
+    "symmetries": {"found": "auto"},
     "scheduler": {"warm_cosine": "warmup_cosine"},
     "loss": {"contrast": "contrastive", "belief_maps": "heatmaps"},
     "model/box_head": {"spread": "quantiles"},
@@ -142,8 +153,13 @@ _CHOICES = {
         "resnet34": "resnet model.encoder.trunk.kind=resnet34",
     },
     "model/train_rollout": {"same": "full", "truncated": "short"},
+    "model/glimpse": {"smooth": "bilinear"},
+    "model/likelihood": {"contrastive": "pointwise"},
+    "model/candidate_sampler": {"candidates": "poses"},
+    "loss/aux/likelihood": {"balanced": "balanced_bce"},
     "loss/aux/displacement": {
-        "center": "towards model.aux_losses.displacement.loss.label.target=center"
+        "towards": "towards_object",
+        "center": "towards_object model.aux_losses.displacement.loss.label.target=center",
     },
     "loss/aux/pose": {"own_point": "surface_point"},
     "model/pose_head": {"own_point": "surface_point"},
@@ -205,6 +221,7 @@ CLASSES = {
     "filters.reweight.Sequential": "filters.reweight.SequentialBayes",
     "filters.reweight.TemperedSMC": "filters.reweight.LikelihoodRatio",
     "losses.contrast.Contrast": "losses.contrastive.Contrastive",
+    "nets.glimpse.SmoothGlimpse": "nets.glimpse.BilinearGlimpse",
     "models.box_heads.SpreadBox": "models.box_heads.QuantileBox",
     "models.schedules.warm_cosine": "models.schedules.warmup_cosine",
     "data.augmentation.Window": "data.augmentation.RandomCrop",
@@ -294,16 +311,17 @@ _OPTIONS = {"part": "split", "parts": "subsets"}
 _BUDGET = "the preset, with its size apart: preset/size="
 
 
-def rename(override: str) -> str | None:
+def rename(override: str, command: str | None = None) -> str | None:
     """Return what is typed today for an override with names of before; None where nothing changed.
 
     Args:
         override: As typed, such as `initialise=uniform` or `resample.alpha=0.2`.
+        command: Whose setting it is, for names that single commands have; None: any.
     """
     sign, key, equals, value = _split(override)
     if key == "budget":
         return _BUDGET + value.partition("/")[0]
-    new = _rename_key(key)
+    new = _rename_setting(key, command)
     # a name of before that, too
     while (newer := _rename_key(new)) != new:
         new = newer
@@ -319,6 +337,12 @@ def _split(override: str) -> tuple[str, str, str, str]:
     found = re.fullmatch(r"([+~]*)([^=]*)(=?)(.*)", override, re.DOTALL)
     assert found is not None
     return found[1], found[2], found[3], found[4]
+
+
+def _rename_setting(key: str, command: str | None) -> str:
+    """Return what a setting is called today: of a command, or of all that have it."""
+    own = [one for name, one in COMMANDS.items() if command in (None, name) and key in one]
+    return own[0][key] if own else _rename_key(key)
 
 
 def _rename_key(key: str) -> str:

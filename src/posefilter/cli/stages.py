@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from posefilter.cli.renamed import COMMANDS
 from posefilter.cli.results import write_json
 from posefilter.errors import UserError
 from posefilter.forms import NUMBER, Each, Record, check_form, parse_json
@@ -13,6 +14,8 @@ from posefilter.limits import read_json
 
 _LONGEST = 1 << 20  # of the file [bytes]
 _STAGE = Record({"settings": {}, "seconds": NUMBER})
+
+_RENAMED = COMMANDS["onboard"]  # settings in records of earlier versions
 
 
 class Stages:
@@ -38,6 +41,9 @@ class Stages:
                     f"{file}: is no record of an onboarding any more; choose another out= ({error})"
                 ) from error
             self.content = {name: found[name] for name in self.content}
+            for stage in self.content["stages"].values():
+                settings = stage["settings"]
+                stage["settings"] = {_RENAMED.get(key, key): settings[key] for key in settings}
 
     @property
     def values(self) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def track(job: Job) -> None:
     """
     cfg, folder = job.cfg, job.folder
     check_unused(folder)
-    if cfg.view:
+    if cfg.save_rerun:
         check_viewer()
     settle(cfg.threads, cfg.seed)
     threads = torch.get_num_threads()
@@ -71,8 +71,8 @@ def track(job: Job) -> None:
     files: dict[str, Path] = {"poses": folder / POSES, "lines": folder / "poses.jsonl"}
     for video in videos:
         name = "video" if len(videos) == 1 else f"video_{video.name.replace('/', '_')}"
-        writer = VideoWriter(folder / name, cfg.video, float(cfg.fps))
-        view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.view else None
+        writer = VideoWriter(folder / name, cfg.save_video, float(cfg.fps))
+        view = folder / f"{name.replace('video', 'view', 1)}.rrd" if cfg.save_rerun else None
         recorder = TrackRecorder(view, shapes)
         try:
             follow(video, estimator, settings, cfg, writer, recorder, shapes, threads, log)
@@ -80,7 +80,7 @@ def track(job: Job) -> None:
             broken = error
         if view is not None:
             files[view.stem] = view
-        if cfg.video != "none":
+        if cfg.save_video != "none":
             files[name] = writer.path
         if broken is not None:
             break

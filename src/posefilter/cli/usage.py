@@ -20,8 +20,12 @@ from posefilter.cli.main import COMMANDS
 _SETTING = re.compile(r"^(\w+): *(.*?) *(?:# *(.*))?$")  # a key at the top of a file
 _UNLISTED = ("generate", "folder", "debug")  # what others are handed on to, or has a line below
 _HIDDEN = ("trainer",)  # groups whose choice the command itself makes
+_TYPED = {"report": {"sweep_folder": "sweep"}}  # settings by the names that are typed
 _MOST_CHOICES = 20
 _INDENT, _NARROWEST, _WIDEST = 26, 60, 120
+_MEANINGS = {
+    "variant": "(paper: as published; working: with this project's modifications, which work)"
+}
 # the settings that are typed most, of sections that the chosen files fill
 _SECTIONS = {
     "train": {
@@ -89,9 +93,12 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
         lines += ["", f"choices, typed group=choice; {_explain_defaults(name)}"]
         for group in groups:
             shown = " ".join(f"[{c}]" if c == group.default else c for c in group.choices)
-            lines += _entry(group.name, shown, width)
+            lines += _entry(group.name, f"{shown} {_MEANINGS.get(group.name, '')}".rstrip(), width)
     lines += ["", "settings, typed key=value"]
-    settings = {f"{key}={value}": comment for key, value, comment in list_settings(text)}
+    typed = _TYPED.get(name, {})
+    settings = {
+        f"{typed.get(key, key)}={value}": comment for key, value, comment in list_settings(text)
+    }
     for key, comment in {**settings, **_SECTIONS.get(name, {})}.items():
         lines += _entry(key, _shorten(comment, width - _INDENT), width)
     lines += ["", *_entry("--cfg job", "print every setting, and run nothing", width)]

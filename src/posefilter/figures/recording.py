@@ -25,7 +25,7 @@ _OTHER = (120, 150, 255)
 def check_viewer() -> None:
     """Raise UserError where the library that writes the view is missing."""
     if importlib.util.find_spec("rerun") is None:
-        raise missing_package("view=true", "rerun-sdk", "viz")
+        raise missing_package("save_rerun=true", "rerun-sdk", "viz")
 
 
 def record(shown: ViewData, path: Path) -> None:

@@ -64,7 +64,9 @@ class VideoWriter:
             code = cv2.VideoWriter.fourcc(*"mp4v")
             self._writer = cv2.VideoWriter(str(self._part), code, self.fps, self._size)
             if not self._writer.isOpened():
-                raise UserError("video=mp4: this OpenCV cannot encode it; choose video=gif or none")
+                raise UserError(
+                    "save_video=mp4: this OpenCV cannot encode it; choose save_video=gif or none"
+                )
         self._writer.write(np.ascontiguousarray(picture[..., ::-1]))
         self._count += 1
 

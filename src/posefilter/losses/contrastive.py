@@ -54,7 +54,7 @@ class Contrastive:
         if trace.particles[-1].state.dim() != 4:
             raise UserError(
                 "loss=contrastive judges candidate poses, not points: choose "
-                "model/candidate_sampler=candidates, or loss=regression"
+                "model/candidate_sampler=poses, or loss=regression"
             )
         poses, scores, sigma = (
             trace.outputs[-1].pose,

@@ -228,7 +228,7 @@ class LabeledRays:
         if not isinstance(net, ScoresSamples):
             raise UserError(
                 "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood "
-                "only; choose model/likelihood=paper or model/candidate_sampler=candidates"
+                "only; choose model/likelihood=paper or model/candidate_sampler=poses"
             )
         B, _, _, W = batch.depth.shape
         device = batch.rgb.device

@@ -20,7 +20,7 @@ from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
 from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, factors_at
 from posefilter.nets.context import ContextMap
-from posefilter.nets.glimpse import IntegerCut, SmoothGlimpse
+from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import fill_depth
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -95,7 +95,7 @@ class ImageSpace(PoseEstimator):
     def __init__(
         self,
         net: Callable[..., nn.Module],
-        glimpse: IntegerCut | SmoothGlimpse,
+        glimpse: IntegerCut | BilinearGlimpse,
         encoder: nn.Module,
         pose_head: nn.Module,
         displacement: nn.Module,

@@ -49,7 +49,7 @@ def missing_context() -> UserError:
     return UserError(
         "model/likelihood=contextual reads the proposal network; choose "
         "model/proposals=dense or "
-        "model/likelihood=contrastive"
+        "model/likelihood=pointwise"
     )
 
 

@@ -31,7 +31,7 @@ class IntegerCut(nn.Module):
         return patch.unflatten(3, (self.size, self.size))
 
 
-class SmoothGlimpse(nn.Module):
+class BilinearGlimpse(nn.Module):
     """Sample bilinearly; differentiable in the position.
 
     Args:

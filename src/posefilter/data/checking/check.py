@@ -58,7 +58,7 @@ def check_dataset(
         UserError: The limit is not positive.
     """
     if limit is not None and limit < 1:
-        raise UserError(f"limit={limit}: compare at least one frame of each object")
+        raise UserError(f"max_frames={limit}: compare at least one frame of each object")
     geometry = Geometry(meshes)
     problems = [
         f"{reader.examples.get(cause, cause)} ({count} such)"
