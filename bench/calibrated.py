@@ -187,7 +187,7 @@ def judge_across(
         frames = gather_frames(own, leave_out)
         for k in range(folds):
             learned = rng.permutation(np.flatnonzero(part != k))
-            both = [learned[frames.there[learned] == there][:most] for there in (True, False)]
+            both = [learned[frames.present[learned] == there][:most] for there in (True, False)]
             made = fit_calibration(frames.select(np.concatenate(both)), "fat")
             held = np.flatnonzero(part == k)
             values = torch.from_numpy(frames.values[held])

@@ -17,12 +17,12 @@ MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 meg
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+def read_bytes(path: Path, max_bytes: int = MOST_BYTES) -> bytes:
     """Read a file.
 
     Args:
         path: The file.
-        most: Bytes that such a file may have.
+        max_bytes: Bytes that such a file may have.
 
     Raises:
         BadData: The file is missing, larger, or may not be read.
@@ -31,45 +31,45 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
         if not path.is_file():
             raise BadData(path, "missing file")
         size = path.stat().st_size
-        if size > most:
-            raise BadData(path, "file too large", f"{size:,} bytes, at most {most:,}")
+        if size > max_bytes:
+            raise BadData(path, "file too large", f"{size:,} bytes, at most {max_bytes:,}")
         return path.read_bytes()
     except OSError as error:
         raise BadData(path, "cannot be read", error.strerror or type(error).__name__) from error
 
 
-def read_lines(path: Path, most: int = 1 << 22) -> list[str]:
+def read_lines(path: Path, max_bytes: int = 1 << 22) -> list[str]:
     """Read a text file's lines that are not empty, without the blanks round them.
 
     Args:
         path: The file.
-        most: Bytes that such a file may have.
+        max_bytes: Bytes that such a file may have.
 
     Raises:
         BadData: The file is missing, larger, may not be read, or is not UTF-8.
     """
     try:
-        lines = read_bytes(path, most).decode().splitlines()
+        lines = read_bytes(path, max_bytes).decode().splitlines()
     except UnicodeDecodeError as error:
         raise BadData(path, "not a text in UTF-8", str(error)) from error
     return [line.strip() for line in lines if line.strip()]
 
 
 def read_json(
-    path: Path, most: int = MOST_BYTES, parse: Callable[[bytes], Any] = json.loads
+    path: Path, max_bytes: int = MOST_BYTES, parse: Callable[[bytes], Any] = json.loads
 ) -> Any:
     """Read a JSON file.
 
     Args:
         path: The file.
-        most: Bytes that such a file may have.
+        max_bytes: Bytes that such a file may have.
         parse: Makes content of its bytes; raises ValueError or RecursionError where it cannot.
 
     Raises:
         BadData: The file is missing, larger, may not be read, or cannot be parsed.
     """
     try:
-        return parse(read_bytes(path, most))
+        return parse(read_bytes(path, max_bytes))
     except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
         raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
 

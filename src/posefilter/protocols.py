@@ -179,7 +179,9 @@ class Initialize(Protocol):
 class Reweight(Protocol):
     """Turn likelihoods into weights."""
 
-    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+    def __call__(
+        self, log_weights: Tensor, log_likelihood: Tensor, ancestor_log_likelihood: Tensor
+    ) -> Tensor:
         """Return log weights (B, N); their log-sum-exp is the step's log evidence.
 
         The caller normalizes them.
@@ -187,8 +189,8 @@ class Reweight(Protocol):
         Args:
             log_weights: (B, N), normalized, before the step.
             log_likelihood: (B, N) of this step.
-            inherited: (B, N) log-likelihood of each particle's ancestor at the step before; zeros
-                at the first.
+            ancestor_log_likelihood: (B, N) log-likelihood of each particle's ancestor at the step
+                before; zeros at the first.
         """
         ...
 

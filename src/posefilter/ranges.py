@@ -17,8 +17,8 @@ _OURS = ("posefilter.", "torch.", "lightning.")
 class Range(NamedTuple):
     """What a setting may be, beside null."""
 
-    least: float
-    most: float = math.inf
+    minimum: float
+    maximum: float = math.inf
     whole: bool = False
     above: bool = False  # the least value itself is too small
     share: bool = False  # also a share of all: a number with a point, in [0, 1]
@@ -40,20 +40,20 @@ class Range(NamedTuple):
             number = float(value)
         except OverflowError:
             return False
-        least = self.least < number if self.above else self.least <= number
-        return least and number <= self.most
+        enough = self.minimum < number if self.above else self.minimum <= number
+        return enough and number <= self.maximum
 
     def __str__(self) -> str:
         """Return the range in words."""
-        parts = [f"{'above' if self.above else 'at least'} {self.least:g}"]
-        parts += [f"at most {self.most:.12g}"] if self.most < math.inf else []
+        parts = [f"{'above' if self.above else 'at least'} {self.minimum:g}"]
+        parts += [f"at most {self.maximum:.12g}"] if self.maximum < math.inf else []
         shares = [f"a share in {'(' if self.above else '['}0, 1]"] if self.share else []
         options = [f"a {'whole ' if self.whole else ''}number, {', '.join(parts)}", *shares]
         return ", or ".join([*options, *map(str, self.words)]) + (self.note and f": {self.note}")
 
 
-def _whole(least: float, most: float = math.inf, **more: Any) -> Range:
-    return Range(least, most, whole=True, **more)
+def _whole(minimum: float, maximum: float = math.inf, **more: Any) -> Range:
+    return Range(minimum, maximum, whole=True, **more)
 
 
 SHARE, WEIGHT, POSITIVE = Range(0, 1), Range(0, 1e6), Range(0, 1e6, above=True)
@@ -302,7 +302,7 @@ RANGES: dict[str, Range] = {
     "model.inlier_px": Range(0, MOST_SIDE, above=True),
     "net.code": _whole(1, 65_536),
     "net.side": _whole(16, 1024),
-    "model.reach": Range(0, 10, above=True),
+    "model.crop_radius": Range(0, 10, above=True),
     "model.distance": Range(1, 1e6, above=True),
     "model.crops": _whole(2, 100_000),
     "model.train_cells": COUNT,
@@ -332,7 +332,7 @@ RANGES: dict[str, Range] = {
     "margin_px": PIXELS,
     "loss_schedule.until": SHARE,
     **{
-        f"loss_schedule.factors.{name}": WEIGHT
+        f"loss_schedule.loss_weights.{name}": WEIGHT
         for name in ("loss", "likelihood", "displacement", "pose", "objectness", "sides")
     },
 }

@@ -59,7 +59,7 @@ class Resampled(NamedTuple):
     ancestors: Tensor  # (B, N) int64, each child's ancestor; of a mixture, the largest
     log_weights: Tensor  # (B, N) the children's weights, normalized
     # (B, N, M) weights of the mixtures, rows sum to 1; None: each child has one ancestor
-    shares: Tensor | None = None
+    mixture_weights: Tensor | None = None
 
 
 class Fragments(NamedTuple):
@@ -72,7 +72,7 @@ class Fragments(NamedTuple):
     # (B, N, K, 3) the object point in each fragment, from the object's center, in radii
     position: Tensor
     centers: Tensor  # (B, K, 3) the fragments' centers, likewise
-    reach: Tensor  # () the fragments' mean radius, in radii of the object
+    mean_radius: Tensor  # () the fragments' mean radius, in radii of the object
 
 
 class ParticleOutput(NamedTuple):

@@ -65,9 +65,9 @@ class Oracle:
 
 def test_slices_of_an_oracle_have_their_top_at_the_truth_and_its_exact_shape() -> None:
     field = evaluate_pose_field(Oracle(TRUE), None, TRUE, model(), (0.04, 0.01), cells=9)
-    assert field.reaches == pytest.approx((0.24, 0.06))
+    assert field.extents == pytest.approx((0.24, 0.06))
     for k, sigma in enumerate(field.sigmas):
-        line = np.linspace(-field.reaches[k], field.reaches[k], 9)
+        line = np.linspace(-field.extents[k], field.extents[k], 9)
         exact = -0.5 * (line[None, :] ** 2 + line[:, None] ** 2) / sigma**2
         for values in field.planes[k]:
             assert np.unravel_index(values.argmax(), values.shape) == (4, 4)
@@ -134,7 +134,7 @@ def test_slices_for_a_point_are_highest_where_the_likelihood_is(
     )
     a, b = field.plane
     row, column = np.unravel_index(field.scores[0].argmax(), field.scores[0].shape)
-    line = np.linspace(-field.reach, field.reach, field.scores.shape[1])
+    line = np.linspace(-field.extent, field.extent, field.scores.shape[1])
     assert abs(line[column] - float(Knows.place[a])) < line[1] - line[0]
     assert abs(line[row] - float(Knows.place[b])) < line[1] - line[0]
     assert field.own[0] == pytest.approx(

@@ -65,7 +65,9 @@ def test_poses_by_hand() -> None:
 
 
 def test_scalars_are_named_by_step() -> None:
-    found = name_scalars({"ess": [0.1 * i for i in range(101)], "sigma_m": [1.0, 0.5]}, most=11)
+    found = name_scalars(
+        {"ess": [0.1 * i for i in range(101)], "sigma_m": [1.0, 0.5]}, max_steps=11
+    )
     assert [name for name in found if "ess" in name][:3] == [
         "filter/ess/step_00",
         "filter/ess/step_10",
@@ -74,7 +76,7 @@ def test_scalars_are_named_by_step() -> None:
     assert found["filter/ess/step_100"] == pytest.approx(10.0)
     assert found["filter/sigma_m/step_01"] == 0.5
     assert len(found) == 13
-    assert list(name_scalars({"ess": [0.0] * 5}, most=1)) == ["filter/ess/step_04"]
+    assert list(name_scalars({"ess": [0.0] * 5}, max_steps=1)) == ["filter/ess/step_04"]
 
 
 def test_figure_shows_the_numbers_where_its_axes_say() -> None:

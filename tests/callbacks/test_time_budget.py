@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from posefilter.callbacks import time_budget
 from posefilter.callbacks.time_budget import TimeBudget
 from posefilter.errors import UserError
-from posefilter.models.schedules import warmup_cosine
+from posefilter.models.lr_schedulers import warmup_cosine
 
 
 class Line(LightningModule):

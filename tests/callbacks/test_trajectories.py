@@ -42,7 +42,7 @@ def test_the_heaviest_are_followed_and_what_they_saw_is_what_is_there() -> None:
         tuple(Step(t, 2, torch.tensor(1.0)) for t in range(2)),
         belief,
     )
-    states = follow_particles(trace, most=2)
+    states = follow_particles(trace, max_particles=2)
     assert states.tolist() == [[[20.0, 8.0]]] * 2
     image = torch.rand(1, 4, 16, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
     method: Any = SimpleNamespace(

@@ -25,7 +25,14 @@ OLD = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrast.Contrast"},
         "start": "not an argument that was renamed here",
-        "loss_schedule": [{"until": 1.0, "factors": {"relevance": 0.0, "pose": 0.5}}],
+        "loss_schedule": [
+            {
+                "_target_": "posefilter.models.loss_schedule.Stage",
+                "until": 1.0,
+                "factors": {"relevance": 0.0, "pose": 0.5},
+            }
+        ],
+        "encoder": {"_target_": "posefilter.nets.context.ConvEncoder", "most_px": 192},
     },
     "data": {
         "_target_": "posefilter.data.module.PoseDataModule",
@@ -56,7 +63,14 @@ NEW = {
         "filter": "${filter}",
         "loss": {"_target_": "posefilter.losses.contrastive.Contrastive"},
         "start": "not an argument that was renamed here",
-        "loss_schedule": [{"until": 1.0, "factors": {"objectness": 0.0, "pose": 0.5}}],
+        "loss_schedule": [
+            {
+                "_target_": "posefilter.models.loss_schedule.Stage",
+                "until": 1.0,
+                "loss_weights": {"objectness": 0.0, "pose": 0.5},
+            }
+        ],
+        "encoder": {"_target_": "posefilter.nets.encoders.UNetEncoder", "max_width_px": 192},
     },
     "data": {
         "_target_": "posefilter.data.module.PoseDataModule",

@@ -56,7 +56,7 @@ def test_what_a_training_may_have_its_checkpoint_may_hold() -> None:
     """Else a run would train, and its best checkpoint be refused before the test."""
     no_part = tuple(f"{name}." for name in (*NOT_KEPT, "onboard", "check_data"))
     wide = {
-        key: known.most
+        key: known.maximum
         for key, known in RANGES.items()
         if known.whole and not key.startswith(no_part)
     }
@@ -68,7 +68,7 @@ def test_what_a_training_may_have_its_checkpoint_may_hold() -> None:
 def test_no_range_holds_what_is_no_number() -> None:
     for key, allowed in RANGES.items():
         for value in (math.nan, math.inf, -math.inf, True, "text", -1e30):
-            assert not allowed.holds(value) or value == allowed.most, (key, value)
+            assert not allowed.holds(value) or value == allowed.maximum, (key, value)
 
 
 REFUSED = {

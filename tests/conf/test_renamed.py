@@ -111,6 +111,7 @@ RENAMED = {
     "loss/aux/displacement=towards": "loss/aux/displacement=towards_object",
     "model/glimpse=smooth": "model/glimpse=bilinear",
     "model/candidate_sampler=candidates": "model/candidate_sampler=poses",
+    "model.reach=1.5": "model.crop_radius=1.5",
     "data.points=500": "data.num_model_points=500",
     "data.model_points=models": "data.model_points_dir=models",
     "data.options.part=test": "data.options.split=test",

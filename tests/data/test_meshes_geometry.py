@@ -109,7 +109,7 @@ def test_few_hull_vertices_draw_the_outline_within_about_a_millimeter(name: str)
 
 def test_a_hull_of_too_few_vertices_is_caught() -> None:
     vertices = builtin.build("bowl").vertices
-    assert _short(outline_hull(vertices, most=12), vertices).max() > 2.5e-3
+    assert _short(outline_hull(vertices, max_vertices=12), vertices).max() > 2.5e-3
 
 
 def test_hull_vertices_are_the_outer_ones() -> None:

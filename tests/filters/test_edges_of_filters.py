@@ -48,7 +48,9 @@ def test_the_density_that_decides_who_follows_whom_is_over_a_thirtieth_of_the_di
 def test_a_particle_follows_the_nearest_that_is_denser_at_the_reach_too() -> None:
     """0 is densest, 10 next; 7 lies nearer to 10, and 3 at its reach from 0."""
     state = torch.tensor([[0.0, 0.0], [10.0, 0.0], [7.0, 0.0], [-3.0, 0.0]])
-    found = find_modes(state, torch.tensor([0.5, 0.3, 0.1, 0.1]).log(), PIXELS, 1.0, reach=3.0)
+    found = find_modes(
+        state, torch.tensor([0.5, 0.3, 0.1, 0.1]).log(), PIXELS, 1.0, max_distance=3.0
+    )
     assert found.member.tolist() == [0, 1, 1, 0]
     assert found.weights.tolist() == pytest.approx([0.6, 0.4])
 

@@ -52,7 +52,7 @@ def test_each_hypothesis_is_a_mode_with_its_share() -> None:
 def test_modes_are_particles_and_share_out_all_the_weight() -> None:
     state = torch.rand(200, 2, generator=torch.Generator().manual_seed(0)) * 100
     log_weights = torch.randn(200, generator=torch.Generator().manual_seed(1))
-    modes = find_modes(state, log_weights, PixelSpace(), 4.0, reach=2.0)
+    modes = find_modes(state, log_weights, PixelSpace(), 4.0, max_distance=2.0)
     assert 1 < len(modes.weights) < 200
     assert float(modes.weights.sum()) == pytest.approx(1)
     assert (modes.weights.diff() <= 0).all()

@@ -84,4 +84,4 @@ def test_lists_and_centers() -> None:
     assert real.sum(1).tolist() == [6, 1]
     assert places[1, 0].tolist() == [0.0, 8.0]
     assert centroid(mask).tolist() == [[6.0, 2.5], [0.0, 8.0]]
-    assert mask_pixels(mask, most=3)[1].sum(1).tolist() == [3, 1]
+    assert mask_pixels(mask, max_pixels=3)[1].sum(1).tolist() == [3, 1]

@@ -195,7 +195,7 @@ def test_more_poses_than_kernels_are_thinned_fairly() -> None:
     poses, fresh = draw(700, g), draw(200, g)
     weights = torch.rand(700, generator=g).double()
     shares = (weights / weights.sum()).log()
-    density = fit_density(poses, shares, CENTER, RADIUS, DIAMETER, most=400)
+    density = fit_density(poses, shares, CENTER, RADIUS, DIAMETER, max_kernels=400)
     assert len(density.chosen) == len(density.chosen.unique()) == 400
     assert float(density.log_weights.exp().sum()) == pytest.approx(1)
     gap = float(true_log_density(fresh).mean() - log_density(density, fresh).mean())

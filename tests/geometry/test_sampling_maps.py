@@ -69,10 +69,10 @@ def test_offsets_of_a_patch_are_in_raster_order() -> None:
 def test_a_selection_of_a_mask_is_even_and_has_both_ends() -> None:
     mask = torch.zeros(2, 1, 3, 20, dtype=torch.bool)
     mask[0, 0, 1, 4:15] = True
-    places, real = mask_pixels(mask, most=6)
+    places, real = mask_pixels(mask, max_pixels=6)
     assert places[0, :, 0].tolist() == [4, 6, 8, 10, 12, 14]
     assert real.tolist() == [[True] * 6, [False] * 6]
-    assert mask_pixels(mask, most=11)[0].shape == (2, 11, 2)
+    assert mask_pixels(mask, max_pixels=11)[0].shape == (2, 11, 2)
     none, real = mask_pixels(mask[1:])
     assert none.shape == (1, 1, 2)  # of no pixels, one that is padding
     assert not real.any()

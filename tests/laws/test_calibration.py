@@ -67,7 +67,7 @@ def test_both_probabilities_are_those_that_made_the_labels() -> None:
     assert gap.mean() < 0.015
     assert gap.max() < 0.08
     held = cross_validate(draw(4000, seed=3))
-    right = torch.from_numpy(draw(4000, seed=3).right)
+    right = torch.from_numpy(draw(4000, seed=3).correct)
     assert float(calibration_error(held.probability, right)) < 0.025
 
 
@@ -136,7 +136,7 @@ def test_verdicts_lower_the_cost_that_is_paid() -> None:
         torch.from_numpy(frames.values)
     )
     costs = Costs(10, 5, 1)
-    right, there = torch.from_numpy(frames.right), torch.from_numpy(frames.there)
+    right, there = torch.from_numpy(frames.correct), torch.from_numpy(frames.present)
 
     def pay(verdict: torch.Tensor) -> float:
         alarm, miss = (verdict > 0) & ~right, (verdict < 0) & there
@@ -161,7 +161,7 @@ def test_the_choice_ranks_answers_by_what_makes_them_right() -> None:
     first = fit_choice(frames, "scenes")
     values = {name: torch.from_numpy(frames.values[:, k]) for k, name in enumerate(NAMES)}
     ranks = first.rank(values)
-    right = torch.from_numpy(frames.right)
+    right = torch.from_numpy(frames.correct)
     assert float(ranks[right].mean()) > float(ranks[~right].mean()) + 0.3
     x = frames.values
     planted = sigmoid(2 * x[:, 1]) * sigmoid(x[:, [0, 2]] @ np.array([2.0, 1.0]) - 0.5)

@@ -125,7 +125,7 @@ def test_a_calibration_carries_the_scores_of_the_frames_with_the_object() -> Non
     own = frames()
     assert sum(made.conformal.scores, ()) != ()
     together = sorted(x for group in made.conformal.scores for x in group)
-    assert together == sorted(own.nonconformity[own.there].tolist())  # type: ignore[index]
+    assert together == sorted(own.nonconformity[own.present].tolist())  # type: ignore[index]
     assert read_calibration(made.to_plain(), "x") == made
     earlier = made.to_plain()
     del earlier["conformal"]
@@ -163,7 +163,7 @@ def test_groups_by_probability_cover_the_hard_frames_as_often_as_the_easy_ones(
         assert len(made.conformal.scores) == 5
         assert all(30 < len(own) < 150 for own in made.conformal.scores)
         new, seen = draw_hard_and_easy(2000, rng)
-        own = new.there
+        own = new.present
         assert new.nonconformity is not None
         probability = made.assess_features(torch.from_numpy(new.values[own])).probability
         limit = [made.conformal.find_limit(level, float(p)) for p in probability]

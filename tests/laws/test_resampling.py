@@ -52,8 +52,8 @@ def cloud_of(rows: int, count: int, seed: int = 0, sharpness: float = 1.5) -> Pa
 def parents_share(resampled: Resampled, count: int) -> Tensor:
     """Return each parent's share of the children's weight, mean over the rows.  -> (M,)."""
     weights = resampled.log_weights.exp()
-    if resampled.shares is not None:
-        return (weights[..., None] * resampled.shares).sum(1).mean(0)
+    if resampled.mixture_weights is not None:
+        return (weights[..., None] * resampled.mixture_weights).sum(1).mean(0)
     return torch.zeros(len(weights), count).scatter_add(1, resampled.ancestors, weights).mean(0)
 
 
@@ -235,9 +235,9 @@ def test_the_gradient_of_an_ensemble_is_whole(space: PixelSpace | PoseSpace) -> 
 
 def test_the_ancestor_of_a_mixture_is_its_largest_part() -> None:
     resampled = EnsembleTransform(0.02, 20)(cloud_of(2, 30), 30, SPACE, Generator())
-    assert resampled.shares is not None
-    assert torch.equal(resampled.shares.max(2).indices, resampled.ancestors)
-    assert float(resampled.shares.amax(2).mean()) > 0.3
+    assert resampled.mixture_weights is not None
+    assert torch.equal(resampled.mixture_weights.max(2).indices, resampled.ancestors)
+    assert float(resampled.mixture_weights.amax(2).mean()) > 0.3
 
 
 def test_transport_moves_particles_less_than_a_shuffle() -> None:

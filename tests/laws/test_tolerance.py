@@ -80,7 +80,7 @@ def test_the_usual_tolerance_has_the_usual_probability() -> None:
 def test_a_tolerance_that_all_keep_or_none_leaves_doubt() -> None:
     frames = draw(100)
     made = fit_calibration(frames, "scenes")
-    rows = torch.from_numpy(frames.values[frames.there])
+    rows = torch.from_numpy(frames.values[frames.present])
     every = made.assess_features(rows, PoseTolerance(add=1e6))
     assert bool((every.probability <= every.presence * 0.995).all())
     assert bool((every.probability > every.presence * 0.9).all())

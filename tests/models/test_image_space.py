@@ -32,10 +32,10 @@ from posefilter.models.box_heads import PoseBox, QuantileBox, VotedBox
 from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.downsized import Downsized
 from posefilter.models.image_space import ImageSpace
-from posefilter.models.loss_schedule import Auxiliary, Stage, factors_at
+from posefilter.models.loss_schedule import Auxiliary, Stage, loss_weights_at
 from posefilter.models.patch_pf import PatchPF
 from posefilter.models.pixel_pf import PixelPF
-from posefilter.nets.context import ConvEncoder, NoContext
+from posefilter.nets.encoders import NoEncoder, UNetEncoder
 from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import (
     AbsoluteQuaternion,
@@ -86,7 +86,7 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
     parts: dict[str, Any] = {
         "net": net,
         "glimpse": BilinearGlimpse(size),
-        "encoder": ConvEncoder((16, 24, 32, 32), 32),
+        "encoder": UNetEncoder((16, 24, 32, 32), 32),
         "pose_head": NoPose() if detects else SurfacePointSixD(),
         "displacement": Bounded(0.3),
         "box_head": VotedBox() if detects else PoseBox(),
@@ -108,7 +108,7 @@ def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> 
     parts: dict[str, Any] = {
         "net": PatchNet if detects else LatentNet,
         "glimpse": IntegerCut(size),
-        "encoder": NoContext(),
+        "encoder": NoEncoder(),
         "pose_head": NoPose() if detects else AbsoluteQuaternion(),
         "displacement": Unbounded(),
         "box_head": QuantileBox(size) if detects else PoseBox(),
@@ -244,10 +244,10 @@ def test_stages_change_the_weights_as_training_proceeds() -> None:
         Stage(0.7, {"own_point": 0.0, "likelihood": 0.0}),
         Stage(1.0, {}),
     )
-    assert factors_at(loss_schedule, 0.2) == {"displacement": 0.0}
-    assert factors_at(loss_schedule, 0.5) == {"own_point": 0.0, "likelihood": 0.0}
-    assert factors_at(loss_schedule, 1.0) == {}
-    assert factors_at((), 0.5) == {}
+    assert loss_weights_at(loss_schedule, 0.2) == {"displacement": 0.0}
+    assert loss_weights_at(loss_schedule, 0.5) == {"own_point": 0.0, "likelihood": 0.0}
+    assert loss_weights_at(loss_schedule, 1.0) == {}
+    assert loss_weights_at((), 0.5) == {}
     method, batch = working(PatchPF, 3, loss_schedule=loss_schedule), scenes(2)
     losses = method.training_losses(batch, method.generator("train", 0))
     assert losses["displacement"].sum() == 0

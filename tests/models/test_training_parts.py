@@ -27,7 +27,7 @@ from posefilter.models.cnn_patch import CnnPatch
 from posefilter.models.image_space import ImageSpace, objectness_loss
 from posefilter.models.loss_schedule import Stage
 from posefilter.models.patch_pf import PatchPF
-from posefilter.nets.context import ContextMap
+from posefilter.nets.encoders import ContextMap
 from posefilter.types import Trace
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -114,7 +114,7 @@ def tiny(kind: type[ImageSpace], **changes: Any) -> ImageSpace:
 def stages_of(name: str) -> tuple[Stage, ...]:
     """Return the stages of conf/loss/schedule/NAME.yaml."""
     said: Any = OmegaConf.to_container(OmegaConf.load(CONF / "loss" / "schedule" / f"{name}.yaml"))
-    return tuple(Stage(one["until"], one.get("factors", {})) for one in said["loss_schedule"])
+    return tuple(Stage(one["until"], one.get("loss_weights", {})) for one in said["loss_schedule"])
 
 
 def at(method: ImageSpace, step: int, steps: int) -> None:
@@ -215,7 +215,7 @@ class Watch(Callback):
         self, trainer: Trainer, method: LightningModule, out: Any, batch: Any, number: int
     ) -> None:
         logged = trainer.callback_metrics
-        names = ("chosen", "displacement", "likelihood", "sides", "objectness")
+        names = ("main", "displacement", "likelihood", "sides", "objectness")
         off = {name for name in names if not logged[f"train/loss_{name}"]}
         self.seen.append((self.share, off))
 
@@ -237,7 +237,7 @@ def test_a_training_walks_through_its_stages() -> None:
     )
     data = DataLoader([scenes(2, seed) for seed in range(6)], batch_size=None)
     trainer.fit(tiny(CnnPatch, loss_schedule=stages_of("three_stages_displacement")), data)
-    first, second = {"chosen", "displacement"}, {"likelihood", "sides", "objectness"}
+    first, second = {"main", "displacement"}, {"likelihood", "sides", "objectness"}
     want = [(0.0, first), (0.2, first), (0.4, second), (0.6, set()), (0.8, set())]
     assert watch.seen == [one for one in want for _ in range(2)]
 

@@ -10,15 +10,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.geometry.camera import intrinsics
-from posefilter.nets.context import ConvEncoder, ResNetContext
+from posefilter.nets.encoders import ResNetEncoder, UNetEncoder
 from posefilter.nets.encoding import geometry
 from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.nets.resnet import ResNet
 
 K = intrinsics(150.0, 140.0, 49.5, 36.0)[None]
 ENCODERS: dict[str, tuple[Callable[[], nn.Module], int]] = {
-    "unet": (lambda: ConvEncoder((16, 24, 32, 32), 32), 4),
-    "resnet18": (lambda: ResNetContext(ResNet("resnet18"), 32), 4),
+    "unet": (lambda: UNetEncoder((16, 24, 32, 32), 32), 4),
+    "resnet18": (lambda: ResNetEncoder(ResNet("resnet18"), 32), 4),
     "coordinates": (lambda: ObjectCoordinateNet((16, 24, 32, 32), fragments=12, features=5), 8),
 }
 
@@ -67,7 +67,7 @@ def test_beyond_an_odd_side_lies_what_nothing_is_known_of(
     torch.manual_seed(0)
     encoder = ENCODERS[kind][0]().eval()
     rgb, depth = scene(75, 101)
-    mean = encoder.trunk.mean if isinstance(encoder, ResNetContext) else torch.full((3, 1, 1), 0.5)
+    mean = encoder.trunk.mean if isinstance(encoder, ResNetEncoder) else torch.full((3, 1, 1), 0.5)
     whole = mean + F.pad(rgb - mean, (0, 1, 0, 1))
     with torch.no_grad():
         found = maps(encoder, rgb, depth)

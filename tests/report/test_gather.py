@@ -27,7 +27,7 @@ def test_losses_of_earlier_runs_get_todays_names() -> None:
     new = rename_losses(old)
     assert new == {
         "train/loss": one,
-        "train/loss_chosen": two,
+        "train/loss_main": two,
         "train/loss_pose": three,
         "val/score": four,
         "train/coordinate_error_mm": five,

@@ -39,15 +39,15 @@ def test_one_bin_needs_one_particle_and_more_bins_more() -> None:
 
 def test_draws_stop_at_the_first_number_that_is_enough() -> None:
     cells = torch.randint(4, (500, 2), generator=torch.Generator().manual_seed(0))
-    count = count_needed(cells, 0.1, 0.95, least=10)
+    count = count_needed(cells, 0.1, 0.95, min_draws=10)
 
     def needed(n: int) -> int:
         return max(10, kld_size(len(cells[:n].unique(dim=0)), 0.1, 0.95))
 
     assert count >= needed(count)
     assert all(n < needed(n) for n in range(1, count))
-    assert count_needed(cells[:30], 0.1, 0.95, least=10) == 30  # where more would be needed
-    assert count_needed(cells * 0, 0.1, 0.95, least=10) == 10
+    assert count_needed(cells[:30], 0.1, 0.95, min_draws=10) == 30  # where more would be needed
+    assert count_needed(cells * 0, 0.1, 0.95, min_draws=10) == 10
 
 
 def test_cells_count_shifts_and_turns_alike() -> None:

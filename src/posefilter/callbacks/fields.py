@@ -45,12 +45,12 @@ class ScoresPoints(Protocol):
         ...
 
 
-def choose_levels(steps: Sequence[Step], most: int = 3) -> tuple[float, ...]:
+def choose_levels(steps: Sequence[Step], max_levels: int = 3) -> tuple[float, ...]:
     """Return noise levels that a filter ran through, broad to sharp: the ends and what lies evenly
     between them.
     """
     found = sorted({float(step.sigma.reshape(-1)[0]) for step in steps}, reverse=True)
-    return tuple(found[i] for i in choose_steps(len(found), most))
+    return tuple(found[i] for i in choose_steps(len(found), max_levels))
 
 
 def evaluate_pose_field(
@@ -74,13 +74,13 @@ def evaluate_pose_field(
         sorted({0.0, *_FINE, *(-d for d in _FINE), *np.arange(-180.0, 181.0, 15.0).tolist()})
     )
     about = turn_pose(truth, center, degrees.to(truth) * math.pi / 180)
-    reaches = tuple(
+    extents = tuple(
         min(max(6 * sigma, object_model.radius / 4), 2 * object_model.radius) for sigma in sigmas
     )
     planes, turns = [], []
-    for sigma, reach in zip(sigmas, reaches, strict=True):
+    for sigma, extent in zip(sigmas, extents, strict=True):
         poses = torch.cat(
-            [truth[None], shift_pose(truth, reach, cells).flatten(0, -3), about.flatten(0, -3)]
+            [truth[None], shift_pose(truth, extent, cells).flatten(0, -3), about.flatten(0, -3)]
         )
         generator = torch.Generator(device=truth.device).manual_seed(0)
         # as the filter reads
@@ -91,15 +91,15 @@ def evaluate_pose_field(
         less = (score - score[0])[1:].numpy()
         planes.append(less[: 3 * cells * cells].reshape(3, cells, cells))
         turns.append(less[3 * cells * cells :].reshape(3, len(degrees)))
-    return PoseField(tuple(sigmas), reaches, np.stack(planes), degrees.numpy(), np.stack(turns))
+    return PoseField(tuple(sigmas), extents, np.stack(planes), degrees.numpy(), np.stack(turns))
 
 
-def shift_pose(pose: Tensor, reach: float, cells: int) -> Tensor:
+def shift_pose(pose: Tensor, extent: float, cells: int) -> Tensor:
     """Return a pose shifted within the planes of the object's axes.
 
     (4, 4) -> (3, cells, cells, 4, 4).
     """
-    line = torch.linspace(-reach, reach, cells, dtype=pose.dtype, device=pose.device)
+    line = torch.linspace(-extent, extent, cells, dtype=pose.dtype, device=pose.device)
     shift = torch.zeros(3, cells, cells, 3, dtype=pose.dtype, device=pose.device)
     for k, (a, b) in enumerate(PLANES):
         shift[k, :, :, a], shift[k, :, :, b] = line[None, :], line[:, None]
@@ -136,8 +136,8 @@ def evaluate_point_field(
     place, center = points.position[0, 0, 0], object_model.center.to(points.position)
     order = points.ray[0, 0, 0].abs().argsort().tolist()  # the axis most along the ray comes last
     plane = (min(order[1:]), max(order[1:])) if depthwise else (min(order[:2]), max(order[:2]))
-    reach = 1.3 * object_model.radius
-    line = torch.linspace(-reach, reach, cells, dtype=truth.dtype, device=truth.device)
+    extent = 1.3 * object_model.radius
+    line = torch.linspace(-extent, extent, cells, dtype=truth.dtype, device=truth.device)
     places = place.expand(cells, cells, 3).clone()
     places[..., plane[0]], places[..., plane[1]] = line[None, :], line[:, None]
     asked = torch.cat([place[None], places.flatten(0, 1)])
@@ -159,7 +159,7 @@ def evaluate_point_field(
     ).numpy()
     scores = found[:, 1:].reshape(len(sigmas), cells, cells)
     return PointField(
-        pixel, on, place.cpu().numpy(), plane, reach, tuple(sigmas), scores, found[:, 0]
+        pixel, on, place.cpu().numpy(), plane, extent, tuple(sigmas), scores, found[:, 0]
     )
 
 
@@ -171,9 +171,9 @@ def make_point(
     """
     center = object_model.center.to(truth)
     middle = origin_of(truth, center)
-    reach = object_model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
+    extent = object_model.radius * image.intrinsics[0, 0, 0] / middle[2].clamp_min(0.1)
     # what `sample_points` will undo
-    noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / reach
+    noise = (truth.new_tensor(pixel) - project(middle[None], image.intrinsics[0])[0]) / extent
     return sample_points(
         image, truth[None, None], center, object_model.radius, noise[None, None, None], spread=1.0
     )

@@ -104,13 +104,13 @@ def measure_health(trace: Trace, space: Space) -> dict[str, torch.Tensor]:
     return {name: torch.stack([row[name] for row in steps], dim=1).double() for name in steps[0]}
 
 
-def name_scalars(curves: dict[str, list[float]], most: int) -> dict[str, float]:
-    """Return curves as scalars with names that sort, `filter/ess/step_03`: `most` of each, evenly
-    chosen.
+def name_scalars(curves: dict[str, list[float]], max_steps: int) -> dict[str, float]:
+    """Return curves as scalars with names that sort, `filter/ess/step_03`: `max_steps` of each,
+    evenly chosen.
     """
     out: dict[str, float] = {}
     for name, values in curves.items():
         # a single one is the last
-        for step in choose_steps(len(values), most) if most > 1 else [len(values) - 1]:
+        for step in choose_steps(len(values), max_steps) if max_steps > 1 else [len(values) - 1]:
             out[f"filter/{name}/step_{step:02d}"] = values[step]
     return out

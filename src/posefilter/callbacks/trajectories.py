@@ -25,11 +25,11 @@ def trace_lineage(history: Sequence[Particles]) -> Tensor:
     return torch.stack(path[::-1], dim=1)
 
 
-def follow_particles(trace: Trace, most: int = 8) -> Tensor:
+def follow_particles(trace: Trace, max_particles: int = 8) -> Tensor:
     """Return the ways of a few particles of one image, chosen by their last weight.  -> (T, n, 2)
     [px].
     """
-    chosen = choose_by_weight(normalize_weights(trace.particles[-1], 0), most).unique()
+    chosen = choose_by_weight(normalize_weights(trace.particles[-1], 0), max_particles).unique()
     return trace_lineage(trace.particles)[0][:, chosen]
 
 

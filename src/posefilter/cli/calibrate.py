@@ -170,7 +170,7 @@ def learn(
 def measure_quality(frames: Frames, found: Assessment) -> dict[str, Any]:
     """Return the numbers of `Confidence` for probabilities of frames, at the default costs."""
     metric = Confidence()
-    there, right = torch.from_numpy(frames.there), torch.from_numpy(frames.right)
+    there, right = torch.from_numpy(frames.present), torch.from_numpy(frames.correct)
     verdicts = score_verdicts(found, Costs())
     metric.update(found.presence, found.probability, there, right, verdicts)
     quality: dict[str, Any] = metric.compute()

@@ -160,7 +160,7 @@ def judge_absent(method: PoseEstimator, data: PoseDataModule, limit: int) -> Non
         for number, batch in enumerate(make_loader(frames, _BATCH, 0)):
             hidden = Batch(*(x.to(method.device) for x in hide_annotation(batch)))
             trace = method.predict_step(hidden, number)
-            method.judge_confidence(trace, hidden, there=False)
+            method.judge_confidence(trace, hidden, present=False)
 
 
 def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:

@@ -64,6 +64,7 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.objectness_weight",
+    "model.reach": "model.crop_radius",
     "model.candidate_sampler.turns": "model.candidate_sampler.rotations",
     "data.points": "data.num_model_points",
     "data.model_points": "data.model_points_dir",
@@ -223,7 +224,12 @@ CLASSES = {
     "losses.contrast.Contrast": "losses.contrastive.Contrastive",
     "nets.glimpse.SmoothGlimpse": "nets.glimpse.BilinearGlimpse",
     "models.box_heads.SpreadBox": "models.box_heads.QuantileBox",
-    "models.schedules.warm_cosine": "models.schedules.warmup_cosine",
+    "models.schedules.warm_cosine": "models.lr_schedulers.warmup_cosine",
+    "models.schedules.warmup_cosine": "models.lr_schedulers.warmup_cosine",
+    "nets.context.NoContext": "nets.encoders.NoEncoder",
+    "nets.context.Pyramid": "nets.encoders.PyramidEncoder",
+    "nets.context.ConvEncoder": "nets.encoders.UNetEncoder",
+    "nets.context.ResNetContext": "nets.encoders.ResNetEncoder",
     "data.augmentation.Window": "data.augmentation.RandomCrop",
     "data.augmentation.Blank": "data.augmentation.RandomErasing",
     "data.augmentation.Color": "data.augmentation.ColorJitter",
@@ -281,9 +287,11 @@ ARGUMENTS = {
     "models.patch_pf.PatchPF": _OBJECTNESS,
     "models.pixel_pf.PixelPF": _OBJECTNESS,
     "models.pose_pf.PosePF": {"even_points": "quasi_monte_carlo"},
+    "models.rotation_grid.RotationGrid": {"reach": "crop_radius"},
+    "models.loss_schedule.Stage": {"factors": "loss_weights"},
     "models.muon.Muon": {"spared": "adam_layers"},
-    "models.schedules.warmup_cosine": {"warm_up": "warmup_steps", "floor": "min_lr_fraction"},
-    "nets.context.ConvEncoder": {"most_px": "max_width_px"},
+    "models.lr_schedulers.warmup_cosine": {"warm_up": "warmup_steps", "floor": "min_lr_fraction"},
+    "nets.encoders.UNetEncoder": {"most_px": "max_width_px"},
     "nets.heads.Bounded": {"reach": "max_displacement"},
     "nets.mlp.LatentNet": {"displacement_reads": "displacement_input"},
     "labels.displacement.TowardsObject": {"reach": "max_displacement"},
@@ -395,7 +403,7 @@ def _upgrade(node: Any) -> Any:
     out = {}
     for key, value in node.items():
         name = rename_argument(target, str(key)) or key
-        if key == "factors" and isinstance(value, Mapping):  # of losses, in a stage of a training
+        if name == "loss_weights" and isinstance(value, Mapping):  # in a stage of a training
             value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
         if key == "options" and _below(target) == "data.module.PoseDataModule":
             value = {_OPTIONS.get(n, n): v for n, v in value.items()} if value else value

@@ -49,7 +49,7 @@ _SCHEDULES = (
 )
 _RECIPE_NAMES = frozenset(
     {
-        "posefilter.models.schedules.warmup_cosine",
+        "posefilter.models.lr_schedulers.warmup_cosine",
         *(f"torch.optim.{name}" for name in _OPTIMIZERS),
         *(f"torch.optim.lr_scheduler.{name}" for name in _SCHEDULES),
         *(f"torch.nn.{name}" for name in _LAYERS),

@@ -244,7 +244,7 @@ def _read(content: Any) -> Calibration:
     if len(set(features)) < len(features):
         raise ValueError("names a feature twice")
     count = len(features)
-    scale = _numbers(content["scale"], count, "scale", least=1e-9)
+    scale = _numbers(content["scale"], count, "scale", minimum=1e-9)
     counts, source = content["counts"], content["source"]
     if not isinstance(counts, dict) or set(counts) != set(COUNTS):
         raise ValueError(f"should count {', '.join(COUNTS)}")
@@ -276,7 +276,7 @@ def _read(content: Any) -> Calibration:
 def _logistic(content: Any, count: int, name: str) -> Logistic:
     if not isinstance(content, dict) or set(content) != {"weights", "bias"}:
         raise ValueError(f"should have weights and bias in {name}")
-    weights = _numbers(content["weights"], count, f"{name}'s weights", least=0.0)
+    weights = _numbers(content["weights"], count, f"{name}'s weights", minimum=0.0)
     return Logistic(weights, _numbers([content["bias"]], 1, f"{name}'s bias")[0])
 
 
@@ -320,13 +320,13 @@ def _conformal(content: Any) -> Conformal | None:
     return Conformal(edges, tuple(read), by)
 
 
-def _numbers(values: Any, count: int, name: str, least: float = -_LARGEST) -> tuple[float, ...]:
+def _numbers(values: Any, count: int, name: str, minimum: float = -_LARGEST) -> tuple[float, ...]:
     """Return finite numbers of moderate size."""
     if not isinstance(values, list) or len(values) != count:
         raise ValueError(f"should have {count} numbers in {name}")
     for value in values:
         number = isinstance(value, int | float) and not isinstance(value, bool)
         # nan is in no range; a whole number may be too large for a float
-        if not (number and least <= value <= _LARGEST):
+        if not (number and minimum <= value <= _LARGEST):
             raise ValueError(f"has {str(value)[:30]!r} in {name}")
     return tuple(float(value) for value in values)

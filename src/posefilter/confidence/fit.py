@@ -26,8 +26,8 @@ class Frames(NamedTuple):
 
     features: tuple[str, ...]
     values: np.ndarray  # (n, F)
-    there: np.ndarray  # (n,) bool: the object is in the image
-    right: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
+    present: np.ndarray  # (n,) bool: the object is in the image
+    correct: np.ndarray  # (n,) bool: and the estimate within 0.1 diameters
     # (n,) of the true pose, NaN where the object is not in the image [nat]; None: not measured
     nonconformity: np.ndarray | None = None
     # of (n,) each, NaN where the object is not in the image; None: not measured
@@ -37,13 +37,13 @@ class Frames(NamedTuple):
         """Return some of the frames."""
         nonconformity = None if self.nonconformity is None else self.nonconformity[index]
         errors = None if self.errors is None else PoseErrors(*(x[index] for x in self.errors))
-        own = (self.values[index], self.there[index], self.right[index])
+        own = (self.values[index], self.present[index], self.correct[index])
         return Frames(self.features, *own, nonconformity, errors)
 
 
 def make_frames(
     values: Sequence[Mapping[str, torch.Tensor]],
-    there: Sequence[np.ndarray],
+    present: Sequence[np.ndarray],
     errors: Sequence[PoseErrors],
     nonconformity: Sequence[np.ndarray],
 ) -> Frames:
@@ -52,7 +52,7 @@ def make_frames(
     """
     names = tuple(values[0])
     rows = [np.stack([one[name].double().cpu().numpy() for name in names], 1) for one in values]
-    all_rows, seen, scores = (np.concatenate(one) for one in (rows, there, nonconformity))
+    all_rows, seen, scores = (np.concatenate(one) for one in (rows, present, nonconformity))
     off = PoseErrors(*(np.concatenate(parts) for parts in zip(*errors, strict=True)))
     return Frames(names, all_rows, seen, RIGHT.accepts(off), scores, off)
 
@@ -72,9 +72,11 @@ def fit_choice(frames: Frames, source: str) -> Calibration:
     """
     _check_counts(frames)
     fitted = _fit(frames, source, {})
-    share = float(np.clip(frames.right.mean(), 0.05, 0.95))
-    balance = np.where(frames.right, 0.5 / share, 0.5 / (1 - share))
-    return replace(fitted, choice=fit_logistic(_standardize(frames, fitted), frames.right, balance))
+    share = float(np.clip(frames.correct.mean(), 0.05, 0.95))
+    balance = np.where(frames.correct, 0.5 / share, 0.5 / (1 - share))
+    return replace(
+        fitted, choice=fit_logistic(_standardize(frames, fitted), frames.correct, balance)
+    )
 
 
 def fit_calibration(
@@ -102,7 +104,7 @@ def fit_calibration(
     fitted = _fit(frames, source, quality or {}, first)
     if frames.nonconformity is None:
         return fitted
-    own = frames.there
+    own = frames.present
     held = cross_validate(frames, first=first).probability.numpy()[own]
     sets = fit_conformal(frames.nonconformity[own], held, choose_edges(held), by="probability")
     return replace(fitted, conformal=sets)
@@ -110,8 +112,8 @@ def fit_calibration(
 
 def _check_counts(frames: Frames) -> None:
     for count, which in (
-        (int(frames.there.sum()), "with"),
-        (int((~frames.there).sum()), "without"),
+        (int(frames.present.sum()), "with"),
+        (int((~frames.present).sum()), "without"),
     ):
         if count < FEWEST:
             raise UserError(
@@ -125,7 +127,7 @@ def _fit(
     quality: Mapping[str, float],
     first: Calibration | None = None,
 ) -> Calibration:
-    there, right = frames.there, frames.right
+    there, right = frames.present, frames.correct
     counts = {
         "right": int(right.sum()),
         "wrong": int((there & ~right).sum()),
@@ -175,7 +177,7 @@ def cross_validate(
         first: As of `fit_calibration`.
     """
     rng = np.random.default_rng(seed)
-    kind = frames.there.astype(int) + frames.right
+    kind = frames.present.astype(int) + frames.correct
     fold = np.empty(len(kind), int)
     for one in np.unique(kind):
         own = np.flatnonzero(kind == one)

@@ -125,11 +125,11 @@ def _search(
     calibration: Calibration,
     first: Trace,
     row: int,
-    least: float,
+    min_rank: float,
     image: Batch,
     generator: Generator,
 ) -> Trace | None:
-    """Return the best of the other searches of one image; None where no rank is above `least`."""
+    """Return the best of an image's other searches; None where no rank is above `min_rank`."""
     object_model, pose = method.object_model, first.belief.best[row : row + 1]
     hidden = find_visible(pose, object_model, image.depth[0, 0], image.intrinsics[0])
     best: Trace | None = None
@@ -146,8 +146,8 @@ def _search(
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(encoding=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])
-        if value > least and not _contradicts(method, found, image).any():
-            least, best = value, found
+        if value > min_rank and not _contradicts(method, found, image).any():
+            min_rank, best = value, found
             if value >= DOUBTFUL:
                 break
     return best

@@ -14,8 +14,8 @@ from posefilter.deploy.resizing import Resize
 from posefilter.filters.agreement import Agreement
 from posefilter.models.image_space import ImageEncoding, ImageSpace, ObjectnessEncoding
 from posefilter.models.pose_pf import PosePF
-from posefilter.nets.context import ContextMap
 from posefilter.nets.coordinates import Context, Coordinates
+from posefilter.nets.encoders import ContextMap
 from posefilter.nets.likelihood import Pixels, PoseLikelihood, flatten_images, sample_points
 from posefilter.nets.pose_votes import measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet

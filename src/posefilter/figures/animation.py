@@ -71,13 +71,13 @@ class Animation:
         entries = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
         self.foot = np.concatenate([draw_legend(entries), draw_weight_scale()])
 
-    def frames(self, between: int | None = None, most: int = 15) -> Iterator[np.ndarray]:
+    def frames(self, between: int | None = None, max_steps: int = 15) -> Iterator[np.ndarray]:
         """Yield the pictures, `between` of them from each iteration to the next; None: two where
         iterations are few, else one.
 
-        most: iterations that are shown, evenly chosen, the first and the last among them.
+        max_steps: iterations that are shown, evenly chosen, the first and the last among them.
         """
-        shown = choose_steps(len(self.trace.particles), most)
+        shown = choose_steps(len(self.trace.particles), max_steps)
         between = between or (2 if len(shown) <= 8 else 1)
         for before, number in zip([shown[0], *shown], shown, strict=False):
             weights = normalize_weights(self.trace.particles[number], 0)

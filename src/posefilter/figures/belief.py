@@ -154,12 +154,14 @@ def draw_rotations(
     return halve(label_map(picture, np.array(taken)))
 
 
-def scale_radii(weights: np.ndarray, least: float = 3.0, most: float = 11.0) -> np.ndarray:
-    """Return radii of discs whose areas grow with weights (N,): `least` at none, `most` at the
-    heaviest.  -> (N,) [px].
+def scale_radii(
+    weights: np.ndarray, min_radius: float = 3.0, max_radius: float = 11.0
+) -> np.ndarray:
+    """Return radii of discs whose areas grow with weights (N,): `min_radius` at none, `max_radius`
+    at the heaviest.  -> (N,) [px].
     """
     share = weights / max(float(weights.max()), 1e-300)
-    return np.asarray(np.sqrt(least**2 + (most**2 - least**2) * share))
+    return np.asarray(np.sqrt(min_radius**2 + (max_radius**2 - min_radius**2) * share))
 
 
 def draw_centers(

@@ -97,15 +97,19 @@ def choose_bounds(info: MetricInfo, values: np.ndarray) -> tuple[float, float]:
     return low - pad, high + pad
 
 
-def choose_ticks(low: float, high: float, most: int = 4, fewest: int = 3) -> tuple[float, ...]:
+def choose_ticks(
+    low: float, high: float, max_ticks: int = 4, min_ticks: int = 3
+) -> tuple[float, ...]:
     """Return round numbers, evenly spaced, within bounds."""
     ticks: tuple[float, ...] = ()
-    for count in range(most, 2 * most + 1):  # closer ones where few would fall within the bounds
+    for count in range(
+        max_ticks, 2 * max_ticks + 1
+    ):  # closer ones where few would fall within the bounds
         rough = (high - low) / count
         power = 10.0 ** np.floor(np.log10(rough))
         step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * (1 - 1e-9))
         first, last = int(np.ceil(low / step)), int(np.floor(high / step))
         ticks = tuple(float(round(i * step, 12)) for i in range(first, last + 1))
-        if len(ticks) >= fewest:
+        if len(ticks) >= min_ticks:
             break
     return ticks

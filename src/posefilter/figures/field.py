@@ -48,7 +48,7 @@ class PoseField(NamedTuple):
     """Scores about the truth of one image, less the truth's own."""
 
     sigmas: tuple[float, ...]  # (L,) noise levels [m]
-    reaches: tuple[float, ...]  # (L,) how far the slices go [m]
+    extents: tuple[float, ...]  # (L,) how far the slices go [m]
     # (L, 3, G, G): plane (a, b); rows by the shift along axis b, columns by that along a, both
     # rising
     planes: np.ndarray
@@ -63,7 +63,7 @@ class PointField(NamedTuple):
     on: bool  # whether it is the object's
     place: np.ndarray  # (3,) where it lies under the true pose, from the object's center [m]
     plane: tuple[int, int]  # the two object axes that span the slice through `place`
-    reach: float  # the slice goes from -reach to reach about the object's center [m]
+    extent: float  # the slice goes from -extent to extent about the object's center [m]
     sigmas: tuple[float, ...]  # (L,) [m]
     scores: np.ndarray  # (L, G, G), rows and columns as in PoseField
     own: np.ndarray  # (L,) at `place`
@@ -76,11 +76,11 @@ def draw_pose_field(field: PoseField, title: str, estimate: np.ndarray | None = 
     estimate: (3,) where the estimate's center lies, from the true one, along the object's axes [m].
     """
     rows: list[list[np.ndarray]] = [[], [], [], []]
-    for k, (sigma, reach) in enumerate(zip(field.sigmas, field.reaches, strict=True)):
+    for k, (sigma, extent) in enumerate(zip(field.sigmas, field.extents, strict=True)):
         own = np.concatenate([field.planes[k].ravel(), field.turns[k].ravel()])
         low = min(float(np.percentile(own, 2)), -1e-3)
         for row, (a, b), values in zip(rows[:3], PLANES, field.planes[k], strict=True):
-            x, y = (make_shift_axis(f"along {_NAMES[axis]} [mm]", reach) for axis in (a, b))
+            x, y = (make_shift_axis(f"along {_NAMES[axis]} [mm]", extent) for axis in (a, b))
             marks = [Mark(0, 0, TRUTH)]
             if estimate is not None:
                 marks.append(
@@ -126,10 +126,10 @@ def color_scores(values: np.ndarray, low: float) -> np.ndarray:
     return out
 
 
-def make_shift_axis(label: str, reach: float) -> Axis:
-    """Return an axis from -reach to reach [m] that is labeled in millimeters."""
-    tick = round_down(1000 * reach * 0.9)
-    return Axis(label, -1000 * reach, 1000 * reach, (-tick, 0, tick))
+def make_shift_axis(label: str, extent: float) -> Axis:
+    """Return an axis from -extent to extent [m] that is labeled in millimeters."""
+    tick = round_down(1000 * extent * 0.9)
+    return Axis(label, -1000 * extent, 1000 * extent, (-tick, 0, tick))
 
 
 def round_down(value: float) -> float:
@@ -163,10 +163,10 @@ def draw_point_field(
     for field in fields:
         a, b = field.plane
         (normal,) = {0, 1, 2} - {a, b}
-        near = np.abs(surface[:, normal] - field.place[normal]) < 0.06 * field.reach
+        near = np.abs(surface[:, normal] - field.place[normal]) < 0.06 * field.extent
         dots = 1000 * surface[near][:, [a, b]]
         marks = [Mark(1000 * float(field.place[a]), 1000 * float(field.place[b]), TRUTH)]
-        x, y = (make_shift_axis(f"object's {_NAMES[axis]} [mm]", field.reach) for axis in (a, b))
+        x, y = (make_shift_axis(f"object's {_NAMES[axis]} [mm]", field.extent) for axis in (a, b))
         most = max(float(np.abs(field.scores).max()), float(np.abs(field.own).max()), 1e-6)
         tiles = []
         for sigma, scores, own in zip(field.sigmas, field.scores, field.own, strict=True):

@@ -86,14 +86,14 @@ def _draw_blank(width: int) -> np.ndarray:
     return picture
 
 
-def label_map(picture: np.ndarray, taken: np.ndarray, reach: float = 70.0) -> np.ndarray:
+def label_map(picture: np.ndarray, taken: np.ndarray, clearance: float = 70.0) -> np.ndarray:
     """Return a map with its directions named: on top of what is drawn there, and away from places
     that are marked.
 
     Args:
         picture: A map of twice its height.
         taken: Places (M, 2) of marks [px].
-        reach: How near to a mark nothing is written [px].
+        clearance: How near to a mark nothing is written [px].
     """
     width = picture.shape[1]
     image = Image.fromarray(picture)
@@ -107,7 +107,7 @@ def label_map(picture: np.ndarray, taken: np.ndarray, reach: float = 70.0) -> np
                 [{"m": 0, "l": half + 60, "r": -half - 60}[anchor[0]], 14 if down > 0 else -14]
             )
             gap = np.abs(taken.reshape(-1, 2) - middle) - [half, 14]
-            if (gap.max(1) > reach / 2).all():
+            if (gap.max(1) > clearance / 2).all():
                 place, where = (middle[0], at[1] + down), "m" + anchor[1]
                 pen.text(
                     place,

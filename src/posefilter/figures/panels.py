@@ -193,18 +193,18 @@ def draw_mark(
     at: np.ndarray,
     color: Color,
     shape: str = "ring",
-    reach: float = 0,
+    size: float = 0,
     width: int = 2,
 ) -> None:
-    """Draw a ring, square or diamond round a place (2,) [px], in place; reach: how far it goes (0:
+    """Draw a ring, square or diamond round a place (2,) [px], in place; size: how far it goes (0:
     as in panels).
     """
-    reach = reach or (_REACH if shape == "ring" else 2 * _REACH / 3)
+    size = size or (_REACH if shape == "ring" else 2 * _REACH / 3)
     first = np.pi / 4 if shape == "square" else 0.0
     turn = (
         np.linspace(0, 2 * np.pi, 33)[:-1] if shape == "ring" else first + np.arange(4) * np.pi / 2
     )
-    length = reach * 2**0.5 if shape == "square" else reach
+    length = size * 2**0.5 if shape == "square" else size
     draw_lines(
         picture,
         [at + length * np.stack([np.cos(turn), np.sin(turn)], 1)],

@@ -195,9 +195,11 @@ def normalize_weights(particles: Particles, image: int) -> torch.Tensor:
     return torch.softmax(particles.log_weights[image].detach().cpu().double(), 0)
 
 
-def choose_steps(count: int, most: int) -> list[int]:
-    """Return at most `most` of `count` steps, evenly spread, the first and the last among them."""
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(most, count)).tolist()})
+def choose_steps(count: int, max_steps: int) -> list[int]:
+    """Return at most `max_steps` of `count` steps, evenly spread, the first and the last among
+    them.
+    """
+    return sorted({round(x) for x in np.linspace(0, count - 1, min(max_steps, count)).tolist()})
 
 
 class PoseStep:
@@ -215,7 +217,7 @@ class PoseStep:
         self.axes = project_axes(
             poses[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
         )
-        self.reach = (
+        self.half_side = (
             space.radius
             * float(camera[0, 0])
             / max(float(weights @ origin_of(poses, center)[:, 2]), 0.05)
@@ -227,7 +229,7 @@ class PoseStep:
         [px].
         """
         middle = self.weights @ self.pixels
-        return np.stack([middle - 0.7 * self.reach, middle + 0.7 * self.reach])
+        return np.stack([middle - 0.7 * self.half_side, middle + 0.7 * self.half_side])
 
     def draw(self, below: np.ndarray, view: View) -> np.ndarray:
         """Draw it on a view's `ground`."""

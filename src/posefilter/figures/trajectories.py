@@ -30,16 +30,16 @@ def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 def draw_trajectories(
-    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, most: int = 100
+    rgb: np.ndarray, mask: np.ndarray, states: np.ndarray, title: str, max_particles: int = 100
 ) -> np.ndarray:
     """Draw where particles started (yellow), went (lines) and ended (green: on the object, red: off
     it).
 
-    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `most` of which are drawn. Half a
-    frame more is shown on each side where a particle has left it.
+    rgb (H, W, 3) uint8; mask (H, W) bool; states (T, N, 2) [px], `max_particles` of which are
+    drawn. Half a frame more is shown on each side where a particle has left it.
     """
     H, W = mask.shape
-    path = states[:, :most]
+    path = states[:, :max_particles]
     on = find_hits(mask, path[-1])
     left = bool(((path < -0.5) | (path > [W - 0.5, H - 0.5])).any())
     view = (
@@ -68,13 +68,13 @@ def draw_glimpses(
     states: np.ndarray,
     patches: np.ndarray,
     title: str,
-    most: int = 8,
+    max_steps: int = 8,
 ) -> np.ndarray:
     """Draw what a few particles saw, a row a particle, below their way over the image.
 
     rgb (H, W, 3) uint8; mask (H, W) bool; states (T, n, 2) [px]; patches (T, n, k, k, 3) uint8.
-    Frames are green where the particle stands on the object, and red where not. most: steps that
-    are shown, the first and the last among them.
+    Frames are green where the particle stands on the object, and red where not. max_steps: steps
+    that are shown, the first and the last among them.
     """
     n, k = patches.shape[1:3]
     on = find_hits(mask, states)
@@ -89,7 +89,7 @@ def draw_glimpses(
         draw_dots(picture, way, np.array([ON if hit else OFF for hit in on[:, i]]), 4)
         draw_dots(picture, way[:1], np.array([START]), 4)
         draw_label(picture, str(i + 1), way[-1])
-    shown = choose_steps(len(states), most)
+    shown = choose_steps(len(states), max_steps)
     size = min(90, (WIDTH - _NUMBER) // len(shown))
     rows = [
         arrange_row(

@@ -102,7 +102,7 @@ class AuxiliaryResampling:
         resampled = self.resampler(
             particles._replace(log_weights=log_weights), count, space, generator
         )
-        if resampled.shares is not None:
+        if resampled.mixture_weights is not None:
             raise UserError(
                 "filter/resample=auxiliary needs a resampler whose children have one ancestor "
                 "each; choose systematic"

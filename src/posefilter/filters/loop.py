@@ -124,7 +124,7 @@ class ParticleFilter(nn.Module):
         encoding = method.encode(batch)
         state = self.initialize(batch, encoding, method, self.initial_particles, generator)
         particles = make_particles(state, method.latent_width)
-        inherited = torch.zeros_like(particles.log_weights)
+        ancestor_log_likelihood = torch.zeros_like(particles.log_weights)
         steps = self.make_steps(state)
         resample = bind_to_encoding(self.resample, encoding, batch)
         history: list[Particles] = []
@@ -137,10 +137,14 @@ class ParticleFilter(nn.Module):
                 displacement = inherit(outputs[-1].displacement, resampled)
                 state = self.propagate(state, displacement, step, method.space, generator)
                 latent = inherit(outputs[-1].latent, resampled)
-                inherited = inherit(outputs[-1].log_likelihood[..., None], resampled)[..., 0]
+                ancestor_log_likelihood = inherit(outputs[-1].log_likelihood[..., None], resampled)[
+                    ..., 0
+                ]
                 particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
             output = method.measure(encoding, particles, step, generator)
-            log_weights = self.reweight(particles.log_weights, output.log_likelihood, inherited)
+            log_weights = self.reweight(
+                particles.log_weights, output.log_likelihood, ancestor_log_likelihood
+            )
             increment = log_weights.logsumexp(1)
             particles = particles._replace(log_weights=log_weights - increment[:, None])
             history.append(particles)
@@ -171,14 +175,14 @@ def make_particles(state: Tensor, latent_width: int) -> Particles:
 def inherit(values: Tensor, resampled: Resampled, space: Space | None = None) -> Tensor:
     """Return the values of each child's ancestor.  (B, M, *V) -> (B, N, *V).
 
-    Where children are mixtures of particles (`resampled.shares`), their values are weighted means:
-    those of `space` for states, arithmetic ones if it is None.
+    Where children are mixtures of particles (`resampled.mixture_weights`), their values are
+    weighted means: those of `space` for states, arithmetic ones if it is None.
     """
-    if resampled.shares is None:
+    if resampled.mixture_weights is None:
         return _take(values, resampled.ancestors)
     if space is not None:
-        return space.mean(values[:, None], resampled.shares)
-    return resampled.shares @ values
+        return space.mean(values[:, None], resampled.mixture_weights)
+    return resampled.mixture_weights @ values
 
 
 def _take(values: Tensor, ancestors: Tensor) -> Tensor:

@@ -21,20 +21,20 @@ class Modes(NamedTuple):
 
 
 def find_modes(
-    state: Tensor, log_weights: Tensor, space: Space, bandwidth: float, reach: float = 3.0
+    state: Tensor, log_weights: Tensor, space: Space, bandwidth: float, max_distance: float = 3.0
 ) -> Modes:
     """Cluster weighted particles by quick shift (Vedaldi and Soatto 2008).
 
-    Each particle follows the nearest particle of higher kernel density within `reach` bandwidths.
-    Particles that follow none are the modes, so a mode is always a particle. The number of modes
-    need not be known.
+    Each particle follows the nearest particle of higher kernel density within `max_distance`
+    bandwidths. Particles that follow none are the modes, so a mode is always a particle. The number
+    of modes need not be known.
 
     Args:
         state: (N, *S) particles.
         log_weights: (N,), normalized here.
         space: The space of the particles.
         bandwidth: Of the Gaussian kernel, in the space's unit.
-        reach: Largest distance to a leader, in bandwidths.
+        max_distance: Largest distance to a leader, in bandwidths.
 
     Returns:
         The modes, by falling weight.
@@ -42,7 +42,7 @@ def find_modes(
     weights = torch.softmax(log_weights.double(), 0)
     density = kernel_mass(state[None], weights.log()[None], space, bandwidth)[0]
     order = torch.argsort(density, descending=True, stable=True)
-    leader = _find_leaders(state[order], space, reach * bandwidth)
+    leader = _find_leaders(state[order], space, max_distance * bandwidth)
     # pointer jumping: follow each chain to its root
     while not torch.equal(leader, leader[leader]):
         leader = leader[leader]
@@ -68,10 +68,10 @@ def find_pose_modes(poses: Tensor, log_weights: Tensor, space: Space, diameter: 
         space: The space of poses about the object's center.
         diameter: The object's diameter [m].
     """
-    return find_modes(poses, log_weights, space, bandwidth=APART * diameter / 3, reach=3.0)
+    return find_modes(poses, log_weights, space, bandwidth=APART * diameter / 3, max_distance=3.0)
 
 
-def _find_leaders(state: Tensor, space: Space, reach: float, chunk: int = 1 << 20) -> Tensor:
+def _find_leaders(state: Tensor, space: Space, max_distance: float, chunk: int = 1 << 20) -> Tensor:
     """Return the index of the particle that each one follows, itself if there is none.  -> (N,).
 
     Particles are sorted by falling density, so only earlier ones are candidates.
@@ -82,5 +82,5 @@ def _find_leaders(state: Tensor, space: Space, reach: float, chunk: int = 1 << 2
         distance = space.distance(state[block][:, None], state[None])
         distance = distance.masked_fill(index[None] >= block[:, None], torch.inf)
         shortest, nearest = distance.min(1)
-        parts.append(torch.where(shortest <= reach, nearest, block))
+        parts.append(torch.where(shortest <= max_distance, nearest, block))
     return torch.cat(parts)

@@ -170,15 +170,17 @@ class AdaptiveResampling:
             return new
         low = (effective_sample_size(particles.log_weights) < self.threshold * M)[:, None]
         kept = NoResampling()(particles, count, space, generator)
-        shares = new.shares
-        if shares is not None:
-            shares = torch.where(
+        mixture_weights = new.mixture_weights
+        if mixture_weights is not None:
+            mixture_weights = torch.where(
                 low[..., None],
-                shares,
-                torch.eye(M, dtype=shares.dtype, device=shares.device),
+                mixture_weights,
+                torch.eye(M, dtype=mixture_weights.dtype, device=mixture_weights.device),
             )
         ancestors = torch.where(low, new.ancestors, kept.ancestors)
-        return Resampled(ancestors, torch.where(low, new.log_weights, kept.log_weights), shares)
+        return Resampled(
+            ancestors, torch.where(low, new.log_weights, kept.log_weights), mixture_weights
+        )
 
 
 class Islands:
@@ -219,7 +221,7 @@ class Islands:
         # of an island without weight any particle will do
         own = own._replace(log_weights=(log_w - log_island).nan_to_num(0.0).log_softmax(1))
         new = self.resampler(own, count // islands, space, generator)
-        if new.shares is not None:
+        if new.mixture_weights is not None:
             raise UserError("filter/resample=islands needs a scheme that draws ancestors")
         first = torch.arange(islands, device=log_w.device)[:, None] * (M // islands)
         ancestors = new.ancestors.view(B, islands, -1) + first

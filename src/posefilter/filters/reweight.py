@@ -15,7 +15,9 @@ class SequentialBayes:
     (by sqrt(T) for a Gaussian).
     """
 
-    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+    def __call__(
+        self, log_weights: Tensor, log_likelihood: Tensor, ancestor_log_likelihood: Tensor
+    ) -> Tensor:
         """Return (B, N)."""
         return log_weights + log_likelihood
 
@@ -31,7 +33,9 @@ class CurrentLikelihood:
     particles and are no estimate of posterior mass.
     """
 
-    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+    def __call__(
+        self, log_weights: Tensor, log_likelihood: Tensor, ancestor_log_likelihood: Tensor
+    ) -> Tensor:
         """Return (B, N)."""
         return log_likelihood - math.log(log_likelihood.shape[1])
 
@@ -47,6 +51,8 @@ class LikelihoodRatio:
     moves alone. That density is flat if the initial one is and the moves are symmetric.
     """
 
-    def __call__(self, log_weights: Tensor, log_likelihood: Tensor, inherited: Tensor) -> Tensor:
+    def __call__(
+        self, log_weights: Tensor, log_likelihood: Tensor, ancestor_log_likelihood: Tensor
+    ) -> Tensor:
         """Return (B, N)."""
-        return log_weights + log_likelihood - inherited
+        return log_weights + log_likelihood - ancestor_log_likelihood

@@ -33,7 +33,7 @@ def view_slopes(side: int, device: torch.device | None = None) -> Tensor:
 
 
 def crop_views(
-    rgb: Tensor, depth: Tensor, K: Tensor, centers: Tensor, reach: float, side: int
+    rgb: Tensor, depth: Tensor, K: Tensor, centers: Tensor, crop_radius: float, side: int
 ) -> Tensor:
     """Crop images about points, scaled so that a ball of one size about each fills the crop.
 
@@ -44,7 +44,7 @@ def crop_views(
         depth: (B, 1, H, W) z-depth [m], 0 where unknown.
         K: (B, 3, 3) camera matrices [px].
         centers: (B, N, 3) points in the camera [m].
-        reach: Radius of the ball [m].
+        crop_radius: Radius of the ball [m].
         side: Of a crop [px].
 
     Returns:
@@ -54,7 +54,7 @@ def crop_views(
     """
     N = centers.shape[1]
     far = centers.norm(dim=-1).clamp_min(_NEAREST)[..., None]  # (B, N, 1)
-    slope = view_slopes(side, rgb.device) * (reach / far)[..., None]  # (B, N, P, 2)
+    slope = view_slopes(side, rgb.device) * (crop_radius / far)[..., None]  # (B, N, P, 2)
     ray = torch.cat([slope, torch.ones_like(slope[..., :1])], dim=-1)
     ray = (ray @ look_at(centers).mT).flatten(1, 2)  # in the camera
     pixels = project(ray, K)
@@ -64,8 +64,8 @@ def crop_views(
     color = (sample(rgb, pixels, padding="border") * 2 - 1).unflatten(1, (N, -1))
     there = ahead.unflatten(1, (N, -1)) & (centers[..., 2:] > 0)[:, :, None]
     seen = gather_pixels(torch.ones_like(depth), index).unflatten(1, (N, -1)) * there
-    along = (z[..., 0] - far) / reach
-    aside = slope.square().sum(-1) * z[..., 0].square() / reach**2
+    along = (z[..., 0] - far) / crop_radius
+    aside = slope.square().sum(-1) * z[..., 0].square() / crop_radius**2
     known = (z[..., 0] > 0) & (along.square() + aside <= 1) & (seen[..., 0] > 0)
     shown = known | (z[..., 0] == 0) & (seen[..., 0] > 0)
     whole = torch.cat(

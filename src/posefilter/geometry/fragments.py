@@ -51,7 +51,7 @@ def within_bounds(points: Tensor) -> Tensor:
 
 
 def init_fragments(
-    centers: Tensor, reach: Tensor, points: Tensor, center: Tensor, radius: float
+    centers: Tensor, mean_radius: Tensor, points: Tensor, center: Tensor, radius: float
 ) -> None:
     """Fill the buffers of fragments from a surface, unless they are filled already.
 
@@ -59,7 +59,7 @@ def init_fragments(
 
     Args:
         centers: Buffer (K, 3) for the fragments' centers, from the object's center, in radii.
-        reach: Buffer () for the fragments' mean radius, in radii of the object.
+        mean_radius: Buffer () for the fragments' mean radius, in radii of the object.
         points: (P, 3) surface points [m].
         center: (3,) the object's center [m].
         radius: The object's radius [m].
@@ -68,11 +68,11 @@ def init_fragments(
         return
     middles, mean = sample_farthest_points((points - center) / radius, len(centers))
     centers.copy_(middles)
-    reach.fill_(mean)
+    mean_radius.fill_(mean)
 
 
 def fragment_errors(
-    log_prob: Tensor, position: Tensor, centers: Tensor, reach: Tensor | float, truth: Tensor
+    log_prob: Tensor, position: Tensor, centers: Tensor, mean_radius: Tensor | float, truth: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the cross-entropy of the true fragments, and the L1 error of the positions in them.
 
@@ -80,7 +80,7 @@ def fragment_errors(
         log_prob: (B, *, K) log-probabilities of the fragments.
         position: (B, *, K, 3) predicted position in each fragment.
         centers: (B, K, 3) the fragments' centers.
-        reach: The fragments' mean radius, the unit of the L1 error.
+        mean_radius: The fragments' mean radius, the unit of the L1 error.
         truth: (B, *, 3) true positions; all are from the object's center, in radii.
 
     Returns:
@@ -88,4 +88,4 @@ def fragment_errors(
     """
     fragment = nearest_fragment(truth, centers)
     nll = -log_prob.gather(-1, fragment[..., None])[..., 0]
-    return nll, (gather_fragment(position, fragment) - truth).abs().sum(-1) / reach
+    return nll, (gather_fragment(position, fragment) - truth).abs().sum(-1) / mean_radius

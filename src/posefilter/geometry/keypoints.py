@@ -45,13 +45,13 @@ def project_keypoints(poses: Tensor, keypoints: Tensor, K: Tensor) -> tuple[Tens
 
 
 def draw_gaussians(
-    pixels: Tensor, there: Tensor, height: int, width: int, stride: int, sigma: float
+    pixels: Tensor, present: Tensor, height: int, width: int, stride: int, sigma: float
 ) -> Tensor:
     """Draw a map of each keypoint: a Gaussian of height 1 about it.
 
     Args:
         pixels: (B, k, 2) [px].
-        there: (B, k) bool; the maps of others are 0.
+        present: (B, k) bool; the maps of others are 0.
         height: Of the maps, in cells.
         width: Of the maps, in cells.
         stride: Pixels of a cell.
@@ -62,7 +62,7 @@ def draw_gaussians(
     """
     grid = pixel_grid(height * stride, width * stride, stride, device=pixels.device)
     far = (grid - pixels[:, :, None, None]).square().sum(-1) / (stride * sigma) ** 2
-    return torch.exp(-0.5 * far) * there[..., None, None]
+    return torch.exp(-0.5 * far) * present[..., None, None]
 
 
 def find_peaks(maps: Tensor, count: int, stride: int) -> tuple[Tensor, Tensor]:

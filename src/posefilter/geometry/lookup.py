@@ -101,12 +101,12 @@ def _any_within(values: Tensor, side: int) -> Tensor:
     return sums[..., side:] > sums[..., :-side]
 
 
-def mask_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
+def mask_pixels(mask: Tensor, max_pixels: int | None = None) -> tuple[Tensor, Tensor]:
     """List each mask's pixels in raster order, padded to the longest list.
 
     Args:
         mask: (B, 1, H, W) bool.
-        most: Maximum number; larger masks are subsampled evenly.
+        max_pixels: Maximum number; larger masks are subsampled evenly.
 
     Returns:
         Pixels (B, M, 2) [px] as (u, v), and which are not padding (B, M) bool.
@@ -114,8 +114,10 @@ def mask_pixels(mask: Tensor, most: int | None = None) -> tuple[Tensor, Tensor]:
     found = []
     for one in mask[:, 0]:
         pixels = one.nonzero().flip(-1).float()
-        if most is not None and len(pixels) > most:
-            pixels = pixels[torch.linspace(0, len(pixels) - 1, most, device=pixels.device).long()]
+        if max_pixels is not None and len(pixels) > max_pixels:
+            pixels = pixels[
+                torch.linspace(0, len(pixels) - 1, max_pixels, device=pixels.device).long()
+            ]
         found.append(pixels)
     longest = max(1, *(len(f) for f in found))
     positions = torch.stack([F.pad(f, (0, 0, 0, longest - len(f))) for f in found])

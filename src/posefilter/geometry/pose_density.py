@@ -64,7 +64,7 @@ def fit_density(
     radius: float,
     diameter: float,
     symmetries: Tensor | None = None,
-    most: int = 2000,
+    max_kernels: int = 2000,
     member: Tensor | None = None,
 ) -> PoseDensity:
     """Fit a kernel density to weighted poses.
@@ -77,8 +77,8 @@ def fit_density(
         diameter: Of the object [m].
         symmetries: (S, 4, 4) object_from_object, a group: a pose and what a symmetry makes of it
             are one, and share the density equally.  None: the identity alone.
-        most: Number of kernels.  Of more poses the heaviest have kernels of their own, and an even
-            selection of the others stands for these.
+        max_kernels: Number of kernels.  Of more poses the heaviest have kernels of their own, and
+            an even selection of the others stands for these.
         member: (N,) int64, the mode of each pose.  A kernel's covariance may then be that of its
             mode, too, however few poses the mode has, if the likelihood says so.
 
@@ -88,7 +88,7 @@ def fit_density(
     poses, log_weights, center = poses.double(), log_weights.double(), center.to(poses).double()
     group = torch.eye(4)[None] if symmetries is None else symmetries
     group = group.to(poses)
-    chosen, log_weights = _thin(log_weights, most)
+    chosen, log_weights = _thin(log_weights, max_kernels)
     poses = poses[chosen]
     canonical = _gather_copies(poses, log_weights, center, radius, group)
     parts = split_poses(canonical, center)
@@ -204,14 +204,16 @@ def _measure(density: PoseDensity, twist: Tensor) -> tuple[Tensor, Tensor]:
     return square, 2 * half.log() - _LOG_UNITS
 
 
-def _thin(log_weights: Tensor, most: int) -> tuple[Tensor, Tensor]:
+def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:
     """Return which poses have kernels, and the log weights of these, which sum to 1."""
     count = len(log_weights)
-    if count <= most:
+    if count <= max_kernels:
         return torch.arange(count, device=log_weights.device), log_weights
     order = log_weights.argsort(descending=True, stable=True)
-    heavy, rest = order[: most // 2], order[most // 2 :]
-    few = rest[torch.linspace(0, len(rest) - 1, most // 2, device=rest.device).round().long()]
+    heavy, rest = order[: max_kernels // 2], order[max_kernels // 2 :]
+    few = rest[
+        torch.linspace(0, len(rest) - 1, max_kernels // 2, device=rest.device).round().long()
+    ]
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)

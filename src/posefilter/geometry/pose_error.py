@@ -7,11 +7,11 @@ from posefilter.geometry.lookup import argmin
 from posefilter.geometry.pose import rotation_of, transform, translation_of
 
 
-def subsample(points: Tensor, most: int) -> Tensor:
-    """Return an even selection of at most `most` points.  (P, 3) -> (<= most, 3)."""
-    if len(points) <= most:
+def subsample(points: Tensor, max_points: int) -> Tensor:
+    """Return an even selection of at most `max_points` points.  (P, 3) -> (<= most, 3)."""
+    if len(points) <= max_points:
         return points
-    return points[torch.linspace(0, len(points) - 1, most, device=points.device).long()]
+    return points[torch.linspace(0, len(points) - 1, max_points, device=points.device).long()]
 
 
 def add_distance(poses: Tensor, truth: Tensor, points: Tensor) -> Tensor:

@@ -6,12 +6,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-def keep_pixels(masks: Sequence[Tensor], least: float) -> list[Tensor | None]:
+def keep_pixels(masks: Sequence[Tensor], min_fraction: float) -> list[Tensor | None]:
     """Let each of several objects keep the pixels that none before it has taken.
 
     Args:
         masks: (H, W) bool each, the most probable object first.
-        least: Share of its pixels that an object must keep, or it keeps none.
+        min_fraction: Share of its pixels that an object must keep, or it keeps none.
 
     Returns:
         The pixels that each keeps, no two the same; None for an object that is on the pixels of
@@ -22,7 +22,7 @@ def keep_pixels(masks: Sequence[Tensor], least: float) -> list[Tensor | None]:
     for mask in masks:
         own = mask if taken is None else mask & ~taken
         total = int(mask.sum())
-        if total == 0 or int(own.sum()) < least * total:
+        if total == 0 or int(own.sum()) < min_fraction * total:
             out.append(None)
             continue
         taken = own if taken is None else taken | own

@@ -130,7 +130,7 @@ class SurfacePointLoss:
         N).
         """
         nll, error = fragment_errors(
-            fragments.log_prob, fragments.position, fragments.centers, fragments.reach, true
+            fragments.log_prob, fragments.position, fragments.centers, fragments.mean_radius, true
         )
         return self.fragment_weight * (nll + self.offset_weight * error)
 

@@ -189,7 +189,7 @@ def hull_vertices(vertices: np.ndarray) -> np.ndarray:
 
 
 def outline_hull(
-    vertices: np.ndarray, most: int = _HULL_VERTICES, error: float = _HULL_ERROR
+    vertices: np.ndarray, max_vertices: int = _HULL_VERTICES, error: float = _HULL_ERROR
 ) -> np.ndarray:
     """Select few hull vertices that have nearly the same outline.
 
@@ -200,11 +200,11 @@ def outline_hull(
 
     Args:
         vertices: (V, 3) [m].
-        most: Largest number of vertices.
+        max_vertices: Largest number of vertices.
         error: Stop where no direction is further below than this [m].
 
     Returns:
-        (<= most, 3) [m].
+        (<= max_vertices, 3) [m].
     """
     full = hull_vertices(vertices)
     directions = sphere_directions(_HULL_DIRECTIONS)
@@ -214,7 +214,7 @@ def outline_hull(
         dict.fromkeys(np.concatenate([full.argmax(axis=0), full.argmin(axis=0)]).tolist())
     )
     have = reach[chosen].max(axis=0)
-    while len(chosen) < most:
+    while len(chosen) < max_vertices:
         worst = int(np.argmax(target - have))
         if target[worst] - have[worst] < error:
             break

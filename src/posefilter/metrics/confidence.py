@@ -12,7 +12,7 @@ COVERAGE = 0.8  # share of the images that are kept where an error rate is given
 _BINS = 10
 
 
-def calibration_error(probability: Tensor, right: Tensor, bins: int = _BINS) -> Tensor:
+def calibration_error(probability: Tensor, correct: Tensor, bins: int = _BINS) -> Tensor:
     """Return the expected calibration error (Naeini et al. 2015).
 
     The mean over bins of equal width, weighted by their number of predictions, of |mean probability
@@ -25,12 +25,12 @@ def calibration_error(probability: Tensor, right: Tensor, bins: int = _BINS) -> 
         return torch.tensor(torch.nan)
     bin = (probability * bins).long().clamp(0, bins - 1)
     gap = torch.zeros(bins, dtype=torch.float64).index_add(
-        0, bin, probability.double() - right.double()
+        0, bin, probability.double() - correct.double()
     )
     return gap.abs().sum() / len(probability)
 
 
-def list_bins(probability: Tensor, right: Tensor, bins: int = _BINS) -> list[dict[str, float]]:
+def list_bins(probability: Tensor, correct: Tensor, bins: int = _BINS) -> list[dict[str, float]]:
     """Return the reliability diagram: of each bin that is not empty its ends, its number of frames,
     mean probability and share that is right.
 
@@ -40,18 +40,18 @@ def list_bins(probability: Tensor, right: Tensor, bins: int = _BINS) -> list[dic
     out = []
     for k in bin.unique().tolist():
         own = bin == k
-        said, share = float(probability[own].mean()), float(right[own].double().mean())
+        said, share = float(probability[own].mean()), float(correct[own].double().mean())
         ends = {"from": k / bins, "to": (k + 1) / bins, "frames": int(own.sum())}
         out.append({**ends, "probability": said, "right": share})
     return out
 
 
-def error_at_coverage(probability: Tensor, right: Tensor, coverage: float = COVERAGE) -> Tensor:
+def error_at_coverage(probability: Tensor, correct: Tensor, coverage: float = COVERAGE) -> Tensor:
     """Return the share that is wrong among the predictions of highest probability.
 
     Args:
         probability: (M,).
-        right: (M,) bool.
+        correct: (M,) bool.
         coverage: Share of the predictions that are kept; the rest is refused.
 
     Returns:
@@ -64,7 +64,7 @@ def error_at_coverage(probability: Tensor, right: Tensor, coverage: float = COVE
     least = probability.double().sort(descending=True).values[kept - 1]
     above, equal = probability > least, probability == least
     share = (kept - above.sum()) / equal.sum()
-    wrong = (~right).double()
+    wrong = (~correct).double()
     return (wrong[above].sum() + share * wrong[equal].sum()) / kept
 
 
@@ -80,18 +80,23 @@ class Confidence(Rows):
     """
 
     def update(
-        self, presence: Tensor, probability: Tensor, there: Tensor, right: Tensor, verdict: Tensor
+        self,
+        presence: Tensor,
+        probability: Tensor,
+        present: Tensor,
+        correct: Tensor,
+        verdict: Tensor,
     ) -> None:
         """Accumulate estimates.
 
         Args:
             presence: (B,) probabilities.
             probability: (B,) likewise.
-            there: (B,) bool, the object is in the image.
-            right: (B,) bool, and the pose within 0.1 diameters.
+            present: (B,) bool, the object is in the image.
+            correct: (B,) bool, and the pose within 0.1 diameters.
             verdict: (B,) 1 where it is found, -1 where absent, 0 where unsure.
         """
-        columns = (presence, probability, there, right, verdict)
+        columns = (presence, probability, present, correct, verdict)
         self.rows.append(torch.stack([x.double().cpu() for x in columns], dim=1))
 
     def compute(self) -> dict[str, Any]:

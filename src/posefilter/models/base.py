@@ -263,7 +263,7 @@ class PoseEstimator(Module):
     def training_step(self, batch: Batch, batch_number: int) -> Tensor:
         """Return the sum of the losses' means, the loss that is minimized.
 
-        It is logged as `train/loss`, its terms as `train/loss_<name>`: `train/loss_chosen` is that
+        It is logged as `train/loss`, its terms as `train/loss_<name>`: `train/loss_main` is that
         of the group `loss`.
 
         Raises:
@@ -277,7 +277,7 @@ class PoseEstimator(Module):
                 f"the loss is no longer finite: { ({k: v.item() for k, v in means.items()}) }"
             )
         for name, value in means.items():
-            self.log_scalar(f"loss_{'chosen' if name == 'loss' else name}", value.detach())
+            self.log_scalar(f"loss_{'main' if name == 'loss' else name}", value.detach())
         if self._trainer is not None:
             self.log("train/loss", total.detach(), prog_bar=True)
             self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"])
@@ -381,7 +381,7 @@ class PoseEstimator(Module):
             self.scores["belief"].update(trace.belief, batch.camera_from_object)
             seen = score_truth(trace.belief, batch.camera_from_object, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
-            self.judge_confidence(trace, batch, there=True)
+            self.judge_confidence(trace, batch, present=True)
         if "parts" in self.scores:
             self.scores["parts"].update(trace.belief.best, batch)
 
@@ -394,17 +394,17 @@ class PoseEstimator(Module):
         presence, probability = self.scores["confidence"].rows[-1][:, :2].T
         return Assessment(presence, probability)
 
-    def judge_confidence(self, trace: Trace, batch: Batch, there: bool) -> None:
+    def judge_confidence(self, trace: Trace, batch: Batch, present: bool) -> None:
         """Add a batch's probabilities, where the method is calibrated, and apparent sizes, where it
         can tell them, to the metrics.
 
         Args:
             trace: A finished run of the filter.
             batch: Its images.
-            there: Whether the object is in them; if not, the batch's poses are not used.
+            present: Whether the object is in them; if not, the batch's poses are not used.
         """
         size = self.measure_apparent_size(trace, batch)
-        if there and "apparent_size" in self.scores:
+        if present and "apparent_size" in self.scores:
             unknown = torch.full((len(batch.rgb),), torch.nan)
             known = (unknown, unknown) if size is None else (size.scale, size.contradicts())
             self.scores["apparent_size"].update(*known)
@@ -412,7 +412,7 @@ class PoseEstimator(Module):
         if found is None:
             return
         right = torch.zeros(len(batch.rgb), dtype=torch.bool)
-        if there:
+        if present:
             truth = batch.camera_from_object
             errors = measure_pose_errors(trace.belief.best, truth, self.object_model)
             right = self.pose_tolerance.accepts(errors)
@@ -426,7 +426,7 @@ class PoseEstimator(Module):
         blank = torch.tensor([bool(find_blank(*pair)) for pair in pairs])
         verdict = torch.where(blank.to(verdict.device), 0, verdict)  # as of a result
         self.scores["confidence"].update(
-            found.presence, found.probability, torch.full_like(right, there), right, verdict
+            found.presence, found.probability, torch.full_like(right, present), right, verdict
         )
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:

@@ -32,7 +32,7 @@ class DenseEncoding(NamedTuple):
 
     coordinates: Coordinates
     cells: Cells
-    reach: Tensor  # () the fragments' mean radius, in radii of the object
+    mean_radius: Tensor  # () the fragments' mean radius, in radii of the object
     source: Tensor  # (B, n, 3) predicted object points of the likeliest cells [m]
     target: Tensor  # (B, n, 3) their measured camera points [m]
     weights: Tensor  # (B, n) their probability of the object, 0 where no depth is known

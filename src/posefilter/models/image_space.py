@@ -18,8 +18,8 @@ from posefilter.geometry.lookup import gather_pixels, nearest_pixel
 from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
-from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, factors_at
-from posefilter.nets.context import ContextMap
+from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, loss_weights_at
+from posefilter.nets.encoders import ContextMap
 from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import fill_depth
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
@@ -244,8 +244,8 @@ class ImageSpace(PoseEstimator):
             losses["objectness"] = self.objectness_weight * objectness_loss(
                 encoding.context, batch.mask
             )
-        factors = factors_at(self.loss_schedule, self.progress())
-        return {name: factors.get(name, 1.0) * value for name, value in losses.items()}
+        weights = loss_weights_at(self.loss_schedule, self.progress())
+        return {name: weights.get(name, 1.0) * value for name, value in losses.items()}
 
     def progress(self) -> float:
         """Return the fraction of the training's steps done; 0 without a trainer or a schedule."""

@@ -1,4 +1,4 @@
-"""Auxiliary losses, and factors on all losses that change as training proceeds."""
+"""Auxiliary losses, and weights of all losses that change as training proceeds."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -16,10 +16,10 @@ class Auxiliary(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A part of training with its own factors on the losses."""
+    """A part of training with its own weights of the losses."""
 
     until: float  # fraction of the training's steps at which it ends
-    factors: Mapping[str, float] = MappingProxyType({})  # by name of the loss; others have 1
+    loss_weights: Mapping[str, float] = MappingProxyType({})  # by name; others have 1
 
 
 def check_loss_schedule(loss_schedule: Sequence[Stage], names: Sequence[str]) -> None:
@@ -36,18 +36,18 @@ def check_loss_schedule(loss_schedule: Sequence[Stage], names: Sequence[str]) ->
     if loss_schedule and (sorted(set(ends)) != ends or ends[-1] != 1):
         raise UserError(f"model.loss_schedule ends at {ends}: the ends must rise, the last be 1")
     for stage in loss_schedule:
-        for name in stage.factors:
+        for name in stage.loss_weights:
             if name not in names:
                 raise UserError(
                     f"model.loss_schedule names the loss {name!r}: there are {', '.join(names)}"
                 )
 
 
-def factors_at(loss_schedule: Sequence[Stage], progress: float) -> Mapping[str, float]:
-    """Return the factors at a fraction `progress` of the training, in [0, 1]; none without
+def loss_weights_at(loss_schedule: Sequence[Stage], progress: float) -> Mapping[str, float]:
+    """Return the weights at a fraction `progress` of the training, in [0, 1]; none without
     stages.
     """
     for stage in loss_schedule:
         if progress < stage.until:
-            return stage.factors
-    return loss_schedule[-1].factors if loss_schedule else {}
+            return stage.loss_weights
+    return loss_schedule[-1].loss_weights if loss_schedule else {}

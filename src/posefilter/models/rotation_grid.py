@@ -58,7 +58,8 @@ class RotationGrid(PoseParticles):
     Args:
         net: Encodes crops and renders.
         cells: Rotations of the grid.
-        reach: Radius of the ball about a particle that its crop shows, in radii of the object.
+        crop_radius: Radius of the ball about a particle that its crop shows, in radii of the
+            object.
         distance: Of the renders, in radii of the object.
         crops: Crops of an image in training, a third of them about the object.
         train_cells: Rotations that a batch is scored against in training.
@@ -75,7 +76,7 @@ class RotationGrid(PoseParticles):
         self,
         net: CropEncoder,
         cells: int = 4000,
-        reach: float = 1.0,
+        crop_radius: float = 1.0,
         distance: float = 7.0,
         crops: int = 24,
         train_cells: int = 128,
@@ -89,7 +90,7 @@ class RotationGrid(PoseParticles):
                 f"{_NEIGHBORS} that a score between cells is made of"
             )
         self.net = net
-        self.reach, self.distance = reach, distance
+        self.crop_radius, self.distance = crop_radius, distance
         self.crops, self.train_cells, self.near_cells = crops, train_cells, near_cells
         self.views: Tensor | None = None  # (cells, 5, side, side) float16; only training has them
         self.register_buffer("codes", torch.zeros(cells, net.width))
@@ -116,7 +117,7 @@ class RotationGrid(PoseParticles):
         from posefilter.rendering.views import render_views  # Embree: prediction renders nothing
 
         radius, center = self.object_model.radius, self.object_model.center
-        reach, distance = self.reach * radius, self.distance * radius
+        reach, distance = self.crop_radius * radius, self.distance * radius
         self.views = render_views(mesh, self.grid, center, reach, distance, self.net.side)
 
     def train(self, mode: bool = True) -> "RotationGrid":
@@ -157,7 +158,9 @@ class RotationGrid(PoseParticles):
 
     def crop(self, encoding: CropEncoding, centers: Tensor) -> Tensor:
         """Return the crops about points.  (B, N, 3) [m] -> (B, N, 5, side, side)."""
-        return crop_views(*encoding, centers, self.reach * self.object_model.radius, self.net.side)
+        return crop_views(
+            *encoding, centers, self.crop_radius * self.object_model.radius, self.net.side
+        )
 
     def measure(
         self, encoding: CropEncoding, particles: Particles, step: Step, generator: Generator

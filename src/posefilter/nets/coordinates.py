@@ -96,7 +96,7 @@ def coordinate_loss(
     camera_from_object: Tensor,
     center: Tensor,
     radius: float,
-    reach: float,
+    mean_radius: float,
 ) -> tuple[Tensor, Tensor]:
     """Return the loss of the coordinate network.
 
@@ -111,7 +111,7 @@ def coordinate_loss(
         camera_from_object: (B, 4, 4) [m].
         center: (3,) the object's center [m].
         radius: The object's radius [m].
-        reach: The fragments' mean radius, in radii of the object.
+        mean_radius: The fragments' mean radius, in radii of the object.
 
     Returns:
         The loss of each image (B,), and the mean error of the most probable points (B,) [m].
@@ -124,7 +124,7 @@ def coordinate_loss(
         (1, 2)
     )
     nll, error = fragment_errors(
-        coordinates.log_prob, coordinates.position, coordinates.centers, reach, truth
+        coordinates.log_prob, coordinates.position, coordinates.centers, mean_radius, truth
     )
     distance = (coordinates.coordinate - truth).norm(dim=-1).detach() * radius
     return 5 * bce + mean(nll + 0.3 * error), mean(distance)
@@ -144,7 +144,7 @@ class HasCoordinates(Protocol):
         ...
 
     @property
-    def reach(self) -> Tensor:
+    def mean_radius(self) -> Tensor:
         """() the fragments' mean radius, in radii of the object."""
         ...
 
@@ -157,7 +157,11 @@ class CoordinateLoss:
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the loss of each image, (B,); the trace's encoding is `HasCoordinates`."""
         encoding: HasCoordinates = trace.encoding
-        size = (object_model.center.to(batch.depth), object_model.radius, float(encoding.reach))
+        size = (
+            object_model.center.to(batch.depth),
+            object_model.radius,
+            float(encoding.mean_radius),
+        )
         pose = batch.camera_from_object
         return coordinate_loss(encoding.coordinates, encoding.cells, batch.mask, pose, *size)[0]
 

@@ -200,7 +200,7 @@ class SurfacePointFragments(_SurfacePointHead):
     requires: ClassVar[Capabilities] = ("surface_point_loss",)
 
     centers: Tensor  # (K, 3) the fragments' centers, from the object's center, in radii
-    reach: Tensor  # () their mean radius, in radii of the object
+    reach: Tensor  # () their mean radius, in radii of the object; by its name in checkpoints
 
     def __init__(self, fragments: int = 64) -> None:
         super().__init__()

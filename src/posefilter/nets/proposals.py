@@ -25,7 +25,7 @@ class ObjectCoordinateNet(UNet):
     provides: ClassVar[Capabilities] = ("object_coordinates", "propose_poses", "objectness")
 
     centers: Tensor  # (K, 3) the fragments' centers, from the object's center, in radii
-    reach: Tensor  # () their mean radius, in radii of the object
+    reach: Tensor  # () their mean radius, in radii of the object; by its name in checkpoints
 
     def __init__(
         self,

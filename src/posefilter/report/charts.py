@@ -223,9 +223,11 @@ def smooth(values: Sequence[float]) -> np.ndarray:
     return np.where(n > 0, (total[high] - total[low]) / np.maximum(n, 1), math.nan)
 
 
-def shorten(text: str, most: int = 22) -> str:
-    """Return a text of at most `most` characters: by default, a name that fits beside a chart."""
-    return text if len(text) <= most else text[: most - 1] + "…"
+def shorten(text: str, max_length: int = 22) -> str:
+    """Return a text of at most `max_length` characters: by default, a name that fits beside a
+    chart.
+    """
+    return text if len(text) <= max_length else text[: max_length - 1] + "…"
 
 
 def to_small_png(figure: Figure) -> bytes:

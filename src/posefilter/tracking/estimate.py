@@ -17,11 +17,11 @@ class ModeMean:
     log-likelihoods.
 
     Args:
-        reach: Distance within which particles belong to the mode [m].
+        max_distance: Distance within which particles belong to the mode [m].
     """
 
-    def __init__(self, reach: float) -> None:
-        self.reach = reach
+    def __init__(self, max_distance: float) -> None:
+        self.max_distance = max_distance
 
     def __call__(
         self,
@@ -36,7 +36,7 @@ class ModeMean:
         assert isinstance(space, PoseSpace)
         rows = torch.arange(len(poses), device=poses.device)
         top = poses[rows, particles.log_weights.argmax(1)]
-        near = space.distance(poses, top[:, None]) < self.reach
+        near = space.distance(poses, top[:, None]) < self.max_distance
         weights = torch.where(near, particles.log_weights, -torch.inf).softmax(1)
         score = (weights * output.log_likelihood).sum(1)
         return BeliefBatch(poses, particles.log_weights, space.mean(poses, weights), score)

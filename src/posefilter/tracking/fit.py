@@ -20,8 +20,9 @@ class QuadraticFit:
     The response-surface method of Box and Wilson (1951). Perturbations come in antithetic pairs:
     half the difference of a pair's scores is linear in the perturbation, and gives the slope; half
     their sum is even in it, and gives the curvature along each axis. Slope and curvature are
-    regressions over all pairs. A normal prior of `reach` standard deviations of the perturbations
-    holds what the likelihood leaves open: a constant likelihood leaves the estimate in place.
+    regressions over all pairs. A normal prior of `prior_std` standard deviations of the
+    perturbations holds what the likelihood leaves open: a constant likelihood leaves the estimate
+    in place.
 
     Args:
         iterations: Number of fits, each about the estimate of the one before.
@@ -29,7 +30,7 @@ class QuadraticFit:
         spread: Standard deviation of the perturbations [m on the object's surface].
         sigma: Noise level of the likelihood [m].
         pixels: Image points for each score, the same for all poses of a fit.
-        reach: Standard deviation of the prior, over that of the perturbations.
+        prior_std: Standard deviation of the prior, over that of the perturbations.
 
     References:
         Box, Wilson: On the experimental attainment of optimum conditions. Journal of the Royal
@@ -43,10 +44,10 @@ class QuadraticFit:
         spread: float = 0.006,
         sigma: float = 0.004,
         pixels: int = 256,
-        reach: float = 2.0,
+        prior_std: float = 2.0,
     ) -> None:
         self.iterations, self.pairs, self.spread, self.sigma = iterations, pairs, spread, sigma
-        self.pixels, self.reach = pixels, reach
+        self.pixels, self.prior_std = pixels, prior_std
 
     @torch.no_grad()
     def __call__(
@@ -61,7 +62,7 @@ class QuadraticFit:
             poses = space.move(best[:, None].expand(-1, 2 * self.pairs, -1, -1), moves)
             scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
             up, down = scores.chunk(2, dim=1)
-            best = space.move(best, find_maximum(noise, up, down, self.reach) * scale)
+            best = space.move(best, find_maximum(noise, up, down, self.prior_std) * scale)
         score = scorer.score_poses(encoding, best[:, None], self.sigma, generator, self.pixels)
         return belief._replace(best=best, score=score[:, 0])
 
@@ -96,14 +97,14 @@ def draw_orthogonal(like: Tensor, pairs: int, dimensions: int, generator: Genera
     return (turn * length).mT.flatten(1, 2)[:, :pairs]
 
 
-def find_maximum(noise: Tensor, up: Tensor, down: Tensor, reach: float) -> Tensor:
+def find_maximum(noise: Tensor, up: Tensor, down: Tensor, prior_std: float) -> Tensor:
     """Return where a quadratic with axes along the coordinates, fitted to scores, is highest.
 
     Args:
         noise: (B, P, D) perturbations, of unit scale.
         up: (B, P) scores at the perturbations.
         down: (B, P) scores at their opposites.
-        reach: Standard deviation of the prior about 0.
+        prior_std: Standard deviation of the prior about 0.
 
     Returns:
         The maximum (B, D) of fit and prior, within `_LONGEST` along each axis.
@@ -111,7 +112,7 @@ def find_maximum(noise: Tensor, up: Tensor, down: Tensor, reach: float) -> Tenso
     slope = regress(noise, (up - down) / 2)
     ones = torch.ones_like(noise[..., :1])
     curvature = regress(torch.cat([ones, noise.square() / 2], dim=-1), (up + down) / 2)[:, 1:]
-    step = slope / ((-curvature).clamp_min(0) + 1 / reach**2)
+    step = slope / ((-curvature).clamp_min(0) + 1 / prior_std**2)
     return step.clamp(-_LONGEST, _LONGEST)
 
 

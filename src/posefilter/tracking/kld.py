@@ -56,7 +56,7 @@ def bin_poses(poses: Tensor, about: Tensor, space: PoseSpace, width: float) -> T
     return (twist / width).round().long()
 
 
-def count_needed(cells: Tensor, epsilon: float, quantile: float, least: int) -> int:
+def count_needed(cells: Tensor, epsilon: float, quantile: float, min_draws: int) -> int:
     """Return after how many draws there are enough: the loop of KLD sampling.
 
     Draws are taken one after the other; each may occupy a new cell, which raises the number that is
@@ -66,17 +66,17 @@ def count_needed(cells: Tensor, epsilon: float, quantile: float, least: int) -> 
         cells: (N, D) int64, the cell of each draw, in their order.
         epsilon: Bound of the divergence [nat].
         quantile: Probability that it holds.
-        least: Number of draws below which there are never enough.
+        min_draws: Number of draws below which there are never enough.
 
     Returns:
-        The number of draws, from `least` to N; N where more would be needed.
+        The number of draws, from `min_draws` to N; N where more would be needed.
     """
     seen, count = set[tuple[int, ...]](), 0
-    needed = least
+    needed = min_draws
     for count, own in enumerate(map(tuple, cells.tolist()), start=1):
         if own not in seen:
             seen.add(own)
-            needed = max(least, kld_size(len(seen), epsilon, quantile))
+            needed = max(min_draws, kld_size(len(seen), epsilon, quantile))
         if count >= needed:
             break
     return count

@@ -6,9 +6,9 @@ from posefilter.errors import UserError
 from posefilter.tracking.motion import ConstantVelocity
 
 
-def check_whole(settings: object, **least: int) -> None:
+def check_whole(settings: object, **minimums: int) -> None:
     """Raise UserError where a setting is no whole number, or below its least value."""
-    for name, bound in least.items():
+    for name, bound in minimums.items():
         value = getattr(settings, name)
         if not isinstance(value, int) or isinstance(value, bool) or value < bound:
             raise UserError(f"tracker: {name}={value} must be a whole number, {bound} or more")

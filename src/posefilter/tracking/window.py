@@ -32,7 +32,7 @@ def place_window(
     size: tuple[int, int],
     scale: float,
     side: int,
-    reach: float,
+    window_scale: float,
 ) -> Window | None:
     """Return the window about an object.
 
@@ -43,7 +43,7 @@ def place_window(
         size: Height and width of the photograph [px].
         scale: Seen pixels for one of the photograph's, at most; that of training.
         side: Seen pixels of the window's side, at most.
-        reach: Half the window's side, in projected radii of the object.
+        window_scale: Half the window's side, in projected radii of the object.
 
     Returns:
         The window, cut at the photograph's edges; None where it would hold the whole photograph or
@@ -52,7 +52,7 @@ def place_window(
     x, y, z = (pose[:3, :3] @ object_model.center.double().numpy() + pose[:3, 3]).tolist()
     if z <= object_model.radius / 2:
         return None
-    half = reach * object_model.radius * float(K[0, 0]) / z
+    half = window_scale * object_model.radius * float(K[0, 0]) / z
     scale = min(scale, side / (2 * half))
     # a whole number of the network's cells, so that no pixel is padding
     cells = min(-(-round(2 * half * scale) // _CELL), side // _CELL)

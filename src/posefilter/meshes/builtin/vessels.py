@@ -48,15 +48,15 @@ def _vessel(outside: Profile, wall: float, floor: float, segments: int) -> Soup:
 
 
 def _handle(
-    attach: tuple[float, float], reach: float, z: tuple[float, float], radius: float
+    attach: tuple[float, float], extent: float, z: tuple[float, float], radius: float
 ) -> Soup:
-    """Make a handle in the plane y = 0: from x attach[1] at z[1] out to `reach` and back to
+    """Make a handle in the plane y = 0: from x attach[1] at z[1] out to `extent` and back to
     attach[0] at z[0] [m].
     """
     t = np.linspace(0, np.pi, 13)
     middle, half = (z[0] + z[1]) / 2, (z[1] - z[0]) / 2
     bow = np.sin(t) ** 0.6
-    x = np.linspace(attach[1], attach[0], 13) * (1 - bow) + (reach - radius) * bow
+    x = np.linspace(attach[1], attach[0], 13) * (1 - bow) + (extent - radius) * bow
     path = np.stack([x, np.zeros_like(t), middle + half * np.cos(t)], -1)
     u0, v0, u1, v1 = SWATCH
     band: Rect = (u0, v0 + 0.9 * (v1 - v0), u1, v1 - 0.02 * (v1 - v0))  # the rim's color

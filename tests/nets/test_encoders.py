@@ -9,7 +9,7 @@ from torch import nn
 
 from posefilter.errors import UserError
 from posefilter.geometry.camera import intrinsics
-from posefilter.nets.context import ConvEncoder, NoContext, Pyramid, ResNetContext
+from posefilter.nets.encoders import NoEncoder, PyramidEncoder, ResNetEncoder, UNetEncoder
 from posefilter.nets.resnet import ResNet
 
 K = intrinsics(150.0, 150.0, 79.5, 59.5)[None]
@@ -22,7 +22,7 @@ def scene(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_pyramid_sees_block_means_under_the_particle() -> None:
     rgb, depth = scene()
-    pyramid = Pyramid(levels=3)
+    pyramid = PyramidEncoder(levels=3)
     # the center of cell (4, 5) of the level of stride 8
     pixels = torch.tensor([[[8 * 5 + 3.5, 8 * 4 + 3.5]]])
     features = pyramid.sample_features(pyramid(rgb, depth, K), pixels)
@@ -37,12 +37,12 @@ def test_pyramid_sees_block_means_under_the_particle() -> None:
 
 def test_no_context_is_empty() -> None:
     rgb, depth = scene()
-    none = NoContext()
+    none = NoEncoder()
     assert none.sample_features(none(rgb, depth, K), torch.zeros(1, 7, 2)).shape == (1, 7, 0)
 
 
 @pytest.mark.parametrize(
-    "make", [ConvEncoder, lambda: ResNetContext(ResNet("resnet18"))], ids=["unet", "resnet18"]
+    "make", [UNetEncoder, lambda: ResNetEncoder(ResNet("resnet18"))], ids=["unet", "resnet18"]
 )
 def test_encoder_learns_where_the_red_square_is(make: Callable[[], nn.Module]) -> None:
     torch.manual_seed(0)
@@ -141,7 +141,7 @@ def test_wide_images_are_downsampled_and_sampled_at_the_same_positions(
     depth[:, :, 100, 201] = 0
     wide = intrinsics(300.0, 300.0, 159.5, 119.5)[None]
     torch.manual_seed(0)
-    encoder = ConvEncoder(max_width_px=192).eval()
+    encoder = UNetEncoder(max_width_px=192).eval()
     small_rgb = torch.nn.functional.avg_pool2d(rgb, 2)
     known = torch.nn.functional.avg_pool2d((depth > 0).float(), 2)
     small_depth = torch.nn.functional.avg_pool2d(depth, 2) / known.clamp_min(1e-6)
@@ -160,9 +160,9 @@ def test_wide_images_are_downsampled_and_sampled_at_the_same_positions(
 
 def test_images_that_are_not_too_wide_keep_their_size() -> None:
     torch.manual_seed(0)
-    bounded, free = ConvEncoder(max_width_px=160).eval(), ConvEncoder().eval()
+    bounded, free = UNetEncoder(max_width_px=160).eval(), UNetEncoder().eval()
     free.load_state_dict(bounded.state_dict())
     with torch.no_grad():
         assert torch.equal(bounded(*scene(), K).levels[0], free(*scene(), K).levels[0])
     with pytest.raises(UserError, match=r"model.encoder.max_width_px=16"):
-        ConvEncoder(max_width_px=16)
+        UNetEncoder(max_width_px=16)

@@ -29,7 +29,7 @@ class ContextMap(NamedTuple):
     objectness: Tensor | None
 
 
-class NoContext(nn.Module):
+class NoEncoder(nn.Module):
     """No context, as in the paper: a particle sees its own patch only."""
 
     width = 0
@@ -46,7 +46,7 @@ class NoContext(nn.Module):
         return pixels.detach()[..., :0]
 
 
-class Pyramid(nn.Module):
+class PyramidEncoder(nn.Module):
     """Color and depth at halving resolutions, a 3 x 3 patch of each; no learned weights.
 
     Args:
@@ -129,7 +129,7 @@ def downsample(rgb: Tensor, depth: Tensor, K: Tensor, factor: int) -> tuple[Tens
     return F.avg_pool2d(rgb, factor), z, resize_intrinsics(K, 1 / factor, 1 / factor)
 
 
-class ConvEncoder(_Encoder, UNet):
+class UNetEncoder(_Encoder, UNet):
     """A small U-Net trained from scratch: strides 4 to 32 and back to 4, about 1.5 million
     parameters.
 
@@ -178,7 +178,7 @@ class ConvEncoder(_Encoder, UNet):
         return self._map(y4, 4 * factor)
 
 
-class ResNetContext(_Encoder):
+class ResNetEncoder(_Encoder):
     """A ResNet trunk with a top-down path to stride 4 (feature pyramid network, Lin et al. 2017).
 
     Args:
