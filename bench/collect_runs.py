@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from posefilter.cli.ablations import ABLATIONS
+from posefilter.cli.renamed import rename
 from posefilter.metrics.registry import find_metric, read_number
 
 HOME = Path(__file__).parents[1]
@@ -79,10 +80,18 @@ def read_runs(folder: Path) -> list[Run]:
         run: Run = json.loads(path.read_text())
         if "signs" in run:  # the name of before
             run["diagnostics"] = run.pop("signs")
-        typed = [text.lstrip("+~") for text in run.get("overrides") or [] if "=" in text]
+        typed = [
+            name_today(text.lstrip("+~")) for text in run.get("overrides") or [] if "=" in text
+        ]
         run["choices"] = dict(text.split("=", 1) for text in typed)
         runs.append(run)
     return runs
+
+
+def name_today(override: str) -> str:
+    """Return an override by today's names, so that a run keeps the row of those before it."""
+    now = rename(override, "train")
+    return override if now is None or " " in now else now
 
 
 def describe(run: Run) -> tuple[str, str, str]:

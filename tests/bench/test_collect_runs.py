@@ -36,6 +36,12 @@ def test_what_decides_no_result_is_left_out(collect: ModuleType, tmp_path: Path)
     assert collect.describe(run) == wanted
 
 
+def test_names_of_before_are_those_of_today(collect: ModuleType, tmp_path: Path) -> None:
+    write_run(tmp_path / "a", 0.9, "model=pose_pf", "filter.first_particles=100")
+    (run,) = collect.read_runs(tmp_path)
+    assert collect.describe(run)[2] == "filter.initial_particles=100"
+
+
 def test_rows_follow_the_table_of_ablations_and_numbers_their_size(collect: ModuleType) -> None:
     def rows(*changes: str) -> list[dict[str, str]]:
         same = {"table": "t", "method": "m", "variant": "paper", "seed": "0"}

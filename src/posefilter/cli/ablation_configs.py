@@ -55,7 +55,8 @@ def _sweep(names: list[str], groups: dict[str, str], **settings: Any) -> dict[st
 
 @cache
 def register_ablations() -> None:
-    """Register the table with Hydra: `ablation=NAME`, `sweep=ablation` and `sweep=ablation_detect`.
+    """Register the table with Hydra: `ablation=NAME`, `sweep=ablation`, `sweep=ablation_detect` and
+    `sweep=ablation_pose`.
 
     All runs of `sweep=ablation` have the size of the working preset, so that a row differs from the
     next in its modification alone. All runs of `sweep=ablation_detect` have 32 particles, for time;
