@@ -160,7 +160,7 @@ def read_rows(file: Path) -> list[Row]:
 
 def judge_across(
     rows: Sequence[Row],
-    most: int | None = None,
+    max_frames: int | None = None,
     leave_out: Sequence[str] = (),
     tolerance: PoseTolerance = RIGHT,
     folds: int = 5,
@@ -170,7 +170,7 @@ def judge_across(
 
     Args:
         rows: Of `look`.
-        most: Frames with the object, and without, that a calibration takes; None: all.
+        max_frames: Frames with the object, and without, that a calibration takes; None: all.
         leave_out: Witnesses that it does without.
         tolerance: What a right pose is.
         folds: Parts of the scenes.
@@ -187,7 +187,8 @@ def judge_across(
         frames = gather_frames(own, leave_out)
         for k in range(folds):
             learned = rng.permutation(np.flatnonzero(part != k))
-            both = [learned[frames.present[learned] == there][:most] for there in (True, False)]
+            shown = frames.present[learned]
+            both = [learned[shown == there][:max_frames] for there in (True, False)]
             made = fit_calibration(frames.select(np.concatenate(both)), "fat")
             held = np.flatnonzero(part == k)
             values = torch.from_numpy(frames.values[held])
@@ -250,9 +251,9 @@ def tabulate_coverage(rows: Sequence[Row]) -> str:
     return draw_table(head, lines)
 
 
-def tell_presence(rows: Sequence[Row], least: float) -> str:
+def tell_presence(rows: Sequence[Row], min_shown: float) -> str:
     """Return the AUROC of the presence, of frames that show so much of the object."""
-    some = [row for row in rows if not row["there"] or row["shown"] >= least]
+    some = [row for row in rows if not row["there"] or row["shown"] >= min_shown]
     presence = torch.tensor([row["presence"] for row in some], dtype=torch.float64)
     return f"{float(auroc(presence, torch.tensor([row['there'] for row in some]))):.3f}"
 

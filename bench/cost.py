@@ -141,12 +141,12 @@ def show_milliseconds(seconds: float) -> str:
     return f"{float(f'{1000 * seconds:.3g}'):,g}"
 
 
-def choose_values(name: str, key: str, most: int) -> tuple[int, ...]:
+def choose_values(name: str, key: str, max_values: int) -> tuple[int, ...]:
     """Return the values of a setting that are measured of a method."""
     if key != "particles":
         return SWEEPS[key]
     # a particle of pose_pf is 64 points; one of the detectors a patch that is convolved
-    limit = min(most, 100_000 if name in ("patch_pf", "pixel_pf") else 10_000)
+    limit = min(max_values, 100_000 if name in ("patch_pf", "pixel_pf") else 10_000)
     return tuple(value for value in SWEEPS[key] if value <= limit)
 
 

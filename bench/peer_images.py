@@ -80,19 +80,21 @@ class Way(NamedTuple):
     estimate: Callable[[Case], tuple[np.ndarray, float, float]]  # pose, seconds, processor's
 
 
-def read_photographs(root: str, meshes: str, names: Sequence[str], most: int) -> list[Shown]:
-    """Return YCB-Video's photographs that show the objects, in order, `most` of each at most."""
+def read_photographs(root: str, meshes: str, names: Sequence[str], max_images: int) -> list[Shown]:
+    """Return YCB-Video's photographs that show the objects, in order, at most so many of each."""
     store = open_meshes(meshes, None, "ycb_video", list(names))
     reader = open_reader("ycb_video", root, list(names), store, subsets=["data"])
     every = range(len(reader.records()))
     return [
         (name, record.group, sample)
         for name in names
-        for record, sample in islice(_read(reader, every, name, 0.0), most)
+        for record, sample in islice(_read(reader, every, name, 0.0), max_images)
     ]
 
 
-def read_renders(root: str, meshes: str, names: Sequence[str], most: int, part: str) -> list[Shown]:
+def read_renders(
+    root: str, meshes: str, names: Sequence[str], max_images: int, part: str
+) -> list[Shown]:
     """Return held-out renders that show the objects, those of bench/held_out.py."""
     reader = open_reader("fat", root, None, open_meshes(meshes, None, "fat", list(names)))
     chosen = split_records(reader.records(), SPLIT, 0, Path(root))[part]
@@ -100,7 +102,7 @@ def read_renders(root: str, meshes: str, names: Sequence[str], most: int, part: 
     for name in names:
         own = [i for i in chosen if reader.records()[i].object == name]
         order = np.random.default_rng(0).permutation(own)
-        found = islice(_read(reader, map(int, order), name, LEAST), most)
+        found = islice(_read(reader, map(int, order), name, LEAST), max_images)
         out += [(name, record.name.rsplit("/", 1)[0], sample) for record, sample in found]
     return out
 
@@ -266,10 +268,12 @@ def make_lines(rows: Sequence[dict[str, Any]], title: str) -> list[str]:
     return [summarize(group, seconds) for group in kept.values() if group]
 
 
-def choose_few(cases: Sequence[Case], most: int) -> list[Case]:
+def choose_few(cases: Sequence[Case], max_cases: int) -> list[Case]:
     """Return the first cases of each object."""
     names = dict.fromkeys(case.object for case in cases)
-    return [case for name in names for case in [one for one in cases if one.object == name][:most]]
+    return [
+        case for name in names for case in [one for one in cases if one.object == name][:max_cases]
+    ]
 
 
 def choose(rows: Sequence[dict[str, Any]], method: str, masked: bool) -> Settings:

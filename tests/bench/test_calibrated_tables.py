@@ -118,5 +118,5 @@ def test_each_scene_is_judged_by_the_others(bench: ModuleType) -> None:
         [b["probability"] for _, b in pairs]
     )
     assert [a["held"] for a, _ in pairs] == [b["held"] for _, b in pairs]
-    few = bench.judge_across(rows, most=15)
+    few = bench.judge_across(rows, max_frames=15)
     assert all(one["held"][3] for one in few if one["there"])  # fewer than 19: every pose

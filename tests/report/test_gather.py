@@ -50,6 +50,10 @@ def test_numbers_of_earlier_runs_get_todays_names(run: Path) -> None:
     assert "belief/coverage_90" not in collect_numbers(record)
     assert record.curves["val/belief/distance_coverage_90"].values == (30.0, 35.0)
     assert "val/belief/coverage_90" not in record.curves
+    with SummaryWriter(str(run)) as log:
+        log.add_scalar("train/loss_chosen", 2.0, 49, walltime=1030.0)
+        log.add_scalar("train/loss_main", 1.0, 99, walltime=1060.0)
+    assert read_run(run).curves["train/loss_main"].values == (2.0, 1.0)
     file.unlink()
     assert collect_numbers(read_run(run))["belief/distance_coverage_90"] == 35.0
 

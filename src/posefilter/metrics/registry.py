@@ -395,7 +395,10 @@ _METRICS = (
     MetricInfo("not_finite", "training scalars that are no numbers", form=".0f", direction=LOWER),
 )
 METRICS = {info.key: info for info in _METRICS}
-_RENAMED = {  # keys of files that earlier versions wrote
+_RENAMED = {  # keys of files that earlier versions wrote, and tags that they logged
+    "train/loss_chosen": "train/loss_main",
+    "speed/waiting_share": "speed/waiting_fraction",
+    "speed/drawing_share": "speed/drawing_fraction",
     "belief/coverage_50": "belief/distance_coverage_50",
     "belief/coverage_90": "belief/distance_coverage_90",
 }

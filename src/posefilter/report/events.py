@@ -82,7 +82,7 @@ def rename_losses(curves: dict[str, Curve]) -> dict[str, Curve]:
         elif name == tag or name == "learning_rate" or name.endswith("_mm"):
             out[tag] = curve
         else:
-            out[f"train/loss_{'chosen' if name == 'loss' else name}"] = curve
+            out[f"train/loss_{'main' if name == 'loss' else name}"] = curve
     return out
 
 
