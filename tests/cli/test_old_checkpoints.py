@@ -136,6 +136,13 @@ def test_an_argument_with_both_names_keeps_both_for_the_refusal() -> None:
     assert str(refusal.value) == "filter.start: is now initial_sigma"
 
 
+@pytest.mark.parametrize("options", [5, "part", ["part"], None, {"part": 1, "split": 2}])
+def test_options_that_are_none_or_of_both_names_stay(options: object) -> None:
+    data = {"_target_": "posefilter.data.module.PoseDataModule", "options": options}
+    found = check_recipe({"choices": {}, "settings": {"data": data}}, "checkpoint=odd.ckpt")
+    assert found["settings"]["data"] == data
+
+
 def test_old_features_of_a_calibration_are_read_by_todays_names() -> None:
     checkpoint = torch.load(WEIGHTS, map_location="cpu", weights_only=True)
     plain = checkpoint["calibration"]

@@ -100,6 +100,9 @@ RENAMED = {
     "lesson.levels=4": "model.candidate_sampler.sigma_levels=4",
     "filter/resample=below_ess": "filter/resample=adaptive",
     "resample=below_ess,guided": "filter/resample=adaptive,auxiliary",
+    "filter/resample@model.train_filter.resample=never": (
+        "filter/resample@model.train_filter.resample=none"
+    ),
     "sweep=iterations": "sweep=steps",
     "tracker.walk=0.4": "tracker.noise_scale=0.4",
     "tracker.move_scale=0.4": "tracker.noise_scale=0.4",

@@ -315,6 +315,7 @@ ARGUMENTS = {
 # values of arguments of classes, likewise
 _VALUES = {("synthetic.generate.generate", "lookalike_texture"): _LOOKALIKE_TEXTURE}
 # options of the data module, which its readers take
+_DATA = "data.module.PoseDataModule"
 _OPTIONS = {"part": "split", "parts": "subsets"}
 _BUDGET = "the preset, with its size apart: preset/size="
 
@@ -334,7 +335,7 @@ def rename(override: str, command: str | None = None) -> str | None:
     while (newer := _rename_key(new)) != new:
         new = newer
     # its values are turned round, so that they are renamed together with their key alone
-    choices = {} if key == new == "model.detach_position" else _CHOICES.get(new, {})
+    choices = {} if key == new == "model.detach_position" else _choices_of(new)
     values = ",".join(choices.get(one, one) for one in value.split(","))
     if (new, values) == (key, value):
         return None
@@ -370,6 +371,11 @@ def _rename_key(key: str) -> str:
     return key if place is None else KEYS[place] + key.removeprefix(place)
 
 
+def _choices_of(group: str) -> Mapping[str, str]:
+    """Return the renamed choices of a group, wherever its settings go: `filter/resample@...`."""
+    return _CHOICES.get(group.partition("@")[0], {})
+
+
 def find_renamed(recipe: Mapping[str, Any]) -> tuple[str, str] | None:
     """Return the first group or setting of before in a checkpoint's recipe whose values have
     changed too, and today's name; None where there is none.
@@ -388,8 +394,7 @@ def upgrade(recipe: Mapping[str, Any]) -> dict[str, Any]:
         recipe: Its `choices` and `settings`, checked for depth and size.
     """
     choices = {
-        group: _CHOICES.get(group, {}).get(choice, choice)
-        for group, choice in recipe["choices"].items()
+        group: _choices_of(group).get(choice, choice) for group, choice in recipe["choices"].items()
     }
     return {"choices": choices, "settings": _upgrade(recipe["settings"])}
 
@@ -405,8 +410,9 @@ def _upgrade(node: Any) -> Any:
         name = rename_argument(target, str(key)) or key
         if name == "loss_weights" and isinstance(value, Mapping):  # in a stage of a training
             value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
-        if key == "options" and _below(target) == "data.module.PoseDataModule":
-            value = {_OPTIONS.get(n, n): v for n, v in value.items()} if value else value
+        if key == "options" and isinstance(value, Mapping) and _below(target) == _DATA:
+            both = {old for old, new in _OPTIONS.items() if new in value}  # refused by the reader
+            value = {n if n in both else _OPTIONS.get(n, n): v for n, v in value.items()}
         values = _VALUES.get((_below(target), name), {})
         if isinstance(value, str):
             value = values.get(value, value)
