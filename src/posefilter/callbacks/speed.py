@@ -24,16 +24,14 @@ class Speed(Callback):
         self._mark: float | None = None  # when the last batch ended
         self._began = 0.0  # the batch, or the validation
 
-    def on_train_batch_start(
-        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
-    ) -> None:
+    def on_train_batch_start(self, *_: Any) -> None:
         """Count the time since the last batch as waiting."""
         self._began = time.perf_counter()
         if self._mark is not None:
             self._waited += self._began - self._mark
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
         """Count the batch, and log from time to time."""
         self._mark = time.perf_counter()
@@ -62,13 +60,7 @@ class Speed(Callback):
         self._began, self._seen = time.perf_counter(), 0
 
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
         """Count images."""
         self._seen += len(batch[0])

@@ -32,13 +32,7 @@ class TraceCallback(Callback):
         """Take in one batch of a test, of this number."""
 
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
         """Hand the trace on."""
         if isinstance(outputs, Trace) and not trainer.sanity_checking:
@@ -51,7 +45,7 @@ class TraceCallback(Callback):
         outputs: Any,
         batch: Any,
         batch_idx: int,
-        dataloader_idx: int = 0,
+        *_: Any,
     ) -> None:
         """Hand the trace on."""
         if isinstance(outputs, Trace):

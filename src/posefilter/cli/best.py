@@ -93,16 +93,6 @@ class Last(Checkpoint):
         if self._due(trainer) and not loop.epoch_loop._should_check_val_fx(loop._data_fetcher):
             self._save(trainer)
 
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write it where it is time."""
-        self._save_amid_validation(trainer)
-
-    def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, *_: Any
-    ) -> None:
-        """Write it where it is time."""
-        self._save_amid_validation(trainer)
-
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write it."""
         if not trainer.sanity_checking:
@@ -120,13 +110,15 @@ class Last(Checkpoint):
             progress = checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]
             progress |= {"total": begun, "current": dict(_NONE_DONE), "is_last_batch": False}
 
-    def _save_amid_validation(self, trainer: Trainer) -> None:
+    def _save_amid_validation(self, trainer: Trainer, *_: Any, **__: Any) -> None:
         # a run that has all its steps would not go on with its validation
         ended = trainer.global_step == trainer.max_steps
         if self._due(trainer) and not trainer.sanity_checking and not ended:
             self._validation_due = True
             self._save(trainer)
             self._validation_due = False
+
+    on_validation_start = on_validation_batch_end = _save_amid_validation
 
     def _due(self, trainer: Trainer) -> bool:
         # the processes of one training write it together, but their clocks differ

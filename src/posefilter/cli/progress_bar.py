@@ -142,12 +142,6 @@ class Bars(Callback):
         if not trainer.sanity_checking:
             self._look("validation", sum(map(int, trainer.num_val_batches)))
 
-    def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, *_: Any
-    ) -> None:
-        """Move it."""
-        self._advance()
-
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Put a line in its place."""
         self._looked()
@@ -161,24 +155,10 @@ class Bars(Callback):
         """Open a bar for the test."""
         self._look("test", sum(map(int, trainer.num_test_batches)))
 
-    def on_test_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Move it."""
-        self._advance()
-
-    def on_exception(
-        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
-    ) -> None:
-        """Leave the terminal as it was."""
-        self._stop()
-
-    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Leave the terminal as it was."""
-        self._stop()
-
     def _look(self, what: str, batches: int) -> None:
         self._looking = self._shown().add_task(what, total=batches, said="")
 
-    def _advance(self) -> None:
+    def _advance(self, *_: Any, **__: Any) -> None:
         if self._looking is not None:
             self._shown().advance(self._looking)
 
@@ -201,7 +181,10 @@ class Bars(Callback):
             self._bars.start()
         return self._bars
 
-    def _stop(self) -> None:
+    def _stop(self, *_: Any, **__: Any) -> None:
         if self._bars is not None:
-            self._bars.stop()
+            self._bars.stop()  # which leaves the terminal as it was
         self._bars = self._training = self._looking = None
+
+    on_validation_batch_end = on_test_batch_end = _advance
+    on_exception = teardown = _stop

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from lightning import Callback, LightningModule, Trainer
+from lightning import Callback, Trainer
 
 from posefilter.errors import Stopped
 
@@ -25,52 +25,8 @@ class Stop(Callback):
         self.asked: int | None = None  # the signal that came
         self.agreed: int | None = None  # the one that all processes stop for
 
-    def on_sanity_check_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the signals over before the training, too."""
-        self._listen()
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the signals over from Lightning, whose own handlers save nothing.
-
-        Lightning puts back those that were there before, when the training ends.
-        """
-        self._listen()
-
-    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the signals over."""
-        self._listen()
-
-    def on_train_batch_start(self, *_: Any) -> None:
-        """Stop here."""
-        self._stop(self.agreed)
-
-    def on_validation_batch_start(self, *_: Any) -> None:
-        """Stop here."""
-        self._stop(self.agreed)
-
-    def on_test_batch_start(self, *_: Any) -> None:
-        """Stop here: a test has no checkpoint to write, and no other process waits for it."""
-        self._stop(self.asked)
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        """Agree on whether to stop."""
-        self._agree(trainer)
-
-    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Agree on whether to stop."""
-        self._agree(trainer)
-
-    def on_validation_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, *_: Any
-    ) -> None:
-        """Agree on whether to stop."""
-        self._agree(trainer)
-
-    def _agree(self, trainer: Trainer) -> None:
-        if any_process(trainer, self.asked is not None):
-            self.agreed = self.asked or signal.SIGTERM
-
-    def _listen(self) -> None:
+    def _listen(self, *_: Any, **__: Any) -> None:
+        # Lightning's own handlers save nothing; it puts back those before when the training ends
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, self._note)
@@ -80,9 +36,22 @@ class Stop(Callback):
             raise Stopped(number)
         self.asked = number
 
-    def _stop(self, number: int | None) -> None:
-        if number is not None:
-            raise Stopped(number)
+    def _agree(self, trainer: Trainer, *_: Any, **__: Any) -> None:
+        if any_process(trainer, self.asked is not None):
+            self.agreed = self.asked or signal.SIGTERM
+
+    def _stop(self, *_: Any, **__: Any) -> None:
+        if self.agreed is not None:
+            raise Stopped(self.agreed)
+
+    on_sanity_check_start = on_train_start = on_test_start = _listen
+    on_train_batch_start = on_validation_batch_start = _stop
+    on_train_batch_end = on_validation_start = on_validation_batch_end = _agree
+
+    def on_test_batch_start(self, *_: Any) -> None:
+        """Stop at once: a test has no checkpoint to write, and no other process waits for it."""
+        if self.asked is not None:
+            raise Stopped(self.asked)
 
 
 @contextmanager
