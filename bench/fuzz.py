@@ -38,7 +38,7 @@ from forking import RAW, Ended, prepare, run, warm  # noqa: E402
 
 import posefilter.cli.onboard  # noqa: E402
 from posefilter.cli.command import compose_job  # noqa: E402
-from posefilter.ranges import list_values  # noqa: E402
+from posefilter.ranges import list_nodes  # noqa: E402
 from posefilter.ros.messages import CAMERA_INFO, IMAGE, make_message, open_types  # noqa: E402
 
 SECONDS, PATIENCE, MEMORY = 20, 300, 12 << 30  # of one line: processor [s], clock [s], [bytes]
@@ -269,7 +269,8 @@ def list_keys(command: str, folder: Path) -> list[str]:
     """Return the settings that a command has."""
     plain = OmegaConf.to_container(compose_job(command, HOME / "conf", [], folder).cfg)
     assert isinstance(plain, dict)
-    keys = {key.partition("[")[0] for key, _, _ in list_values(plain)}
+    values = [key for key, value, _ in list_nodes(plain) if not isinstance(value, dict | list)]
+    keys = {key.partition("[")[0] for key in values}
     return sorted(key for key in keys if "_target_" not in key and key != "folder")
 
 

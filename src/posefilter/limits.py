@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from PIL import Image, UnidentifiedImageError
 
-from posefilter.errors import BadData
+from posefilter.errors import BadData, find_reason
 
 MOST_SIDE, MOST_PIXELS = 16_384, 1 << 27  # of an image: a photograph of 100 megapixels passes
 MOST_BYTES = 1 << 29  # of an image's or JSON's file
@@ -72,6 +72,24 @@ def read_json(
         return parse(read_bytes(path, max_bytes))
     except (ValueError, RecursionError) as error:  # JSON, UTF-8, whole numbers too long to read
         raise BadData(path, "not readable as JSON", f"truncated? {error}") from error
+
+
+def read_yaml(path: Path, most: int) -> Any:
+    """Read a YAML file of plain data without aliases.
+
+    Args:
+        path: The file.
+        most: Bytes that such a file may have.
+
+    Raises:
+        BadData: The file is missing, larger, may not be read, or is no YAML.
+    """
+    try:
+        # a SafeLoader, which makes nothing but plain data
+        return yaml.load(read_bytes(path, most).decode(), Loader=PlainLoader)
+    # YAML, UTF-8, whole numbers too long to read, days that there are not
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadData(path, "is no YAML", find_reason(error)) from error
 
 
 class PlainLoader(yaml.SafeLoader):

@@ -349,7 +349,7 @@ def check_ranges(settings: Mapping[str, Any], command: str) -> None:
         UserError: A setting is outside of its range, or no number where one is expected; or any
             number is not finite.
     """
-    for key, value, ours in _list_nodes(settings):
+    for key, value, ours in list_nodes(settings):
         if value is None or (isinstance(value, str) and "${" in value) or value == "???":
             continue
         place = f"{command}.{key}"
@@ -382,23 +382,17 @@ def find_range(place: str) -> Range | None:
     return next((RANGES[key] for key in keys if key in RANGES), None)
 
 
-def list_values(settings: Any) -> Iterator[tuple[str, Any, bool]]:
-    """Yield (key, value, ours) of each value that is no mapping or list; `ours` is False below a
-    class of a plug-in, whose settings may mean anything.
+def list_nodes(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, Any, bool]]:
+    """Yield (key, value, ours) of each setting, sections and lists included; `ours` is False below
+    a class of a plug-in, whose settings may mean anything.
     """
-    for key, node, ours in _list_nodes(settings):
-        if not isinstance(node, Mapping | list | tuple):
-            yield key, node, ours
-
-
-def _list_nodes(node: Any, key: str = "", ours: bool = True) -> Iterator[tuple[str, Any, bool]]:
     if key:
         yield key, node, ours
     if isinstance(node, Mapping):
         target = node.get("_target_")
         ours = ours if target is None else str(target).startswith(_OURS)
         for name, value in node.items():
-            yield from _list_nodes(value, f"{key}.{name}" if key else str(name), ours)
+            yield from list_nodes(value, f"{key}.{name}" if key else str(name), ours)
     elif isinstance(node, list | tuple):
         for i, value in enumerate(node):
-            yield from _list_nodes(value, f"{key}[{i}]", ours)
+            yield from list_nodes(value, f"{key}[{i}]", ours)

@@ -14,7 +14,7 @@ from posefilter.cli.main import COMMANDS
 from posefilter.cli.options import open_groups
 from posefilter.cli.recipe import LIMITS, MOST_WHOLE, NOT_KEPT
 from posefilter.errors import UserError
-from posefilter.ranges import RANGES, check_ranges, find_range, list_values
+from posefilter.ranges import RANGES, check_ranges, find_range, list_nodes
 
 HOME = Path(__file__).parents[2]
 CONF = HOME / "conf"
@@ -29,12 +29,12 @@ def find_numbers() -> dict[str, Any]:
     found = {}
     for name in COMMANDS:
         plain = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"), resolve=False)
-        found |= {f"{name}.{key}": (value, ours) for key, value, ours in list_values(plain)}
+        found |= {f"{name}.{key}": (value, ours) for key, value, ours in list_nodes(plain)}
     with open_groups() as groups:
         folders = {file.parent for file in CONF.rglob("*/*.yaml")}
         for folder in folders:
             for option in groups.list_options(folder.relative_to(CONF).as_posix()):
-                values = list_values(option.settings)
+                values = list_nodes(option.settings)
                 found |= {f"train.{key}": (value, ours) for key, value, ours in values}
     return {key: value for key, (value, ours) in found.items() if ours and is_number(value)}
 

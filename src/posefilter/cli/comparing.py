@@ -55,17 +55,10 @@ def differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 def flat(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield every value of nested settings, those in lists too, by its dotted key."""
-    inner = (
-        node.items()
-        if isinstance(node, Mapping)
-        else enumerate(node)
-        if isinstance(node, list)
-        else None
-    )
-    if inner is None:
+    if not isinstance(node, Mapping | list):
         yield name, node
         return
-    for key, value in inner:
+    for key, value in node.items() if isinstance(node, Mapping) else enumerate(node):
         yield from flat(value, f"{name}.{key}" if name else str(key))
 
 

@@ -18,6 +18,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
 from posefilter.cli.options import Groups, list_places, list_targets, open_groups
+from posefilter.cli.plain import find
 from posefilter.cli.trust import Scope, check_name, is_plugin
 from posefilter.errors import UserError
 
@@ -89,16 +90,10 @@ def resolve_known(tree: Any, place: str) -> Any:
         link = _LINK.fullmatch(node) if isinstance(node, str) else None
         if link is None or depth > _DEEPEST:  # settings that refer to themselves have no end
             return node
-        found = _find(tree, link[1].split("."))
+        found = find(tree, link[1])
         return node if found is None else walk(found, depth + 1)
 
-    return walk(_find(tree, place.split(".")), 0)
-
-
-def _find(tree: Any, path: Sequence[str]) -> Any:
-    for key in path:
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return tree
+    return walk(find(tree, place), 0)
 
 
 def declared_by(target: str, key: str, scope: Scope) -> Declared:
@@ -179,7 +174,7 @@ def typed_key(tree: Any, where: str) -> str:
     path: list[str] = []
     for part in where.split("."):
         path.append(part)
-        node = _find(tree, path)
+        node = find(tree, ".".join(path))
         if isinstance(node, str) and (link := _LINK.fullmatch(node)):
             path = link[1].split(".")
     return ".".join(path)

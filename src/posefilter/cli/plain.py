@@ -1,6 +1,6 @@
 """Settings as plain data."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -29,6 +29,19 @@ def map_values(node: Any, change: Callable[[Any, str], Any], place: str = "") ->
     if isinstance(node, list):
         return [map_values(value, change, f"{place}[{i}]") for i, value in enumerate(node)]
     return change(node, place)
+
+
+def find(node: Any, path: str) -> Any:
+    """Return what nested settings hold at a dotted path, in lists by number; None for nothing."""
+    for key in path.split("."):
+        if isinstance(node, list):
+            try:
+                node = node[int(key)]
+            except (ValueError, IndexError):
+                return None
+        else:
+            node = node.get(key) if isinstance(node, Mapping) else None
+    return node
 
 
 def resolve(node: Any) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from posefilter.cli.plain import find
 from posefilter.errors import UserError, missing_package
 from posefilter.weights import expand_weights, find_weights, is_several
 
@@ -84,10 +85,10 @@ def check_files(command: str, cfg: DictConfig) -> None:
         if cfg[key] is not None and not Path(str(cfg[key])).is_file():
             raise UserError(f"{key}={cfg[key]}: no such file")
     for key in _FOLDERS.get(command, ()):
-        folder = _select(cfg, key)
+        folder = find(cfg, key)
         if folder is None or folder == "builtin" or Path(str(folder)).is_dir():
             continue
-        if key == "data.root" and _select(cfg, "data.generate") is not None:
+        if key == "data.root" and find(cfg, "data.generate") is not None:
             continue  # it is rendered
         raise UserError(f"{_SHOWN.get(key, key)}={folder}: no such folder")
 
@@ -160,17 +161,11 @@ def _take_as_text(cfg: DictConfig, key: str) -> None:
 
     Raises UserError for what is neither.
     """
-    value = _select(cfg, key)
+    value = find(cfg, key)
     if isinstance(value, int | float) and not isinstance(value, bool):
         OmegaConf.update(cfg, key, str(value))
     elif not isinstance(value, str | None):
         raise UserError(f"{_SHOWN.get(key, key)}={value}: must be the name of a file or folder")
-
-
-def _select(cfg: Any, key: str) -> Any:
-    for part in key.split("."):
-        cfg = cfg.get(part) if isinstance(cfg, DictConfig) else None
-    return cfg
 
 
 def _find_all(weights: Any) -> None:

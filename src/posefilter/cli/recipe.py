@@ -14,7 +14,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from posefilter.cli.plain import map_values, resolve
+from posefilter.cli.plain import find, map_values, resolve
 from posefilter.cli.renamed import find_renamed, upgrade
 from posefilter.cli.trust import DATA_NAMES, is_plugin
 from posefilter.errors import UserError
@@ -214,24 +214,12 @@ def _without_selects(settings: dict[str, Any]) -> dict[str, Any]:
         found = _SELECT.fullmatch(value) if isinstance(value, str) else None
         if found is None:
             return value
-        if _at(settings, found[1]) is not None:
+        if find(settings, found[1]) is not None:
             return f"${{{found[1]}}}"
         return None if found[2] == "null" else int(found[2])
 
     out: dict[str, Any] = map_values(settings, refer)
     return out
-
-
-def _at(settings: Any, path: str) -> Any:
-    for key in path.split("."):
-        if isinstance(settings, list):  # OmegaConf counts in lists: ${a.0}
-            try:
-                settings = settings[int(key)]
-            except (ValueError, IndexError):
-                settings = None
-        else:
-            settings = settings.get(key) if isinstance(settings, dict) else None
-    return settings
 
 
 def _check_expansion(settings: dict[str, Any], said: str) -> None:
@@ -249,4 +237,4 @@ def _check_expansion(settings: dict[str, Any], said: str) -> None:
         elif isinstance(node, list):
             stack += [(depth + 1, value) for value in node]
         elif isinstance(node, str):
-            stack += [(depth + 1, _at(settings, name)) for name in _REFERENCE.findall(node)]
+            stack += [(depth + 1, find(settings, name)) for name in _REFERENCE.findall(node)]

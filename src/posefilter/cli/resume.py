@@ -4,13 +4,13 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 
 from posefilter.cli.arguments import quoted
+from posefilter.cli.plain import find
 from posefilter.errors import BadData, UserError
-from posefilter.limits import PlainLoader, read_bytes
+from posefilter.limits import read_bytes, read_yaml
 from posefilter.paths import check_links, stays_inside
 
 LAST, BEFORE = "last.ckpt", "last.previous.ckpt"  # of a run's checkpoints
@@ -92,8 +92,8 @@ def overrides_of(folder: Path) -> list[str]:
     """Return what was typed to start a run.  Raises UserError where its record is damaged."""
     file = folder / ".hydra" / "overrides.yaml"
     try:
-        before: Any = yaml.load(read_bytes(file, _LONGEST).decode(), Loader=PlainLoader)
-    except (yaml.YAMLError, RecursionError, ValueError, BadData):
+        before = read_yaml(file, _LONGEST)
+    except BadData:
         before = None
     before = [] if before == [] else before
     if not (
@@ -171,14 +171,11 @@ def _find_recorded(key: str, folder: Path) -> Any:
     """Return what a run's record says of a choice or setting."""
     choice = key in _KEPT_GROUPS
     file = folder / ".hydra" / ("hydra.yaml" if choice else "config.yaml")
-    path = ["hydra", "runtime", "choices", key] if choice else key.split(".")
     try:
-        node: Any = yaml.load(read_bytes(file, _RECORD).decode(), Loader=PlainLoader)
-    except (OSError, yaml.YAMLError, RecursionError, ValueError, BadData) as error:
+        record = read_yaml(file, _RECORD)
+    except BadData as error:
         raise UserError(f"{file}: cannot be read, so that {key}= cannot be compared") from error
-    for part in path:
-        node = node.get(part) if isinstance(node, dict) else None
-    return node
+    return find(record, f"hydra.runtime.choices.{key}" if choice else key)
 
 
 def _resumed(arguments: list[str]) -> str | None:

@@ -6,10 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from posefilter import limits
-from posefilter.errors import UserError, find_reason
+from posefilter.errors import UserError
 from posefilter.forms import NUMBER, TEXT, Each, Record, check_form, parse_json
 from posefilter.metrics.image_errors import FILE, ImageError
 from posefilter.report.events import Curve, find_event_files, read_events, select_unsaved
@@ -218,12 +216,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         return {}
-    try:
-        # a SafeLoader, which makes nothing but plain data
-        content = yaml.load(limits.read_bytes(path, _MOST_YAML).decode(), Loader=limits.PlainLoader)
-    # YAML, UTF-8, whole numbers too long to read, days that there are not
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UserError(f"{path}: is no YAML ({find_reason(error)})") from error
+    content = limits.read_yaml(path, _MOST_YAML)
     if not isinstance(content, dict):
         raise UserError(f"{path}: should hold one mapping")
     return content
