@@ -157,6 +157,4 @@ def draw_tile(one: KeptImage, shape: Shape, tells_pose: bool) -> np.ndarray:
     else:
         picture = draw_particles(one.rgb, one.pixels, one.weights, full_view(height, width, _TILE))
         caption = f"{1 - one.error:.0%} on object"
-    return add_caption(
-        add_caption(picture, cut_text(one.name, DETAIL, picture.shape[1]), DETAIL), caption
-    )
+    return add_caption(picture, caption, note=cut_text(one.name, DETAIL, picture.shape[1]))

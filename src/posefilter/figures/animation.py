@@ -10,7 +10,6 @@ import torch
 from posefilter.figures.canvas import (
     TRUTH,
     close_up,
-    draw_lines,
     full_view,
     stamp_dots,
 )
@@ -125,15 +124,8 @@ class Animation:
         for view, ground in zip(self.views, self.grounds, strict=True):
             picture = ground.copy()
             stamp_dots(picture, view.place(dots[order]), colors, 2 if self.posed else 3)
-            draw_lines(
-                picture,
-                [view.place(x) for x in outline_hulls(corners)],
-                _LINE,
-                1,
-                closed=True,
-                halo=False,
-            )
-            draw_lines(picture, [view.place(x) for x in self.target], TRUTH, 2, closed=True)
+            view.outline(picture, outline_hulls(corners), _LINE, 1, halo=False)
+            view.outline(picture, self.target, TRUTH, 2)
             parts.append(picture)
         return np.concatenate(
             [self.head, add_caption(center_part(arrange_row(parts)), caption), self.foot]

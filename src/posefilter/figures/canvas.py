@@ -71,6 +71,18 @@ class View(NamedTuple):
         """Return where the photograph's pixels are shown.  (*, 2) [px] -> (*, 2) [px]."""
         return (np.asarray(pixels, np.float64) - [self.left, self.top]) * self.scale - 0.5
 
+    def outline(
+        self,
+        picture: np.ndarray,
+        outlines: Sequence[np.ndarray],
+        color: Color,
+        width: int,
+        halo: bool = True,
+    ) -> None:
+        """Draw closed lines of the photograph, each (P, 2) [px], into what is shown of it."""
+        placed = [self.place(line) for line in outlines]
+        draw_lines(picture, placed, color, width, closed=True, halo=halo)
+
     def camera(self, K: np.ndarray) -> np.ndarray:
         """Return the camera matrix of what is shown.  (3, 3) [px] -> (3, 3)."""
         out = np.array(K, np.float64)

@@ -173,11 +173,8 @@ def draw_point_field(
             panel = draw_heat_panel(
                 map_colors(scores, -most, most, "RdBu_r"), x, y, _COLUMN, marks, dots
             )
-            tiles.append(
-                add_caption(
-                    add_caption(panel, f"at the ring: {own:+.2f}", DETAIL), f"{1000 * sigma:.3g} mm"
-                )
-            )
+            note = f"at the ring: {own:+.2f}"
+            tiles.append(add_caption(panel, f"{1000 * sigma:.3g} mm", note=note))
         place = f"plane {_NAMES[normal]} = {1000 * field.place[normal]:.0f} mm"
         parts += [
             draw_text(f"{'On' if field.on else 'Off'} it: {place}, at noise levels of", CAPTION),

@@ -138,6 +138,10 @@ def draw_scale(
     return out
 
 
-def add_caption(tile: np.ndarray, caption: str, size: int = CAPTION) -> np.ndarray:
-    """Put a caption above a tile."""
-    return np.concatenate([draw_text(caption, size, tile.shape[1]), tile])
+def add_caption(
+    tile: np.ndarray, caption: str, size: int = CAPTION, note: str | None = None
+) -> np.ndarray:
+    """Put a caption above a tile, and a note in small letters below the caption."""
+    width = tile.shape[1]
+    notes = [draw_text(note, DETAIL, width)] if note is not None else []
+    return np.concatenate([draw_text(caption, size, width), *notes, tile])

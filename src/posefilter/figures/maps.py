@@ -76,25 +76,13 @@ def draw_proposals(
         if np.isfinite(proposals.error)
         else "of the object's own frame"
     )
+    predicted = draw_point_map(proposals.coordinates, proposals.chance, view)
+    true = draw_point_map(proposals.true, proposals.on.astype(float), view)
     tiles = [
-        add_caption(add_caption(chance, "that a cell shows the object", DETAIL), "chance"),
-        add_caption(
-            add_caption(drawn, "from these maps", DETAIL), f"{len(proposals.axes)} poses drawn"
-        ),
-        add_caption(
-            add_caption(
-                draw_point_map(proposals.coordinates, proposals.chance, view), mean, DETAIL
-            ),
-            "points, predicted",
-        ),
-        add_caption(
-            add_caption(
-                draw_point_map(proposals.true, proposals.on.astype(float), view),
-                "by depth and pose",
-                DETAIL,
-            ),
-            "points, true",
-        ),
+        add_caption(chance, "chance", note="that a cell shows the object"),
+        add_caption(drawn, f"{len(proposals.axes)} poses drawn", note="from these maps"),
+        add_caption(predicted, "points, predicted", note=mean),
+        add_caption(true, "points, true", note="by depth and pose"),
     ]
     entries = [("true outline", TRUTH), ("pose's center", _PROPOSED), *list_axes()]
     span = f"{1000 * radius:.0f}"
@@ -146,15 +134,13 @@ def draw_objectness(
     """
     wide, half = (full_view(rgb.shape[0], rgb.shape[1], tile_width(columns)) for columns in (1, 2))
     heat = draw_heat_map(rgb, objectness, wide)
-    draw_lines(heat, [wide.place(line) for line in trace_outline(mask)], TRUTH, 3, closed=True)
+    wide.outline(heat, trace_outline(mask), TRUTH, 3)
     on, off = average_objectness(objectness, mask), average_objectness(objectness, ~mask)
     mean = f"{on:.2f} on the object, {off:.2f} elsewhere"
     tiles = []
     for name, (pixels, weights) in (("first", first), ("last", last)):
         picture = draw_particles(rgb, pixels, weights, half)
-        draw_lines(
-            picture, [half.place(line) for line in trace_outline(mask)], TRUTH, 2, closed=True
-        )
+        half.outline(picture, trace_outline(mask), TRUTH, 2)
         tiles.append(add_caption(picture, f"the {name} iteration"))
     foot = [
         draw_legend([("rim of the mask", TRUTH)]),

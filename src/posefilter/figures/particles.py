@@ -20,7 +20,6 @@ from posefilter.figures.canvas import (
 )
 from posefilter.figures.layout import (
     CAPTION,
-    DETAIL,
     LEGEND,
     WIDTH,
     add_caption,
@@ -158,10 +157,9 @@ def draw_iterations(
             note = describe_effective(trace, image, number) + (
                 f", {off:.0%} off the frame" if off else ""
             )
-            tile = add_caption(draw_particles_on(below, state, weights, frame), note, DETAIL)
-            tiles.append(
-                add_caption(tile, f"step {number}: {describe_noise(trace, image, number, 'px')}")
-            )
+            caption = f"step {number}: {describe_noise(trace, image, number, 'px')}"
+            picture = draw_particles_on(below, state, weights, frame)
+            tiles.append(add_caption(picture, caption, note=note))
         parts.append(arrange_grid(tiles, 2))
     return compose_figure(title or "Particles by iteration", *parts, draw_weight_scale())
 

@@ -8,7 +8,7 @@ from matplotlib import colormaps
 
 from posefilter.data.frames import Reader, Sample
 from posefilter.errors import BadData
-from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_lines, draw_row, load_font
+from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_row, full_view, load_font
 from posefilter.figures.overlay import trace_outline
 
 _TILE = 320  # [px]
@@ -47,18 +47,11 @@ def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray | Non
 def draw_frame(sample: Sample, name: str, near: float, far: float) -> np.ndarray:
     """Return a frame's name, its photograph, and its depth colored from `near` to `far` [m]."""
     height, width = sample.mask.shape
-    scale = _TILE / width
-    size = (_TILE, round(height * scale))
-    photo = cv2.resize(
-        sample.rgb, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    )
-    draw_lines(
-        photo,
-        [(line + 0.5) * scale - 0.5 for line in trace_outline(sample.mask)],
-        TRUTH,
-        1,
-        closed=True,
-    )
+    view = full_view(height, width, _TILE)
+    size = (view.width, view.height)
+    how = cv2.INTER_AREA if view.scale < 1 else cv2.INTER_CUBIC
+    photo = cv2.resize(sample.rgb, size, interpolation=how)
+    view.outline(photo, trace_outline(sample.mask), TRUTH, 1)
     share = (np.clip(sample.depth, near, far) - near) / max(far - near, 1e-9)
     depth = (_DEPTH(share)[..., :3] * 255).astype(np.uint8)
     depth[sample.depth <= 0] = _UNKNOWN

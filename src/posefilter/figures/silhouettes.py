@@ -10,7 +10,6 @@ from posefilter.figures.canvas import (
     View,
     arrange_grid,
     close_up,
-    draw_lines,
     full_view,
 )
 from posefilter.figures.layout import (
@@ -106,17 +105,8 @@ def draw_silhouettes(
         for view, ground in zip((frame, near), grounds, strict=True):
             share = compute_coverage(pixels, np.full(len(pixels), 1 / len(pixels)), view)
             picture = blend_coverage(ground, share)
-            draw_lines(
-                picture,
-                [view.place(line) for line in outline_hulls(pixels[::4])],
-                _LINE,
-                1,
-                closed=True,
-                halo=False,
-            )
-            draw_lines(
-                picture, [view.place(line) for line in outline_hulls(true)], TRUTH, 2, closed=True
-            )
+            view.outline(picture, outline_hulls(pixels[::4]), _LINE, 1, halo=False)
+            view.outline(picture, outline_hulls(true), TRUTH, 2)
             tiles.append(picture)
         parts += [draw_text(describe_step(trace, 0, number, "mm"), CAPTION), arrange_grid(tiles, 2)]
     foot = [

@@ -48,9 +48,7 @@ def draw_trajectories(
         else full_view(H, W, WIDTH)
     )
     picture = view.show(rgb)
-    draw_lines(
-        picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True
-    )
+    view.outline(picture, trace_outline(mask), (255, 255, 255), 1)
     for end, color in ((False, OFF), (True, ON)):
         chosen = view.place(path[:, on == end])
         draw_lines(picture, list(chosen.transpose(1, 0, 2)), color, 1, halo=False)
@@ -80,9 +78,7 @@ def draw_glimpses(
     on = find_hits(mask, states)
     view = full_view(mask.shape[0], mask.shape[1], WIDTH)
     picture = view.show(rgb)
-    draw_lines(
-        picture, [view.place(line) for line in trace_outline(mask)], (255, 255, 255), 1, closed=True
-    )
+    view.outline(picture, trace_outline(mask), (255, 255, 255), 1)
     for i in range(n):
         way = view.place(states[:, i])
         draw_lines(picture, [way], TRUTH if on[-1, i] else OFF, 2)
