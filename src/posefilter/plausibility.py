@@ -7,7 +7,6 @@ from posefilter.types import ObjectModel
 _SMALLEST = 16.0  # [px] the diameter, below which nothing on an object can be told apart
 _LARGEST = 3.0  # times the image's longer side
 _FEWEST = 0.05  # of the pixels have depth
-_BEYOND = 1.5  # times the depths of training
 _NEAREST = 0.2  # [m] the median depth; few depth cameras measure nearer
 _OFF = 0.24  # of the image's size: principal points farther from its middle are those of a part
 
@@ -17,7 +16,6 @@ def find_warnings(
     object_model: ObjectModel,
     depth: np.ndarray,
     intrinsics: np.ndarray,
-    trained_depth: tuple[float, float] | None = None,
     apparent_size: float | None = None,
 ) -> tuple[str, ...]:
     """Return what makes an estimate implausible, one sentence each.
@@ -30,7 +28,6 @@ def find_warnings(
         object_model: The object.
         depth: Measured z-depth (H, W) [m], 0 where unknown, at the network's resolution.
         intrinsics: Its camera matrix (3, 3) [px].
-        trained_depth: The nearest and farthest that training saw the object's center [m].
         apparent_size: How large the object appears, relative to its mesh, where that contradicts
             the inputs.
     """
@@ -70,13 +67,6 @@ def find_warnings(
         )
     elif pixels > _LARGEST * max(height, width):
         found.append(f"at {z:.2f} m the object would be far larger than the image: {scale}")
-    elif trained_depth is not None and not (
-        trained_depth[0] / _BEYOND <= z <= trained_depth[1] * _BEYOND
-    ):
-        found.append(
-            f"the object would be {z:.2f} m away, but training saw it between "
-            f"{trained_depth[0]:.2f} and {trained_depth[1]:.2f} m: {scale}"
-        )
     u = intrinsics[0, 0] * x / z + intrinsics[0, 2]
     v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
     if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):

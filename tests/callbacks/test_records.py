@@ -138,6 +138,3 @@ def test_outcomes_and_beliefs(tmp_path: Path) -> None:
         assert found["im_id"].tolist() == [9, 7]
         assert np.abs(found["weights"] - weights.numpy()).max() < 1e-6
         assert np.abs(found["poses"] @ native_from_mesh - history.numpy()).max() < 1e-5
-    assert collect_outcomes(Trace((), (), (), belief), batch, 0.25, beliefs=False)[
-        0
-    ].poses.shape == (0, 4, 4)

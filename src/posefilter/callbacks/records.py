@@ -34,15 +34,10 @@ class Outcome(NamedTuple):
 
 
 class Records(TraceCallback):
-    """Collect the `outcomes` of a test.
+    """Collect the `outcomes` of a test."""
 
-    Args:
-        beliefs: Keep the particles too.
-    """
-
-    def __init__(self, beliefs: bool = True) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.beliefs = beliefs
         self.outcomes: list[Outcome] = []
 
     def on_test_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -54,7 +49,7 @@ class Records(TraceCallback):
     ) -> None:
         """Take in one batch."""
         times = method.seconds_per_image
-        found = collect_outcomes(trace, batch, times[-1] if times else math.nan, self.beliefs)
+        found = collect_outcomes(trace, batch, times[-1] if times else math.nan)
         probabilities = method.last_assessment(len(found)).probability.tolist()
         self.outcomes += [
             one._replace(probability=probability)
@@ -62,24 +57,20 @@ class Records(TraceCallback):
         ]
 
 
-def collect_outcomes(
-    trace: Trace, batch: Batch, seconds: float, beliefs: bool = True
-) -> list[Outcome]:
+def collect_outcomes(trace: Trace, batch: Batch, seconds: float) -> list[Outcome]:
     """Return the outcome of each image of a batch.
 
     Args:
         trace: The run of the filter.
         batch: Its B images.
         seconds: That an image took.
-        beliefs: Keep the particles too.
     """
     belief = trace.belief
     best = belief.best.detach().cpu().double().numpy()
     poses = belief.poses.detach().cpu().float().numpy()
     weights = belief.log_weights.detach().exp().cpu().float().numpy()
-    keep = slice(None) if beliefs else slice(0)
     return [
-        Outcome(frame, best[i], float(belief.score[i]), seconds, poses[i][keep], weights[i][keep])
+        Outcome(frame, best[i], float(belief.score[i]), seconds, poses[i], weights[i])
         for i, frame in enumerate(batch.frame_id.tolist())
     ]
 

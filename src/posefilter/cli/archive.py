@@ -146,7 +146,11 @@ def _check_object(model: Any, said: str) -> None:
     if not (isinstance(name, str) and is_plain_name(name)):
         raise UserError(f"{said}: its object's name {str(name)[:40]!r} is not a plain one")
     parts = {} if model.get("parts") is None else model["parts"]
-    if not (isinstance(parts, dict) and len(parts) <= _PARTS and all(map(_is_part_name, parts))):
+    if not (
+        isinstance(parts, dict)
+        and len(parts) <= _PARTS
+        and all(isinstance(part, str) and is_plain_name(part) for part in parts)
+    ):
         raise UserError(f"{said}: its object's parts should be points by plain names")
     held = {key: model[key] for key in shapes}
     held |= {key: model[key] for key in later if model.get(key) is not None}
@@ -182,10 +186,6 @@ def _are_rigid(symmetries: Tensor) -> bool:
         and bool((torch.linalg.det(R) > 0).all())
         and torch.equal(last, last.new_tensor([0.0, 0, 0, 1]).expand_as(last))
     )
-
-
-def _is_part_name(name: Any) -> bool:
-    return isinstance(name, str) and is_plain_name(name)
 
 
 def _leaves(node: Any, said: str) -> Iterator[Any]:

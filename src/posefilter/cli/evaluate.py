@@ -109,7 +109,7 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     data.setup("test")
     method.set_object(object_to_judge(data, method.object_model))
     warn_of_several(data, job.cfg.console)
-    records = Records(beliefs=True)
+    records = Records()
     callbacks = [records, ErrorTable(job.folder), progress(job.cfg.console)]
     make_trainer(job.cfg.trainer, callbacks).test(method, datamodule=data, verbose=False)
     files = {"beliefs": job.folder / "beliefs.npz", "errors": job.folder / ERRORS}

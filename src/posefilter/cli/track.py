@@ -214,7 +214,8 @@ def draw_frame(
     tracked = [one for one in results if one.is_tracked]
     drawn = [Drawn(f"{one.object}: {one.status}", one.pose, shapes[one.object]) for one in tracked]
     lost = [one.object for one in results if not one.is_tracked]
-    return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=_name_lost(lost))
+    caption = f"lost: {', '.join(lost)}" if lost else ""
+    return draw_detections(frame.rgb, frame.intrinsics, drawn, caption=caption)
 
 
 def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
@@ -228,10 +229,6 @@ def list_seen(results: Sequence[TrackResult]) -> list[Seen]:
         )
         for one in results
     ]
-
-
-def _name_lost(lost: Sequence[str]) -> str:
-    return f"lost: {', '.join(lost)}" if lost else ""
 
 
 def make_settings(node: DictConfig) -> TrackerSettings:

@@ -134,7 +134,8 @@ def list_groups(name: str, folders: Sequence[Path]) -> Iterator[Group]:
             for folder in top.rglob("*")
             if folder.is_dir()
         }
-        names += sorted(nested - {*names, "preset"} - {f"preset/{c}" for c in _methods(folders)})
+        methods = {choice for top in folders for choice in list_choices(top / "model")}
+        names += sorted(nested - {*names, "preset"} - {f"preset/{one}" for one in methods})
     for group in (one for one in names if one not in _HIDDEN):
         found = {choice for top in folders for choice in list_choices(top / group)}
         found |= _list_stored(group)
@@ -173,10 +174,6 @@ def _list_stored(group: str) -> set[str]:
         return {name.removesuffix(".yaml") for name in ConfigStore.instance().list(group)}
     except OSError:  # so Hydra says that there are none
         return set()
-
-
-def _methods(folders: Sequence[Path]) -> set[str]:
-    return {choice for top in folders for choice in list_choices(top / "model")}
 
 
 def _program(name: str) -> str:

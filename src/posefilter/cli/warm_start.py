@@ -30,7 +30,7 @@ def read_starts(weights: Any, own: str) -> list[dict[str, Any]]:
         UserError: There is no such checkpoint, or it is unreadable.
     """
     found = [read_checkpoint(one) for one in expand_weights(weights)]
-    others = [one for one in found if _object_of(one) != own]
+    others = [one for one in found if (one.get("object_model") or {}).get("name") != own]
     return found if len(found) == 1 or not others else others
 
 
@@ -80,7 +80,3 @@ def warm_start(method: PoseEstimator, checkpoints: Sequence[dict[str, Any]]) -> 
 
 def _fits(state: dict[str, Tensor], name: str, value: Tensor) -> bool:
     return name in state and state[name].shape == value.shape
-
-
-def _object_of(checkpoint: dict[str, Any]) -> str | None:
-    return (checkpoint.get("object_model") or {}).get("name")

@@ -78,8 +78,6 @@ def draw_band(
     shape: Shape,
     level: float = 0.95,
     caption: str = "",
-    color: Color = ESTIMATE,
-    width: int = WIDTH,
 ) -> np.ndarray:
     """Draw the band of a belief on the photograph, and the outline at which half of it ends.
 
@@ -91,8 +89,6 @@ def draw_band(
         shape: A mesh, or the vertices of a convex hull.
         level: Probability that the outline lies in the band, at a point of it.
         caption: Written below.
-        color: Of the line in the middle.
-        width: Of the result at least [px].
 
     Returns:
         The picture (h, w, 3) uint8.
@@ -101,7 +97,7 @@ def draw_band(
         UserError: The image or the camera matrix is not as it should be.
     """
     rgb, K = to_picture(rgb), to_camera(intrinsics)
-    view = full_view(rgb.shape[0], rgb.shape[1], max(width, rgb.shape[1]))
+    view = full_view(rgb.shape[0], rgb.shape[1], max(WIDTH, rgb.shape[1]))
     picture = view.show(rgb)
     cover = measure_cover(poses, weights, shape, K, view)
     surely, maybe = find_band(cover, level)
@@ -111,8 +107,8 @@ def draw_band(
     ).round()
     for part in (surely, maybe):
         draw_lines(picture, trace_outline(part), _BAND, 1, closed=True, halo=False)
-    draw_lines(picture, trace_outline(_smooth(cover) > 0.5), color, 1, closed=True, halo=False)
-    entries = [("outline", color), (f"{100 * level:g} % band", _BAND)]
+    draw_lines(picture, trace_outline(_smooth(cover) > 0.5), ESTIMATE, 1, closed=True, halo=False)
+    entries = [("outline", ESTIMATE), (f"{100 * level:g} % band", _BAND)]
     return np.concatenate([picture, draw_row(picture.shape[1], caption, entries)])
 
 

@@ -299,12 +299,12 @@ def to_png(picture: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def to_jpeg(picture: np.ndarray, quality: int = 85) -> bytes:
+def to_jpeg(picture: np.ndarray) -> bytes:
     """Return a picture as the bytes of a JPEG, its colors as sharp as its brightness: lines are
     thin.
     """
     stream = BytesIO()
-    Image.fromarray(picture).save(stream, "JPEG", quality=quality, subsampling=0)
+    Image.fromarray(picture).save(stream, "JPEG", quality=85, subsampling=0)
     return stream.getvalue()
 
 

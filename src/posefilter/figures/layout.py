@@ -38,11 +38,13 @@ def compose_figure(title: str, *parts: np.ndarray) -> np.ndarray:
     return np.concatenate([*lines, *(center_part(part) for part in parts)])
 
 
-def center_part(part: np.ndarray, width: int = WIDTH) -> np.ndarray:
-    """Return a picture with white at both sides.  Raises ValueError where it is wider than that."""
-    spare = width - part.shape[1]
+def center_part(part: np.ndarray) -> np.ndarray:
+    """Return a picture with white at both sides, as wide as a figure.  Raises ValueError where it
+    is wider than that.
+    """
+    spare = WIDTH - part.shape[1]
     if spare < 0:
-        raise ValueError(f"a part of {part.shape[1]} pixels does not fit a figure of {width}")
+        raise ValueError(f"a part of {part.shape[1]} pixels does not fit a figure of {WIDTH}")
     return np.pad(part, ((0, 0), (spare // 2, spare - spare // 2), (0, 0)), constant_values=255)
 
 

@@ -106,16 +106,13 @@ def draw_point_map(points: np.ndarray, chance: np.ndarray, view: View) -> np.nda
     return np.asarray(cv2.resize(cells, (view.width, view.height), interpolation=cv2.INTER_NEAREST))
 
 
-def draw_heat_map(
-    rgb: np.ndarray, values: np.ndarray, view: View, name: str = "magma"
-) -> np.ndarray:
+def draw_heat_map(rgb: np.ndarray, values: np.ndarray, view: View) -> np.ndarray:
     """Return a photograph in gray below a map (h, w) in [0, 1] whose cells lie evenly over it.  ->
     picture.
     """
     ground = view.show(rgb).mean(-1, keepdims=True)
-    cells = cv2.resize(
-        map_colors(values, 0, 1, name), (view.width, view.height), interpolation=cv2.INTER_NEAREST
-    )
+    colors = map_colors(values, 0, 1, "magma")
+    cells = cv2.resize(colors, (view.width, view.height), interpolation=cv2.INTER_NEAREST)
     return np.asarray(0.35 * ground + 0.65 * cells).round().astype(np.uint8)
 
 

@@ -174,18 +174,13 @@ def draw_color_scale(
     return draw_scale(before, map_colors(np.linspace(0, 1, 256), 0, 1, name), after, width, size)
 
 
-def arrange_row(parts: Sequence[np.ndarray], width: int | None = None) -> np.ndarray:
-    """Put pictures side by side, on white where one is lower; `width` pads or cuts the whole."""
+def arrange_row(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Put pictures side by side, on white where one is lower."""
     height = max(part.shape[0] for part in parts)
     padded = [
         np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0)), constant_values=255) for p in parts
     ]
-    row = np.concatenate(padded, axis=1)
-    if width is None:
-        return row
-    return np.pad(
-        row[:, :width], ((0, 0), (0, max(0, width - row.shape[1])), (0, 0)), constant_values=255
-    )
+    return np.concatenate(padded, axis=1)
 
 
 def draw_mark(

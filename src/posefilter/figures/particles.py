@@ -20,8 +20,6 @@ from posefilter.figures.canvas import (
 )
 from posefilter.figures.layout import (
     CAPTION,
-    LEGEND,
-    WIDTH,
     add_caption,
     compose_figure,
     draw_legend,
@@ -243,7 +241,7 @@ def choose_by_weight(weights: torch.Tensor, count: int) -> torch.Tensor:
     return torch.searchsorted(weights.cumsum(0), at).clamp(max=len(weights) - 1)
 
 
-def draw_weight_scale(width: int = WIDTH, size: int = LEGEND) -> np.ndarray:
+def draw_weight_scale() -> np.ndarray:
     """Return a row that explains the colors."""
     ramp = (_WEIGHT(np.linspace(0, 1, 256))[:, :3] * 255).astype(np.uint8)
-    return draw_scale("weight: mean / 10", ramp, "x 10", width, size)
+    return draw_scale("weight: mean / 10", ramp, "x 10")

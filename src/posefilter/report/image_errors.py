@@ -38,24 +38,21 @@ def read_image_errors(folder: Path) -> list[ImageError]:
         raise UserError(f"{path}: is no table of errors ({error})") from error
 
 
-def compute_cdf(
-    errors_mm: Sequence[float], limit_mm: float = LIMIT_MM
-) -> tuple[list[float], list[float]]:
+def compute_cdf(errors_mm: Sequence[float]) -> tuple[list[float], list[float]]:
     """Return the share of the images whose error is at most a threshold.
 
     Args:
         errors_mm: An error an image; infinite where it was missed.
-        limit_mm: The greatest threshold.
 
     Returns:
         Thresholds [mm], from 0 to the limit, and the shares there [%]; a step is two points.
     """
-    within = sorted(error for error in errors_mm if error < limit_mm)
+    within = sorted(error for error in errors_mm if error < LIMIT_MM)
     x, y = [0.0], [0.0]
     for number, error in enumerate(within, start=1):
         x += [error, error]
         y += [y[-1], 100 * number / len(errors_mm)]
-    return [*x, limit_mm], [*y, y[-1]]
+    return [*x, LIMIT_MM], [*y, y[-1]]
 
 
 def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:

@@ -115,16 +115,8 @@ def _check_object(
     if mesh is None:
         return _row(name, 0, []), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
     native = reader.native_from_mesh(name)
-    chosen = (
-        [
-            mine[k]
-            for k in np.unique(
-                np.linspace(0, len(mine) - 1, min(limit or len(mine), len(mine))).astype(int)
-            )
-        ]
-        if mine
-        else []
-    )
+    spread = np.linspace(0, len(mine) - 1, min(limit or len(mine), len(mine)))
+    chosen = [mine[k] for k in np.unique(spread.astype(int))]
     broken: Counter[str] = Counter()
     examples: dict[str, str] = {}
     views: list[View] = []
@@ -177,14 +169,8 @@ def _judge(
     """Return what is wrong with an object's frames, and the likely cause."""
     name, iou, error = row["object"], row["silhouette_iou"], row["depth_error_mm"]
     tried = float(np.median([fit.iou for fit in fits[: len(views)]]))
-    distance = float(
-        np.median(
-            [
-                np.median(fit.rendered[fit.rendered > 0]) if (fit.rendered > 0).any() else 1
-                for fit in fits
-            ]
-        )
-    )
+    depths = [fit.rendered[fit.rendered > 0] for fit in fits]
+    distance = float(np.median([np.median(known) if known.size else 1 for known in depths]))
     bad_depth = error is not None and error > max(_DEPTH_MM, _DEPTH_SHARE * distance * 1000)
     if iou < LEAST_IOU or bad_depth:
         causes = likely_causes(views, geometry, tried)

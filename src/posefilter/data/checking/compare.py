@@ -113,14 +113,8 @@ def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str 
     nearly vanish.
     """
     for shift in (0.5, -0.5):
-        after = float(
-            np.median(
-                [
-                    compare(v, geometry, None, _shifted(v.sample.intrinsics, shift)).iou
-                    for v in views
-                ]
-            )
-        )
+        fits = [compare(v, geometry, None, _shifted(v.sample.intrinsics, shift)) for v in views]
+        after = float(np.median([fit.iou for fit in fits]))
         if 1 - after < 0.4 * (1 - before) and after - before > 0.004:
             corner = (
                 "pixel corners, not centers, have whole numbers"
@@ -134,32 +128,20 @@ def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str 
 
 def causes(view: View) -> list[Cause]:
     """Return every cause that is tried, with how to undo it."""
-    out = [
-        Cause(f"translations {_UNITS.get(k, f'are too small by a factor of {k:g}')}", _scaled(k))
-        for k in _POWERS
-    ]
-    out += [
-        Cause(
-            "poses are the wrong way round (object from camera)",
-            lambda v: (_inverse(v), v.sample.intrinsics),
-        ),
-        Cause("rotations are transposed", lambda v: (_transposed(v), v.sample.intrinsics)),
-        Cause(
-            "poses are in OpenGL's camera axes (y up, z backward)",
-            lambda v: (_opengl(v), v.sample.intrinsics),
-        ),
-    ]
-    out += [Cause(words, _reframed(step)) for words, step in _frames(view)]
     width = view.sample.mask.shape[1]
-    for other in _WIDTHS:
-        if other != width:
-            out.append(
-                Cause(
-                    f"intrinsics belong to pictures {other} px wide, not {width}",
-                    _resized(width / other),
-                )
-            )
-    return out
+    units = {k: _UNITS.get(k, f"are too small by a factor of {k:g}") for k in _POWERS}
+    return [
+        *(Cause(f"translations {words}", _scaled(k)) for k, words in units.items()),
+        Cause("poses are the wrong way round (object from camera)", _inverse),
+        Cause("rotations are transposed", _transposed),
+        Cause("poses are in OpenGL's camera axes (y up, z backward)", _opengl),
+        *(Cause(words, _reframed(step)) for words, step in _frames(view)),
+        *(
+            Cause(f"intrinsics belong to pictures {k} px wide, not {width}", _resized(width / k))
+            for k in _WIDTHS
+            if k != width
+        ),
+    ]
 
 
 def _depth_scale(fits: Sequence[Fit]) -> list[str]:
@@ -181,42 +163,24 @@ def _depth_scale(fits: Sequence[Fit]) -> list[str]:
 
 def _frames(view: View) -> list[tuple[str, np.ndarray]]:
     """Return frames that may have been mixed up: words, and mesh_from_supposed."""
-    native = view.native_from_mesh
     out = []
-    if not np.allclose(native, np.eye(4)):
-        out.append(
-            (
-                "poses are in the mesh file's frame already, not in the dataset's own",
-                np.linalg.inv(native),
-            )
-        )
-        out.append(
-            (
-                "the dataset's object frame was applied the wrong way round",
-                np.linalg.inv(native) @ np.linalg.inv(native),
-            )
-        )
+    if not np.allclose(view.native_from_mesh, np.eye(4)):
+        back = np.linalg.inv(view.native_from_mesh)
+        out += [
+            ("poses are in the mesh file's frame already, not in the dataset's own", back),
+            ("the dataset's object frame was applied the wrong way round", back @ back),
+        ]
     if view.mesh.name in ycb.CLASSES and view.mesh.name not in ycb.WITHOUT_GEOMETRY:
-        step = ycb.ycbvideo_from_original(view.mesh.name)
-        out.append(
-            ("poses are in YCB-Video's object frame, meshes in the original (google_16k) one", step)
-        )
-        out.append(
-            (
-                "poses are in the original (google_16k) frame, meshes in YCB-Video's",
-                np.linalg.inv(step),
-            )
-        )
+        on = ycb.ycbvideo_from_original(view.mesh.name)
+        back = np.linalg.inv(on)
+        out += [
+            ("poses are in YCB-Video's object frame, meshes in the original (google_16k) one", on),
+            ("poses are in the original (google_16k) frame, meshes in YCB-Video's", back),
+        ]
     center = np.eye(4)
     center[:3, 3] = -view.mesh.bounds.mean(0)
-    out.append(
-        (
-            "poses are in a frame at the center of the bounding box (as BOP's), the mesh has "
-            "another origin",
-            center,
-        )
-    )
-    return out
+    words = "poses are in a frame at the center of the bounding box (as BOP's)"
+    return [*out, (f"{words}, the mesh has another origin", center)]
 
 
 def _scaled(factor: float) -> Change:
@@ -244,19 +208,20 @@ def _resized(scale: float) -> Change:
     return undo
 
 
-def _inverse(view: View) -> np.ndarray:
+def _inverse(view: View) -> tuple[np.ndarray, np.ndarray]:
     camera_from_native = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
-    return np.linalg.inv(camera_from_native) @ view.native_from_mesh
+    return np.linalg.inv(camera_from_native) @ view.native_from_mesh, view.sample.intrinsics
 
 
-def _transposed(view: View) -> np.ndarray:
+def _transposed(view: View) -> tuple[np.ndarray, np.ndarray]:
     pose = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
     pose[:3, :3] = pose[:3, :3].T.copy()
-    return pose @ view.native_from_mesh
+    return pose @ view.native_from_mesh, view.sample.intrinsics
 
 
-def _opengl(view: View) -> np.ndarray:
-    return np.diag([1.0, -1.0, -1.0, 1.0]) @ view.sample.camera_from_object
+def _opengl(view: View) -> tuple[np.ndarray, np.ndarray]:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    return flip @ view.sample.camera_from_object, view.sample.intrinsics
 
 
 def _shifted(K: np.ndarray, shift: float) -> np.ndarray:
