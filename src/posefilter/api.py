@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
-from posefilter.cli.checkpoints import build_method, method_of, read_checkpoint, recipe
+from posefilter.cli.checkpoints import build_method, methods_of, recipe
 from posefilter.cli.components import SECTIONS, changes
 from posefilter.cli.job import Job
 from posefilter.confidence.tolerance import PoseTolerance
@@ -15,7 +15,6 @@ from posefilter.confidence.verdicts import Costs
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
 from posefilter.models.base import PoseEstimator
-from posefilter.weights import expand_weights
 
 if TYPE_CHECKING:
     from posefilter.data.module import PoseDataModule
@@ -68,10 +67,7 @@ def load(
     """
     check_overrides(overrides)
     wanted = changes(compose(overrides, "predict")) if overrides else {}
-    methods = [
-        method_of(read_checkpoint(one), wanted, lightning=False) for one in expand_weights(weights)
-    ]
-    return Estimator(methods, device, costs, pose_tolerance)
+    return Estimator(methods_of(weights, wanted), device, costs, pose_tolerance)
 
 
 def check_overrides(overrides: Sequence[str]) -> None:

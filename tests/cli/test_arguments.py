@@ -129,7 +129,7 @@ def test_a_sweep_gives_each_job_a_folder_of_its_own(
 ) -> None:
     folders = []
     monkeypatch.setattr(f"posefilter.cli.{command}.{command}", lambda job: folders.append(job))
-    monkeypatch.setattr("posefilter.cli.command.check_files", lambda name, cfg: None)
+    monkeypatch.setattr("posefilter.cli.running.check_files", lambda name, cfg: None)
     words = ["-m", typed, f"out={tmp_path}", "console=json"]
     assert run_command(command, HOME, [*words, "plugins=[]"]) == 0
     key, _, values = typed.partition("=")

@@ -12,9 +12,10 @@ import pytest
 from tests.cli.conftest import Cold
 
 import posefilter
-from posefilter.cli.command import finish_wandb, run_command
+from posefilter.cli.command import run_command
 from posefilter.cli.main import COMMANDS, main
 from posefilter.cli.ranks import STARTED, is_follower
+from posefilter.cli.running import finish_wandb
 from posefilter.errors import MISTAKE
 
 HOME = Path(__file__).parents[2]

@@ -19,7 +19,7 @@ ROUTES: dict[str, dict[str, Any]] = {
     "posefilter.cli.command.os.system": {"command": "touch {secret}/x"},
     "posefilter.cli.machine.subprocess.run": {"args": ["touch", "{secret}/x"]},
     "posefilter.cli.machine.subprocess.Popen": {"args": ["touch", "{secret}/x"]},
-    "posefilter.cli.command.importlib.import_module": {"name": "hostile_module"},
+    "posefilter.cli.running.importlib.import_module": {"name": "hostile_module"},
     "posefilter.cli.instantiate.importlib.import_module": {"name": "hostile_module"},
     "posefilter.cli.instantiate.functools.partial": {},
     "posefilter.cli.evaluate.shutil.copy2": {"src": "{secret}/file.txt", "dst": "{secret}/x"},

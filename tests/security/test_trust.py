@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from posefilter.cli import command, run_command, trust
+from posefilter.cli import command, run_command, running, trust
 from posefilter.cli.instantiate import instantiate, instantiate_recipe, locate
 from posefilter.errors import UserError
 
@@ -88,7 +88,7 @@ def test_the_command_line_names_them(
         (7, "must be a list"),
     ):
         with pytest.raises(UserError, match=told):
-            command.use_plugins(OmegaConf.create({"plugins": wanted}))
+            running.use_plugins(OmegaConf.create({"plugins": wanted}))
     report = [f"run={tmp_path}/none", "plugins=[my_plugin]", "console=json"]
     assert run_command("report", HOME, report) == 2
     assert len(capfd.readouterr().err.strip().splitlines()) == 1

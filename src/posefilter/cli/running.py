@@ -1,0 +1,142 @@
+"""One job that Hydra has prepared: it is checked, its work is done, and what goes wrong is told."""
+
+import importlib
+import sys
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from posefilter.cli.console import JSON, say, settle_logging
+from posefilter.cli.explain import first_line
+from posefilter.cli.fit import check_fit
+from posefilter.cli.folders import (
+    forget_failure,
+    hold_folder,
+    note_failure,
+    read_results,
+    remove_if_empty,
+)
+from posefilter.cli.job import Job, check_settings
+from posefilter.cli.preflight import check_files
+from posefilter.cli.replaced import replace_typed
+from posefilter.cli.trust import Scope, installed, trust
+from posefilter.errors import Carrier, UserError
+from posefilter.locks import release
+
+Work = Callable[[Job], Any]
+EXPECTED = (
+    UserError,
+    HydraException,
+    OmegaConfBaseException,
+    FloatingPointError,
+    OSError,  # a full disk, a folder that may not be written
+    MemoryError,
+)
+# others write to a folder of another
+_OWN_FOLDER = ("train", "evaluate", "predict", "check_data", "track")
+
+
+def run_job(cfg: DictConfig, name: str, begun: list[Job], kept: list[Job]) -> Any:
+    """Do a job that Hydra has prepared, and return what its work returns.
+
+    It is added to those that have begun; to those that are kept, where a sweep's job fails whose
+    folder holds earlier results.
+    """
+    try:
+        job = job_of(cfg)
+        begun.append(job)
+        console = job.cfg.get("console", JSON)
+        settle_logging(console)
+    except EXPECTED as error:  # a setting refers to nothing
+        raise Carrier(error) from error
+    try:
+        check_settings(cfg, name)
+        if name in _OWN_FOLDER:
+            hold_folder(job.folder)
+        forget_failure(job)
+        use_plugins(cfg)
+        if not (name == "train" and read_results(job)):
+            check_files(name, cfg)
+        if name == "train":
+            check_fit(cfg, job.choices, Scope.CONFIG)
+        if not job.swept:  # before torch is imported, which takes seconds
+            say(console, "started", f"{name}: starting", command=name, folder=str(job.folder))
+        work: Work = getattr(importlib.import_module(f"posefilter.cli.{name}"), name)
+        return work(job)
+    except Exception as error:
+        if job.swept and "summary" in HydraConfig.get().callbacks:  # the other jobs go on
+            if not isinstance(error, EXPECTED):
+                traceback.print_exception(error)
+            print(f"{job.name} {' '.join(job.overrides)}: {first_line(error)}", file=sys.stderr)
+            if not note_failure(job, first_line(error)):
+                kept.append(job)
+            return None  # of NaN Optuna's sweeper would make an error
+        if not isinstance(error, EXPECTED):
+            raise
+        release(job.folder)
+        with suppress(OSError):  # nothing of ours is in a folder that may not be written
+            remove_if_empty(job.folder, job.name)
+        raise Carrier(error) from error
+    finally:
+        if job.swept:
+            release(job.folder)
+            finish_wandb()
+
+
+def finish_wandb() -> None:
+    """End the run that Weights & Biases logs, where it is in use: the next job has its own."""
+    wandb = sys.modules.get("wandb")
+    if getattr(wandb, "run", None) is not None:
+        wandb.finish()  # type: ignore[union-attr]
+
+
+def use_plugins(cfg: DictConfig) -> None:
+    """Trust the packages that the user names in `plugins`; import them, and installed plug-ins.
+
+    Raises UserError where one is not there.
+    """
+    named = cfg.get("plugins") or ListConfig([])
+    if not isinstance(named, ListConfig):
+        raise UserError(
+            f"plugins={named}: must be a list of packages, such as plugins=[my_package]"
+        )
+    for package in named:
+        trust(package)
+    for package in (*named, *installed()):  # they may register readers
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"plugins={package}: there is no package '{error.name}' (is it installed?)"
+            ) from error
+        except (Exception, SystemExit) as error:  # a plug-in may not end the run as if it were done
+            raise UserError(
+                f"plugins={package}: could not be imported ({type(error).__name__}: "
+                f"{first_line(error)}); debug=traceback shows where"
+            ) from error
+
+
+def job_of(cfg: DictConfig) -> Job:
+    """Return the job that Hydra has prepared."""
+    own = HydraConfig.get()
+    choices = {str(k): str(v) for k, v in own.runtime.choices.items()}
+    swept = own.mode is RunMode.MULTIRUN
+    # as typed: what an interpolation stands for may be a secret, or not known yet
+    typed: Any = OmegaConf.to_container(own.overrides.task, resolve=False)
+    replace_typed(cfg, typed)
+    return Job(
+        cfg,
+        choices,
+        typed,
+        Path(own.runtime.output_dir),
+        own.job.config_name or "",
+        swept,
+    )
