@@ -33,7 +33,7 @@ sys.path[:0] = [str(HOME / "bench"), str(HOME / "tests" / "data")]
 from dataset_trees import HIGH, LOW, bop_scene, fat_tree, pose, write_mesh, ycb_frame  # noqa: E402
 from spoiling import spoil  # noqa: E402
 
-from posefilter.data.checking.check import check_dataset  # noqa: E402
+from posefilter.checking.check import check_dataset  # noqa: E402
 from posefilter.data.frames import NotShown, Sample  # noqa: E402
 from posefilter.data.module import PoseDataModule  # noqa: E402
 from posefilter.data.readers.registry import open_reader  # noqa: E402

@@ -13,11 +13,11 @@ import torch
 
 from posefilter.belief import Belief
 from posefilter.callbacks.records import write_beliefs
+from posefilter.checking.contact_figure import write_sheet
 from posefilter.cli import run_command
 from posefilter.cli.files import save_whole
 from posefilter.cli.results import write_json
 from posefilter.data.cache import DiskCache
-from posefilter.data.checking.contact_figure import write_sheet
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.errors import UserError
 from posefilter.figures.canvas import save_image

@@ -18,7 +18,7 @@ from dataset_trees import (
     ycb_frame,
 )
 
-from posefilter.data.checking.check import check_dataset, format_report
+from posefilter.checking.check import check_dataset, format_report
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader
@@ -65,7 +65,7 @@ def test_a_true_dataset_passes(tmp_path, meshes):
     assert 0.4 < row["visible_share"] < 1
     assert json.loads((tmp_path / "out" / "data_report.json").read_text()) == report
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
-    assert sheet.shape == (2 * 276 + 20, 3 * 512, 3)  # two rows of tiles, and the legend
+    assert sheet.shape == (2 * (275 + 6) + 19, 3 * (512 + 6) + 6, 3)  # two rows, and the legend
     assert NAME in format_report(report)
     assert "no problems" in format_report(report)
 

@@ -10,8 +10,8 @@ import pytest
 import scipy.io
 from dataset_trees import K, bop_scene, fat_tree, pose, write_mesh, ycb_frame
 
+from posefilter.checking.check import check_dataset
 from posefilter.cli.evaluate import check_bop_model
-from posefilter.data.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.decode import holds_meters, read_depth

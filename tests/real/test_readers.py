@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from posefilter.data.checking.check import check_dataset
+from posefilter.checking.check import check_dataset
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.ycb_video import YCBVideoReader

@@ -5,10 +5,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from posefilter.checking.check import check_dataset, format_report
 from posefilter.cli.console import JSON, ended, typed
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.job import Job
-from posefilter.data.checking.check import check_dataset, format_report
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import ProblemsFound, UserError
 from posefilter.synthetic.generate import GENERATOR

@@ -13,9 +13,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from posefilter.data.checking.compare import Fit, View, compare, half_pixel, likely_causes
-from posefilter.data.checking.contact_figure import tile, write_sheet
-from posefilter.data.checking.frames import Suspect, describe_suspects, is_suspect
+from posefilter.checking.compare import Fit, View, compare, half_pixel, likely_causes
+from posefilter.checking.contact_figure import tile, write_sheet
+from posefilter.checking.frames import Suspect, describe_suspects, is_suspect
 from posefilter.data.frames import Implausible, NotShown, Reader
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from posefilter.data.checking.compare import Fit, View, compare, likely_causes
+from posefilter.checking.compare import Fit, View, compare, likely_causes
 from posefilter.data.silhouette import Geometry
 
 LEAST_FRAME_IOU = 0.75  # of one frame's silhouettes
