@@ -27,8 +27,9 @@ from numpy.random import Generator
 
 import posefilter
 from posefilter.data.augmentation import Augment, Compose, Draw, PasteOccluder, RollAndZoom
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.frames import FrameRecord, Sample
 from posefilter.data.photometric import ColorResponse
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s, add_up_to_symmetry
@@ -66,7 +67,7 @@ def choose_views(records: Sequence[FrameRecord], name: str) -> list[int]:
     return [own[k * len(own) // VIEWS] for own in groups.values() for k in range(VIEWS)]
 
 
-def read_scraps(reader: Reader, records: Sequence[FrameRecord], group: str) -> list[Sample]:
+def read_scraps(reader: BaseReader, records: Sequence[FrameRecord], group: str) -> list[Sample]:
     """Return samples of other sequences than `group`."""
     others = [i for i, record in enumerate(records) if record.group != group]
     return [reader.read(i) for i in others[:: max(len(others) // SCRAPS, 1)]]

@@ -24,7 +24,8 @@ from marked import format_row
 
 import posefilter
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance, measure_pose_errors
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.errors import UserError
 from posefilter.result import Result
@@ -77,7 +78,7 @@ SPOILED: dict[str, Spoil] = {
 }
 
 
-def list_images(reader: Reader, every: int) -> list[list[int]]:
+def list_images(reader: BaseReader, every: int) -> list[list[int]]:
     """Return the records of each image, every so many images of a scene."""
     images: dict[str, list[int]] = {}
     for i, record in enumerate(reader.records()):
@@ -110,7 +111,7 @@ def probability_of(result: Result) -> float | None:
 
 
 def look(
-    estimator: posefilter.Estimator, reader: Reader, images: list[list[int]], spoil: str
+    estimator: posefilter.Estimator, reader: BaseReader, images: list[list[int]], spoil: str
 ) -> list[dict[str, Any]]:
     """Return a row an object and image: whether it is there, right, and what was declared."""
     records, rows = list(reader.records()), []

@@ -26,7 +26,8 @@ import numpy as np
 import torch
 
 import posefilter
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.figures.canvas import save_image
 from posefilter.figures.detections import Drawn, draw_detections
@@ -36,7 +37,7 @@ from posefilter.metrics.matching import match_greedily
 from posefilter.weights import list_shipped
 
 
-def list_frames(reader: Reader) -> list[list[int]]:
+def list_frames(reader: BaseReader) -> list[list[int]]:
     """Return the records of each image."""
     frames: dict[str, list[int]] = {}
     for i, record in enumerate(reader.records()):
@@ -94,7 +95,7 @@ def judge(
 
 
 def list_lines(
-    results: list[Any], record: FrameRecord, reader: Reader, seconds: float
+    results: list[Any], record: FrameRecord, reader: BaseReader, seconds: float
 ) -> list[PoseRow]:
     """Return the results of a frame in BOP's format."""
     native = reader.native_from_mesh(record.object)

@@ -16,7 +16,8 @@ from rich.table import Table
 from posefilter.checking.compare import Fit, View, compare, half_pixel, likely_causes
 from posefilter.checking.contact_figure import tile, write_sheet
 from posefilter.checking.frames import Suspect, describe_suspects, is_suspect
-from posefilter.data.frames import Implausible, NotShown, Reader
+from posefilter.data.frames import Implausible, NotShown
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
 from posefilter.files import write_whole
@@ -33,7 +34,7 @@ _TILES = 12  # on the contact sheet
 
 
 def check_dataset(
-    reader: Reader,
+    reader: BaseReader,
     meshes: MeshStore,
     limit: int | None = 50,
     out: Path | str | None = None,
@@ -107,7 +108,7 @@ def format_report(report: dict[str, Any]) -> str:
 
 
 def _check_object(
-    reader: Reader, geometry: Geometry, name: str, limit: int | None, drawn: int, progress: bool
+    reader: BaseReader, geometry: Geometry, name: str, limit: int | None, drawn: int, progress: bool
 ) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
     """Return an object's row, its problems and its tiles."""
     mine = [i for i, record in enumerate(reader.records()) if record.object == name]

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from posefilter.data.frames import FrameRecord, NotShown, Reader, Sample
+from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.module import PoseDataModule
+from posefilter.data.readers.base import BaseReader
 from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, hull_vertices
 from posefilter.metrics.bop import REFERENCE_WIDTH, densify, mspd, mssd
@@ -107,7 +108,7 @@ def score_targets(
     return {**compute_average_recall(scored), "targets": count, "estimates": used}
 
 
-def _read_shown(places: Sequence[int], reader: Reader) -> list[Sample]:
+def _read_shown(places: Sequence[int], reader: BaseReader) -> list[Sample]:
     """Return the instances of which a pixel is seen; the others are no targets."""
     samples = []
     for place in places:
@@ -171,7 +172,7 @@ def _pair(
 
 
 def _stack_poses(
-    samples: Sequence[Sample], rows: Sequence[PoseRow], reader: Reader
+    samples: Sequence[Sample], rows: Sequence[PoseRow], reader: BaseReader
 ) -> tuple[Tensor, Tensor]:
     """Return true and estimated poses (T, 4, 4), (E, 4, 4) in the mesh file's frame, float64."""
     native = reader.native_from_mesh(reader.objects[samples[0].object_id])

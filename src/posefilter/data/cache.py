@@ -11,7 +11,6 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -44,24 +43,6 @@ class Prepared:
     def pixels(self) -> int:
         """Return how many pixels the mask has."""
         return int(np.unpackbits(self.mask_bits).sum())
-
-
-class FrameCache(Protocol):
-    """Somewhere to keep samples."""
-
-    def find(self, record: FrameRecord) -> Prepared | None:
-        """Return what is kept of a record, None for nothing, or where its files have changed
-        since.
-        """
-        ...
-
-    def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
-        """Keep a sample."""
-        ...
-
-    def load(self, record: FrameRecord, frame_id: int) -> Sample:
-        """Return a kept sample."""
-        ...
 
 
 class MemoryCache:
@@ -188,6 +169,9 @@ class NoCache:
         """Return the sample, decoded anew."""
         one, sample = self._records[record.key], self._read(record)
         return unpack(pack_image(sample), one, frame_id)
+
+
+FrameCache = MemoryCache | DiskCache | NoCache
 
 
 def open_cache(

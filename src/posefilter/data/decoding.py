@@ -4,7 +4,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from posefilter.data.cache import FrameCache, Prepared
-from posefilter.data.frames import FrameRecord, Reader, Sample
+from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.resize import network_size, resize
 from posefilter.errors import BadData
 
@@ -22,7 +23,7 @@ class FrameDecoder:
 
     def __init__(
         self,
-        reader: Reader,
+        reader: BaseReader,
         records: Sequence[FrameRecord],
         width: int | None,
         height: int | None,

@@ -2,11 +2,8 @@
 `Sample`.
 """
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -48,55 +45,6 @@ class FrameRecord:
     def key(self) -> str:
         """Return a name that no other record of the dataset has."""
         return f"{self.name}#{self.instance}"
-
-
-class Reader(Protocol):
-    """A dataset on disk."""
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Return the classes that it was asked for, or all that it has."""
-        ...
-
-    @property
-    def skipped(self) -> Counter[str]:
-        """Return what listing left out: reasons and counts."""
-        ...
-
-    @property
-    def examples(self) -> dict[str, str]:
-        """Return the first message for each of those reasons."""
-        ...
-
-    @property
-    def notes(self) -> Counter[str]:
-        """Return what else the log should say, with counts."""
-        ...
-
-    def records(self) -> Sequence[FrameRecord]:
-        """Return every object of every image, in a fixed order."""
-        ...
-
-    def read(self, i: int) -> Sample:
-        """Return record i at the dataset's resolution, its visibility still unknown.
-
-        Raises BadData, naming the file, where it is not as it should be.
-        """
-        ...
-
-    def visible_share(self, sample: Sample) -> float:
-        """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
-        ...
-
-    def others(self, i: int) -> np.ndarray:
-        """Return the pixels that the dataset labels as anything but record i.  -> (H, W) bool."""
-        ...
-
-    def native_from_mesh(self, name: str) -> np.ndarray:
-        """Return the transform from the mesh file's frame into the dataset's own object frame.  ->
-        (4, 4) [m].
-        """
-        ...
 
 
 class NotShown(BadData):

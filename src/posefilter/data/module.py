@@ -15,11 +15,12 @@ from posefilter.data.absent import find_absent
 from posefilter.data.cache import CACHES, open_cache
 from posefilter.data.dataset import EpochShuffle, FrameDataset
 from posefilter.data.decoding import FrameDecoder
-from posefilter.data.frames import FrameRecord, Reader
+from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.points import read_model_points
 from posefilter.data.prepare import Criteria, usable
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
 from posefilter.errors import UserError
@@ -146,7 +147,7 @@ class PoseDataModule(LightningDataModule):
         return open_meshes(self._meshes, self._mesh_scale, self.source, self._object)
 
     @cached_property
-    def reader(self) -> Reader:
+    def reader(self) -> BaseReader:
         """The dataset's reader."""
         return open_reader(
             self.source, self.root, self._object, self.meshes, self._on_error, **self._options

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from posefilter.data.frames import FrameRecord, NotShown, Reader
+from posefilter.data.frames import FrameRecord, NotShown
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
 from posefilter.errors import UserError
 
@@ -127,7 +128,9 @@ class SceneVideo(Video):
         stride: Take every so many frames.
     """
 
-    def __init__(self, reader: Reader, group: str, objects: Sequence[str], stride: int = 1) -> None:
+    def __init__(
+        self, reader: BaseReader, group: str, objects: Sequence[str], stride: int = 1
+    ) -> None:
         self.name, self._reader, self._wanted = group, reader, set(objects)
         frames: dict[int, list[tuple[int, FrameRecord]]] = {}
         for index, record in enumerate(reader.records()):
@@ -167,7 +170,7 @@ class SceneVideo(Video):
         return VideoFrame(record.name, record.im_id, sample.rgb, sample.depth, K, truth)
 
 
-def list_groups(reader: Reader) -> list[str]:
+def list_groups(reader: BaseReader) -> list[str]:
     """Return the scenes of a dataset, in the order of their records."""
     return list(dict.fromkeys(record.group for record in reader.records()))
 

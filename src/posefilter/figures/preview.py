@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from matplotlib import colormaps
 
-from posefilter.data.frames import Reader, Sample
+from posefilter.data.frames import Sample
+from posefilter.data.readers.base import BaseReader
 from posefilter.errors import BadData
 from posefilter.figures.canvas import PAPER, TRUTH, arrange_grid, draw_row, full_view, load_font
 from posefilter.figures.overlay import trace_outline
@@ -16,7 +17,7 @@ _DEPTH = colormaps["viridis"]
 _UNKNOWN = (40, 40, 40)
 
 
-def draw_preview(reader: Reader, title: str, count: int = 4) -> np.ndarray | None:
+def draw_preview(reader: BaseReader, title: str, count: int = 4) -> np.ndarray | None:
     """Return `count` frames, spread evenly over the dataset, each with its depth below it.  ->
     picture.
 

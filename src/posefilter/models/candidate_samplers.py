@@ -34,8 +34,8 @@ class ScoresSamples(Protocol):
         ...
 
 
-class CandidateSampler(Protocol):
-    """Draw and score the candidates of one batch."""
+class CandidateSampler:
+    """Draw and score the candidates of one batch; it keeps nothing from batch to batch."""
 
     def __call__(
         self, method: "PosePF", encoding: Encoding, batch: Batch, generator: Generator
@@ -48,15 +48,14 @@ class CandidateSampler(Protocol):
             batch: B images with their truth.
             generator: Source of randomness.
         """
-        ...
+        raise NotImplementedError
 
     def state(self) -> dict[str, Tensor]:
         """Return what is kept from batch to batch, for checkpoints."""
-        ...
+        return {}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Restore what `state` returned."""
-        ...
 
 
 def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) -> Trace:
@@ -72,7 +71,7 @@ def one_step_trace(particles: Particles, output: ParticleOutput, sigma: Tensor) 
     return Trace((particles,), (output,), (Step(0, 1, sigma),), belief)
 
 
-class CandidatePoses:
+class CandidatePoses(CandidateSampler):
     """Draw candidates of several kinds, all of an image at one noise level.
 
     Args:
@@ -188,7 +187,7 @@ def pick_pixels(usable: Tensor, count: int | None, generator: Generator) -> tupl
     return pick[:, :longest], drawn[:, :longest] > 0
 
 
-class LabeledRays:
+class LabeledRays(CandidateSampler):
     """The paper's samples: points along the rays of the object's pixels, scored singly (section 5).
 
     Args:
@@ -265,10 +264,3 @@ class LabeledRays:
             scores, scores.new_zeros(B, scores.shape[1], 6), pose, particles.latent
         )
         return one_step_trace(particles, output, torch.full((B,), self.tolerance, device=device))
-
-    def state(self) -> dict[str, Tensor]:
-        """Return nothing: no state is kept between batches."""
-        return {}
-
-    def restore(self, state: dict[str, Tensor]) -> None:
-        """Restore nothing."""

@@ -21,19 +21,36 @@ class BaseReader:
     `records`.
     """
 
-    objects: tuple[str, ...]
+    objects: tuple[str, ...]  # that it was asked for, or all that it has
     _entries: Sequence[Any]
 
     def __init__(self, root: str | Path, meshes: MeshStore | None, on_error: str) -> None:
         self.root, self.on_error = Path(root), on_error
-        self.skipped: Counter[str] = Counter()
+        self.skipped: Counter[str] = Counter()  # what listing left out: reasons and counts
         self.examples: dict[str, str] = {}  # of each reason to skip, the first message
-        self.notes: Counter[str] = Counter()
+        self.notes: Counter[str] = Counter()  # what else the log should say, with counts
         self._geometry = None if meshes is None else Geometry(meshes)
 
     def records(self) -> Sequence[FrameRecord]:
         """Return every object of every image, in a fixed order."""
         return [entry.record for entry in self._entries]
+
+    def read(self, i: int) -> Sample:
+        """Return record i at the dataset's resolution, its visibility still unknown.
+
+        Raises BadData, naming the file, where it is not as it should be.
+        """
+        raise NotImplementedError
+
+    def others(self, i: int) -> np.ndarray:
+        """Return the pixels that the dataset labels as anything but record i.  -> (H, W) bool."""
+        raise NotImplementedError
+
+    def native_from_mesh(self, name: str) -> np.ndarray:
+        """Return the transform from the mesh file's frame into the dataset's own object frame.  ->
+        (4, 4) [m].
+        """
+        raise NotImplementedError
 
     def visible_share(self, sample: Sample) -> float:
         """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""

@@ -1,18 +1,18 @@
 """A part of an object as an object of its own: `hammer.head` in a dataset of hammers."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from posefilter.data.frames import FrameRecord, NotShown, Reader, Sample
+from posefilter.data.frames import FrameRecord, NotShown, Sample
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.silhouette import Geometry
 from posefilter.meshes.parts import split_part, take_faces
 from posefilter.meshes.store import MeshStore
 
 
-class PartReader:
+class PartReader(BaseReader):
     """The dataset of an object, with one of its parts in the object's place.
 
     Pose and frame are the object's; the mask has those of its visible pixels where the part's faces
@@ -24,8 +24,12 @@ class PartReader:
         meshes: Where the object's mesh and its parts are.
     """
 
-    def __init__(self, whole: Reader, name: str, meshes: MeshStore) -> None:
+    _geometry: Geometry
+
+    def __init__(self, whole: BaseReader, name: str, meshes: MeshStore) -> None:
         self._whole, self._name, self._meshes = whole, name, meshes
+        self.objects = (name,)
+        self.skipped, self.examples, self.notes = whole.skipped, whole.examples, whole.notes
         base, part = split_part(name)
         mesh = meshes.load(base)
         own = mesh.parts[part]
@@ -33,26 +37,6 @@ class PartReader:
         self._solids = [meshes.load(name)]
         if not own.all():
             self._solids.append(take_faces(mesh, ~own, f"{base} without {part}"))
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Return the part's name alone."""
-        return (self._name,)
-
-    @property
-    def skipped(self) -> Counter[str]:
-        """Return what the object's reader left out."""
-        return self._whole.skipped
-
-    @property
-    def examples(self) -> dict[str, str]:
-        """Return its messages."""
-        return self._whole.examples
-
-    @property
-    def notes(self) -> Counter[str]:
-        """Return its notes."""
-        return self._whole.notes
 
     def records(self) -> Sequence[FrameRecord]:
         """Return the object's records, of the part's name."""

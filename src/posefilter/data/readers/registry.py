@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from posefilter.data.frames import Reader
+from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.bop import BopReader
 from posefilter.data.readers.fat import FatReader
 from posefilter.data.readers.part import PartReader
@@ -13,7 +13,7 @@ from posefilter.errors import UserError
 from posefilter.meshes.parts import split_part
 from posefilter.meshes.store import MeshStore
 
-READERS: dict[str, Callable[..., Reader]] = {
+READERS: dict[str, Callable[..., BaseReader]] = {
     "scenes": FatReader,
     "fat": FatReader,
     "ycb_video": YCBVideoReader,
@@ -21,7 +21,7 @@ READERS: dict[str, Callable[..., Reader]] = {
 }
 
 
-def register_reader(source: str, reader: Callable[..., Reader]) -> None:
+def register_reader(source: str, reader: Callable[..., BaseReader]) -> None:
     """Make a reader known by the name that `data.source` gives, for plug-ins.
 
     Args:
@@ -44,7 +44,7 @@ def open_reader(
     meshes: MeshStore | None = None,
     on_error: str = "raise",
     **options: Any,
-) -> Reader:
+) -> BaseReader:
     """Return the reader of a dataset: source "scenes" (rendered here), "fat", "ycb_video" or "bop".
 
     An object may be a part, `hammer.head`: see `PartReader`. options: the format's own, see the
