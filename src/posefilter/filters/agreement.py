@@ -1,5 +1,6 @@
 """The pose that explains most particles' own surface points, by hypothesis and verification."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -28,6 +29,7 @@ def require_surface_points(method: Method) -> HasSurfacePoints:
     return method
 
 
+@dataclass(eq=False)
 class Agreement:
     """Estimate the pose that most particles' surface points agree on, weighted by likelihood.
 
@@ -56,24 +58,18 @@ class Agreement:
         "the highest likelihood of a particle; no probability"
     )
 
-    def __init__(
-        self,
-        scale_m: float = 0.015,
-        hypotheses: int = 64,
-        iterations: int = 8,
-        top_fragments: int = 3,
-        effective_particles: float = 8.0,
-    ) -> None:
-        if min(hypotheses, top_fragments) < 1 or scale_m <= 0:
+    scale_m: float = 0.015
+    hypotheses: int = 64
+    iterations: int = 8
+    top_fragments: int = 3
+    effective_particles: float = 8.0
+
+    def __post_init__(self) -> None:
+        if min(self.hypotheses, self.top_fragments) < 1 or self.scale_m <= 0:
             raise UserError(
-                f"estimate: hypotheses={hypotheses} and top_fragments={top_fragments} must be 1 "
-                f"or more, and scale_m={scale_m} above 0"
+                f"estimate: hypotheses={self.hypotheses} and top_fragments={self.top_fragments} "
+                f"must be 1 or more, and scale_m={self.scale_m} above 0"
             )
-        self.scale_m = scale_m
-        self.hypotheses = hypotheses
-        self.iterations = iterations
-        self.top_fragments = top_fragments
-        self.effective_particles = effective_particles
 
     def __call__(
         self,

@@ -25,15 +25,11 @@ def select_particle(particles: Particles, output: ParticleOutput, scores: Tensor
     return BeliefBatch(output.pose, particles.log_weights, output.pose[rows, index], score)
 
 
-class Argmax:
-    """The pose of the particle of highest likelihood (the paper, section 5).
+class BestParticle:
+    """Base of estimates that are one of the particles: the one that is rated highest.
 
-    The score is its log-likelihood.
+    The score is its rating.
     """
-
-    score_is: ClassVar[str] = (
-        "log-likelihood of the estimate, up to a constant of the image; no probability"
-    )
 
     def __call__(
         self,
@@ -44,7 +40,26 @@ class Argmax:
         generator: Generator,
     ) -> BeliefBatch:
         """Return the belief."""
-        return select_particle(particles, output, output.log_likelihood)
+        return select_particle(particles, output, self.rate(particles, output, method))
+
+    def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
+        """Return the particles' ratings, (B, N)."""
+        raise NotImplementedError
+
+
+class Argmax(BestParticle):
+    """The pose of the particle of highest likelihood (the paper, section 5).
+
+    The score is its log-likelihood.
+    """
+
+    score_is: ClassVar[str] = (
+        "log-likelihood of the estimate, up to a constant of the image; no probability"
+    )
+
+    def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
+        """Return their log-likelihoods."""
+        return output.log_likelihood
 
 
 class Mean:
@@ -106,7 +121,7 @@ def kernel_mass(
     return torch.cat(parts, dim=1)
 
 
-class DensestMode:
+class DensestMode(BestParticle):
     """The pose of the particle of highest kernel density; the score is the log of its kernel mass.
 
     Args:
@@ -119,22 +134,13 @@ class DensestMode:
     def __init__(self, bandwidth: float) -> None:
         self.bandwidth = bandwidth
 
-    def __call__(
-        self,
-        particles: Particles,
-        output: ParticleOutput,
-        encoding: Encoding,
-        method: Method,
-        generator: Generator,
-    ) -> BeliefBatch:
-        """Return the belief."""
-        mass = kernel_mass(
-            particles.state.detach(), particles.log_weights.detach(), method.space, self.bandwidth
-        )
-        return select_particle(particles, output, mass)
+    def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
+        """Return the logs of their kernel masses."""
+        state, log_weights = particles.state.detach(), particles.log_weights.detach()
+        return kernel_mass(state, log_weights, method.space, self.bandwidth)
 
 
-class DensestPose:
+class DensestPose(BestParticle):
     """The particle's pose of highest kernel density among poses, for particles of any space.
 
     Particles that are pixels can predict one pose from distant positions; this estimate compares
@@ -150,16 +156,7 @@ class DensestPose:
     def __init__(self, bandwidth: float, radius: float = 0.1) -> None:
         self.bandwidth, self.space = bandwidth, PoseSpace((0.0, 0.0, 0.0), radius)
 
-    def __call__(
-        self,
-        particles: Particles,
-        output: ParticleOutput,
-        encoding: Encoding,
-        method: Method,
-        generator: Generator,
-    ) -> BeliefBatch:
-        """Return the belief."""
-        mass = kernel_mass(
-            output.pose.detach(), particles.log_weights.detach(), self.space, self.bandwidth
-        )
-        return select_particle(particles, output, mass)
+    def rate(self, particles: Particles, output: ParticleOutput, method: Method) -> Tensor:
+        """Return the logs of their poses' kernel masses."""
+        pose, log_weights = output.pose.detach(), particles.log_weights.detach()
+        return kernel_mass(pose, log_weights, self.space, self.bandwidth)

@@ -1,5 +1,6 @@
 """A last pass of importance sampling: particles that carry the posterior given the image once."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -16,6 +17,7 @@ from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
 
+@dataclass(eq=False)
 class ImportanceSampling:
     """Draw the particles anew from a density about the old ones, and weight them by the posterior.
 
@@ -44,22 +46,20 @@ class ImportanceSampling:
 
     requires: ClassVar[Capabilities] = ("pose_space", "score_poses")
 
-    def __init__(
-        self,
-        samples: int = 400,
-        rounds: int = 2,
-        widening: float = 2.0,
-        temperature: float = 1.0,
-        sigma: float = 0.004,
-        pixels: int = 256,
-    ) -> None:
-        if samples < 1 or rounds < 1 or not widening >= 1 or not temperature > 0:
+    samples: int = 400
+    rounds: int = 2
+    widening: float = 2.0
+    temperature: float = 1.0
+    sigma: float = 0.004
+    pixels: int = 256
+
+    def __post_init__(self) -> None:
+        counts, widening, temperature = (self.samples, self.rounds), self.widening, self.temperature
+        if min(counts) < 1 or not widening >= 1 or not temperature > 0:
             raise UserError(
                 f"refine: importance sampling needs samples and rounds >= 1, widening >= 1 and "
-                f"temperature > 0, got {samples}, {rounds}, {widening} and {temperature}"
+                f"temperature > 0, got {self.samples}, {self.rounds}, {widening} and {temperature}"
             )
-        self.samples, self.rounds, self.widening = samples, rounds, widening
-        self.temperature, self.sigma, self.pixels = temperature, sigma, pixels
 
     @torch.no_grad()
     def __call__(

@@ -1,6 +1,7 @@
 """Refinements of the estimate: rescoring particles, mean shift, gradient ascent; particles stay."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -73,6 +74,7 @@ def select_best(belief: BeliefBatch, poses: Tensor, scores: Tensor) -> BeliefBat
     )
 
 
+@dataclass(eq=False)
 class Rescore:
     """Score the estimate and the heaviest particles again with more pixels, and select the best.
 
@@ -85,8 +87,9 @@ class Rescore:
     requires: ClassVar[Capabilities] = ("score_poses",)
     score_is: ClassVar[str] = _RESCORED
 
-    def __init__(self, top_k: int = 20, pixels: int = 1024, sigma: float = 0.004) -> None:
-        self.top_k, self.pixels, self.sigma = top_k, pixels, sigma
+    top_k: int = 20
+    pixels: int = 1024
+    sigma: float = 0.004
 
     def __call__(
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
@@ -98,6 +101,7 @@ class Rescore:
         return select_best(belief, poses, scores)
 
 
+@dataclass(eq=False)
 class MeanShift:
     """Shift the estimate to the likelihood-weighted mean around it (Comaniciu and Meer 2002).
 
@@ -120,23 +124,20 @@ class MeanShift:
     requires: ClassVar[Capabilities] = ("score_poses",)
     score_is: ClassVar[str] = _RESCORED
 
-    def __init__(
-        self,
-        iterations: int = 4,
-        antithetic_pairs: int = 24,
-        initial_scale: float = 0.012,
-        final_scale: float = 0.007,
-        sigma: float = 0.004,
-        pixels: int = 256,
-    ) -> None:
-        if iterations < 1 or antithetic_pairs < 1 or not 0 < final_scale <= initial_scale:
+    iterations: int = 4
+    antithetic_pairs: int = 24
+    initial_scale: float = 0.012
+    final_scale: float = 0.007
+    sigma: float = 0.004
+    pixels: int = 256
+
+    def __post_init__(self) -> None:
+        low, high = self.final_scale, self.initial_scale
+        if self.iterations < 1 or self.antithetic_pairs < 1 or not 0 < low <= high:
             raise UserError(
                 f"refine: a mean shift needs iterations and antithetic_pairs >= 1 and "
-                f"0 < final_scale <= initial_scale, got {final_scale} and {initial_scale}"
+                f"0 < final_scale <= initial_scale, got {low} and {high}"
             )
-        self.iterations, self.antithetic_pairs = iterations, antithetic_pairs
-        self.initial_scale, self.final_scale = initial_scale, final_scale
-        self.sigma, self.pixels = sigma, pixels
 
     @torch.no_grad()
     def __call__(
@@ -160,6 +161,7 @@ class MeanShift:
         return belief._replace(best=best, score=score[:, 0])
 
 
+@dataclass(eq=False)
 class Gradient:
     """Maximize the score by Adam (Kingma and Ba 2015) on the pose's tangent.
 
@@ -179,18 +181,13 @@ class Gradient:
     requires: ClassVar[Capabilities] = ("score_poses",)
     score_is: ClassVar[str] = _RESCORED
 
-    def __init__(
-        self,
-        steps: int = 50,
-        lr: float = 2e-3,
-        sigma: float = 0.006,
-        pixels: int = 256,
-        starts: int = 1,
-        final_pixels: int = 1024,
-        final_sigma: float = 0.004,
-    ) -> None:
-        self.steps, self.lr, self.sigma, self.pixels, self.starts = steps, lr, sigma, pixels, starts
-        self.final_pixels, self.final_sigma = final_pixels, final_sigma
+    steps: int = 50
+    lr: float = 2e-3
+    sigma: float = 0.006
+    pixels: int = 256
+    starts: int = 1
+    final_pixels: int = 1024
+    final_sigma: float = 0.004
 
     def __call__(
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator

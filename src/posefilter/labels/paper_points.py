@@ -1,5 +1,6 @@
 """The paper's labels of points along the rays of the object's pixels (section 5)."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -10,6 +11,7 @@ from posefilter.errors import UserError
 from posefilter.types import Batch, ObjectModel, Trace
 
 
+@dataclass(eq=False)
 class PaperPoints:
     """+100 on the surface with its own color, -100 behind the surface, 0 otherwise.
 
@@ -25,14 +27,9 @@ class PaperPoints:
 
     requires: ClassVar[Capabilities] = ("ray_samples",)
 
-    def __init__(
-        self,
-        tolerance: float = 0.01,
-        surface_label: float = 100.0,
-        behind_label: float = -100.0,
-    ) -> None:
-        self.tolerance = tolerance
-        self.surface_label, self.behind_label = surface_label, behind_label
+    tolerance: float = 0.01
+    surface_label: float = 100.0
+    behind_label: float = -100.0
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return labels (1, B, N).
