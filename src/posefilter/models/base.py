@@ -471,13 +471,7 @@ class PoseEstimator(Module):
         for metric in self.scores.values():
             metric.reset()
 
-    def on_validation_epoch_start(self) -> None:
-        """Reset the metrics."""
-        self._reset()
-
-    def on_test_epoch_start(self) -> None:
-        """Reset the metrics."""
-        self._reset()
+    on_validation_epoch_start = on_test_epoch_start = _reset
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics; the best checkpoint has the highest `val/score`."""
