@@ -147,3 +147,21 @@ def test_an_estimate_an_image_is_not_compared_with_several_instances_without_a_w
         warn_of_several(data, "json")
     (line,) = said
     assert "2 of 2 images show several instances of the object" in line
+
+
+def test_estimates_of_the_meshs_frame_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """FAT's own object frame is turned against the mesh file's."""
+    scenes = tmp_path / "scenes"
+    generate(scenes, 2, object="carton", workers=1, sensor="ideal", progress=False)
+    rows = list_truths(scenes)
+    evaluate(rows, scenes, tmp_path / "right")
+    assert "warning" not in capsys.readouterr().out
+    reader = open_reader("fat", scenes, "carton", MeshStore("builtin"))
+    native = reader.native_from_mesh("carton")
+    of_mesh = [one._replace(camera_from_native=one.camera_from_native @ native) for one in rows]
+    assert evaluate(of_mesh, scenes, tmp_path / "wrong")["add"]["median_mm"] > 100
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    (warning,) = [line for line in lines if line["event"] == "warning"]
+    assert warning["median_mm_in_mesh_frame"] < 0.01

@@ -2,6 +2,7 @@
 
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -186,18 +187,22 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     assigned = assign_estimates(rows, data.records("test"), data)
     models = [data.object_model(i) for i in range(len(data.objects))]
     errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
+    errors_in_mesh_frame = PoseErrors(models)  # were they of the meshes' frames
     used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
         estimates = [assigned.get(r.key) for r in own]
         poses = torch.full_like(batch.camera_from_object, torch.nan)
+        as_they_are = poses.clone()
         for i, estimate in enumerate(estimates):
             if estimate is not None:
                 used += 1
                 native = data.reader.native_from_mesh(own[i].object)
                 pose = to_mesh(estimate.camera_from_native, native)
                 poses[i] = torch.from_numpy(pose.astype(np.float32))
+                as_they_are[i] = torch.from_numpy(estimate.camera_from_native.astype(np.float32))
         errors.update(poses, batch.camera_from_object, batch.object_id)
+        errors_in_mesh_frame.update(as_they_are, batch.camera_from_object, batch.object_id)
         height, width = batch.rgb.shape[-2:]
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         pairs = [
@@ -219,8 +224,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             f"estimates={job.cfg.estimates}: none of its {len(rows)} rows belongs to "
             f"an instance of this data"
         )
+    found = errors.compute()
+    warn_of_frame(found, errors_in_mesh_frame.compute(), job.cfg.console)
     results = {
-        **errors.compute(),
+        **found,
         **bop.compute(),
         "iou": float(iou.compute()),
         "particles_on_object": None,
@@ -235,6 +242,19 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     write_errors(job.folder / ERRORS, table)
     metrics = {**record(results, job, data.describe(), None), "estimates": str(job.cfg.estimates)}
     return metrics, {"errors": job.folder / ERRORS}
+
+
+def warn_of_frame(found: Mapping[str, Any], in_mesh_frame: Mapping[str, Any], console: str) -> None:
+    """Say where estimates fit the truth in the meshes' frames, and not in the dataset's."""
+    own, other = (one["add"]["median_mm"] for one in (found, in_mesh_frame))
+    if other < 0.5 * own:
+        sentence = (
+            f"warning: the poses fit the meshes' frames (median ADD {other:.1f} mm) better than "
+            f"the dataset's ({own:.1f} mm), in which they are scored: predict.py and track.py "
+            "frames=... write poses of the mesh's frame, evaluate.py and track.py data=... of the "
+            "dataset's"
+        )
+        say(console, "warning", sentence, median_mm=own, median_mm_in_mesh_frame=other)
 
 
 def data_settings(
