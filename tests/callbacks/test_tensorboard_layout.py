@@ -130,7 +130,7 @@ def test_every_chart_finds_what_methods_log() -> None:
         "filter/ess/step_00", "filter/spread_m/step_13", "filter/spread_rad/step_00",
         "filter/spread_px/step_00",
         "filter/sigma_px/step_00", "diagnostics/off_frame/last", "val/belief/distance_coverage_50",
-        "val/belief/mass_2cm",
+        "val/belief/mass_2cm", "val/credibility/coverage_90",
         "val/belief/truth_outscored", "speed/train_images_per_second", "speed/waiting_fraction",
         "speed/drawing_fraction",
     ]  # fmt: skip

@@ -159,3 +159,16 @@ def test_settings_that_differ() -> None:
         Change("a.gone", "2", None),
     ]
     assert compare_settings(default, default) == []
+
+
+def test_credible_sets_that_are_too_small_are_a_sign_of_failure(run: Path) -> None:
+    """Where the distances from the mean alone look calibrated."""
+    file = run / "metrics.json"
+    metrics = json.loads(file.read_text())
+    metrics["belief"]["distance_coverage_90"] = 92.0
+    for coverage, bad in ((33.0, True), (88.0, False)):
+        metrics["credibility"] = {"coverage_90": coverage}
+        file.write_text(json.dumps(metrics))
+        found = {one.diagnostic.key: one.bad for one in diagnose(read_run(run))}
+        assert found["credibility/coverage_90"] == bad
+        assert not found["belief/distance_coverage_90"]

@@ -63,6 +63,7 @@ LAYOUT: dict[str, dict[str, list[str]]] = {
         "coverage of the 50 % and 90 % mean-distance regions [%]": [
             r"val/belief/(distance_)?coverage_\d+$"  # both: a run that was begun before
         ],
+        "coverage of the 50 % and 90 % credible sets [%]": [r"val/credibility/coverage_(50|90)$"],
         "weight near the truth": [r"val/belief/mass_.*"],
         "share of the images in which a particle outscores the truth": [
             r"val/belief/truth_outscored.*"

@@ -118,6 +118,7 @@ def _describe_credible() -> tuple[MetricInfo, ...]:
             f"coverage of the {level} % credible set",
             "%",
             ".0f",
+            HIGHER if level == 90 else NEITHER,  # filters are overconfident; see diagnostics
             limits=PERCENT,
             short=f"{level} % credible set",
             meaning=f"truths in the highest-density set: {level} where calibrated; fewer: "

@@ -43,6 +43,9 @@ DIAGNOSTICS = (
         "The likelihood prefers a wrong pose: no amount of searching would help.",
     ),
     Diagnostic("belief/distance_coverage_90", 75.0, "The belief is overconfident."),
+    Diagnostic(
+        "credibility/coverage_90", 80.0, "Credible sets are too small: the belief is overconfident."
+    ),
     Diagnostic("diagnostics/pairwise_cosine", 0.8, "All particles move in one direction."),
     Diagnostic("diagnostics/offset_r2", 0.1, "Displacements say no more than their mean would."),
     Diagnostic("diagnostics/heading", 0.2, "Particles do not head for the object."),
