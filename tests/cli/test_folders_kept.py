@@ -100,3 +100,17 @@ def test_the_settings_of_several_jobs_are_not_shown_as_one(
     assert run_command("train", HOME, ["--cfg", "job", "-m", "seed=0,1"]) == 2
     (line,) = capfd.readouterr().err.splitlines()
     assert line == "train: --cfg shows the settings of one job; leave -m out"
+
+
+def test_the_folder_of_all_runs_is_no_runs_own(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run = fill(tmp_path / "runs" / "first")
+    (run / ".hydra" / "config.yaml").write_text("seed: 7")
+    typed = [f"out={run.parent}", "data.root=/nonexistent", "console=json"]
+    assert run_command("train", HOME, typed) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line == (
+        f"train: out={run.parent}: holds other runs, such as first; choose a folder of its own"
+    )
+    assert [path.name for path in run.parent.iterdir()] == ["first"]

@@ -51,6 +51,8 @@ class KeepResults(Callback):
                 refuse(folder, "an evaluation already; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
             refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
+        elif config.hydra.job.name == "train" and (other := find_run_within(folder)):
+            refuse(folder, f"other runs, such as {other.name}; choose a folder of its own")
         hold_folder(folder)
 
 
@@ -83,6 +85,12 @@ def hold_folder(folder: Path) -> None:
 def holds_run(folder: Path) -> bool:
     """Tell whether a training has been there."""
     return (folder / "metrics.json").is_file() or (folder / "checkpoints").is_dir()
+
+
+def find_run_within(folder: Path) -> Path | None:
+    """Return a run that has a folder of its own inside another; None where there is none."""
+    found = folder.glob("*/.hydra/config.yaml")
+    return min((path.parents[1] for path in found), default=None)
 
 
 def holds_evaluation(folder: Path) -> bool:
