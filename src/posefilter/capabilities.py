@@ -7,6 +7,7 @@ component is provided by the method or by one of its components. A new method is
 and drawn by these names alone.
 """
 
+import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -73,10 +74,25 @@ class Declared(NamedTuple):
 
 
 def read_declared(kind: type) -> Declared:
-    """Return what a class declares, itself or by a parent."""
-    return Declared(
-        frozenset(getattr(kind, "provides", ())), frozenset(getattr(kind, "requires", ()))
-    )
+    """Return what a class declares, itself or by a parent.
+
+    Raises UserError where it does not declare capabilities.
+    """
+    return Declared(*(_read_names(kind, which) for which in Declared._fields))
+
+
+def _read_names(kind: type, which: str) -> frozenset[str]:
+    names = getattr(kind, which, ())
+    where = f"{kind.__module__}.{kind.__qualname__}.{which}"
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise UserError(f"{where}={names!r}: must be a tuple, such as {which} = ('rollout',)")
+    names = [*names]
+    for name in names:
+        if name not in MEANINGS:
+            near = difflib.get_close_matches(str(name), MEANINGS, n=1, cutoff=0.5)
+            told = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(MEANINGS)}"
+            raise UserError(f"{where}: there is no capability {name!r}; {told}")
+    return frozenset(names)
 
 
 def list_parts(thing: Any) -> list[Any]:

@@ -5,7 +5,6 @@ Torch is not imported for it: components of posefilter are read from their sourc
 """
 
 import ast
-import importlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
@@ -17,9 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
+from posefilter.cli.instantiate import locate
 from posefilter.cli.options import Groups, list_places, list_targets, open_groups
 from posefilter.cli.plain import find
-from posefilter.cli.trust import Scope, check_name, is_plugin
+from posefilter.cli.trust import Scope, check_name, is_component, is_listed, is_plugin
 from posefilter.errors import UserError
 
 _LINK = re.compile(r"\$\{([\w.]+)\}")
@@ -105,12 +105,13 @@ def declared_by(target: str, key: str, scope: Scope) -> Declared:
         scope: Where the settings come from.
 
     Raises:
-        UserError: It may not be built from there.
+        UserError: It may not be built from there, or is not there.
     """
     check_name(target, key, scope)
     module, _, name = target.rpartition(".")
-    if is_plugin(target):
-        found = vars(importlib.import_module(module)).get(name)
+    unknown = is_component(module, scope) and name not in parse_module(module)
+    if is_plugin(target) or (unknown and not is_listed(target, scope)):  # told if it is not there
+        found = locate(target, key, scope)
         return read_declared(found) if isinstance(found, type) else Declared()
     return Declared(
         *(frozenset(read_attribute(module, name, which) or ()) for which in Declared._fields)
@@ -204,7 +205,10 @@ def list_fitting(
     found = {name for _, name in find_missing(component.declared for component in components)}
     fitting = []
     for option in options:
-        own = [declared_by(target, key, scope) for key, target in option.targets().items()]
+        try:
+            own = [declared_by(target, key, scope) for key, target in option.targets().items()]
+        except UserError:  # a draft, which is not chosen
+            continue
         offered = _union(declared.provides for declared in own)
         fits = _union(declared.requires for declared in own) <= provided | offered
         breaks = required - provided - offered - found

@@ -6,6 +6,8 @@ import difflib
 import functools
 import importlib
 import inspect
+import pkgutil
+import sys
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +25,7 @@ from posefilter.cli.trust import (
     listed_in,
     trust,
 )
-from posefilter.errors import UserError
+from posefilter.errors import UserError, find_reason
 
 __all__ = [
     "accepted",
@@ -118,6 +120,9 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
         raise UserError(f"{where}._target_={name}: is now {new}")
     check_name(name, where, scope)
     module, _, attribute = name.rpartition(".")
+    listed, plugin = is_listed(name, scope), is_plugin(name)
+    # a class of one's own changes its name more often than the files that name it
+    old = "; was it renamed after the checkpoint?" if plugin and scope is Scope.RECIPE else ""
     try:
         home = importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -125,8 +130,17 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
             raise UserError(
                 f"{where}._target_={name}: needs the package '{error.name}', which is not installed"
             ) from error
-        raise UserError(f"{where}._target_={name}: there is no module {module}") from error
-    listed, plugin = is_listed(name, scope), is_plugin(name)
+        near = hint(error.name or module, _list_modules(error.name or module))
+        raise UserError(
+            f"{where}._target_={name}: there is no module {error.name or module}{near}{old}"
+        ) from error
+    except (Exception, SystemExit) as error:
+        if not plugin:
+            raise
+        raise UserError(
+            f"{where}._target_={name}: {module} could not be imported ({type(error).__name__}: "
+            f"{find_reason(error)})"
+        ) from error
     own = plugin or is_component(module, scope)
     found = vars(home).get(attribute)
     if found is None or not (listed or (own and _defined_in(found, module, attribute))):
@@ -136,11 +150,18 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
         ]
         raise UserError(
             f"{where}._target_={name}: there is no '{attribute}' defined in "
-            f"{module}{hint(attribute, known)}"
+            f"{module}{hint(attribute, known)}{old}"
         )
     if not (listed or inspect.isclass(found) or (plugin and inspect.isfunction(found))):
         raise UserError(f"{where}._target_={name}: is no class")
     return typing.cast(Callable[..., Any], found)
+
+
+def _list_modules(module: str) -> list[str]:
+    """Return the modules beside one that is not there."""
+    package = module.rpartition(".")[0]
+    folders = getattr(sys.modules.get(package), "__path__", [])
+    return [f"{package}.{found.name}" for found in pkgutil.iter_modules(folders)]
 
 
 def _defined_in(thing: Any, module: str, name: str) -> bool:

@@ -1,11 +1,14 @@
 """The choices of Hydra's groups, those of plug-ins' folders included, and what each sets."""
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple
 
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from posefilter.cli.plain import to_plain
 from posefilter.paths import find_conf
@@ -66,7 +69,11 @@ class Groups:
         """Read all choices of a group."""
         # not the loader's own get_group_options, which copies every file that it has read
         names = self._loader.repository.get_group_options(group.partition("@")[0])
-        return [self.load(group, name) for name in names if not name.startswith("_")]
+        options = []
+        for name in names:
+            with suppress(HydraException, OmegaConfBaseException, YAMLError):  # an unreadable draft
+                options += [] if name.startswith("_") else [self.load(group, name)]
+        return options
 
     def _load(self, group: str, name: str) -> Option:
         folder, _, package = str(group).partition("@")
