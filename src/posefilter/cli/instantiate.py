@@ -40,6 +40,7 @@ __all__ = [
 Variant = Callable[[Any], Callable[..., Any]]
 _LIBRARIES = ("torch.", "lightning.")
 _PLAIN = (bool, int, float, str)
+_CALLED_LATER = ("optimizer", "scheduler")  # with what only a trainer knows
 
 
 def instantiate(node: Any, where: str, **given: Any) -> Any:
@@ -223,12 +224,14 @@ def check_arguments(
     for name, value in arguments.items():
         if name in known and not fits(value, known[name].annotation):
             raise UserError(f"{where}.{name}={value!r}: must be {describe(known[name].annotation)}")
+    later = where.rpartition(".")[2] in _CALLED_LATER
     # others' parents may be given what the child works out
-    if partial or not target.__module__.startswith("posefilter."):
+    if partial or not (later or target.__module__.startswith("posefilter.")):
         return
     for name, parameter in known.items():
         if parameter.default is parameter.empty and name not in arguments and name not in given:
-            raise UserError(f"{where}.{name}: is missing, and has no default")
+            call = "; it is called later: add `_partial_: true`" if later else ""
+            raise UserError(f"{where}.{name}: is missing, and has no default{call}")
 
 
 def fits(value: Any, wanted: Any) -> bool:

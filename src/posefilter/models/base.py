@@ -33,6 +33,7 @@ from posefilter.geometry.spaces import PoseSpace
 from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import clip_submodules
+from posefilter.models.lr_schedulers import find_length
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -57,7 +58,8 @@ class PoseEstimator(Module):
         filter: Run in validation and test.
         loss: Given a training trace; returns one value for each image.
         optimizer: Given (name, parameter) pairs.
-        scheduler: Given the optimizer and the number of steps; advanced at each step.
+        scheduler: Given the optimizer, and the number of steps where it has a parameter for it
+            (`lr_schedulers.LENGTHS`); advanced at each step.
         train_filter: Rolled out in training; None: `filter`.
         seed: Decides every random draw, together with the epoch and the batch's number.
     """
@@ -77,13 +79,15 @@ class PoseEstimator(Module):
         filter: ParticleFilter,
         loss: Loss,
         optimizer: Callable[[Iterable[tuple[str, nn.Parameter]]], Optimizer],
-        scheduler: Callable[[Optimizer, int], LRScheduler] | None = None,
+        scheduler: Callable[..., LRScheduler] | None = None,
         train_filter: ParticleFilter | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
+        if scheduler is not None:
+            find_length(scheduler)  # a setting that is missing is told before the training begins
         self._object_model: ObjectModel | None = None
         self._first: tuple[nn.Module, ...] = ()  # the first module that has weights
         self._scores: Any = None  # made when they are first asked for
@@ -295,7 +299,9 @@ class PoseEstimator(Module):
         )
         if self.make_scheduler is None:
             return optimizer
-        scheduler = self.make_scheduler(optimizer, int(self.trainer.estimated_stepping_batches))
+        length = find_length(self.make_scheduler)
+        steps = int(self.trainer.estimated_stepping_batches) if length else 0
+        scheduler = self.make_scheduler(optimizer, **({length: steps} if length else {}))
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": scheduler, "interval": "step"},

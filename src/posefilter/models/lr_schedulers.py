@@ -1,9 +1,41 @@
 """Learning-rate schedules over a run's steps."""
 
+import inspect
 import math
+from collections.abc import Callable
+from typing import Any
 
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
+
+from posefilter.errors import UserError
+
+# parameters of a schedule that are given the number of steps of the training
+LENGTHS = ("steps", "total_steps", "max_steps", "T_max")
+
+
+def find_length(make: Callable[..., Any]) -> str | None:
+    """Return the parameter of a schedule that is given the number of steps, where it is not set;
+    None for one that needs no length.
+
+    Args:
+        make: Given the optimizer, and the number of steps by the name of the parameter.
+
+    Raises:
+        UserError: It needs another setting, which is missing.
+    """
+    parameters = [*inspect.signature(make).parameters.values()][1:]  # the first is the optimizer
+    settings = getattr(make, "keywords", {})
+    unset = [one for one in parameters if one.name not in settings]
+    length = next((one.name for one in unset if one.name in LENGTHS), None)
+    for one in unset:
+        named = one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)
+        if named and one.default is one.empty and one.name != length:
+            raise UserError(
+                f"scheduler.{one.name}: is missing, and has no default; the number of steps is "
+                f"given to a parameter {', '.join(LENGTHS[:-1])} or {LENGTHS[-1]}"
+            )
+    return length
 
 
 def warmup_cosine(

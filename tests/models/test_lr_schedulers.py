@@ -1,0 +1,93 @@
+"""A schedule is given the number of steps by the name of its parameter, and only where it has
+one.
+"""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.optim import lr_scheduler
+
+from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.command import compose_job
+from posefilter.errors import UserError
+from posefilter.models.base import PoseEstimator
+from posefilter.models.lr_schedulers import warmup_cosine
+
+CONF = Path(__file__).parents[2] / "conf"
+STEPS, RATE = 40, 0.5
+
+
+def build(**scheduler: Any) -> PoseEstimator:
+    job = compose_job("train", CONF, ["model=cnn_patch", "optimizer.lr=0.5"], Path())
+    job.cfg.scheduler = scheduler
+    return build_method(recipe(job))
+
+
+def schedule(**scheduler: Any) -> Any:
+    """Return the schedule of a training of 40 steps."""
+    method = build(**scheduler)
+    method.__dict__["_trainer"] = type("Trainer", (), {"estimated_stepping_batches": STEPS})
+    return method.configure_optimizers()["lr_scheduler"]["scheduler"]
+
+
+@pytest.fixture(autouse=True)
+def a_trainer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        PoseEstimator, "trainer", property(lambda self: self._trainer), raising=False
+    )
+
+
+TORCH = {
+    "ConstantLR": {},
+    "CosineAnnealingLR": {},
+    "ExponentialLR": {"gamma": 0.9},
+    "LinearLR": {"total_iters": 7},
+    "MultiStepLR": {"milestones": [3, 5]},
+    "OneCycleLR": {"max_lr": 1.0},
+    "StepLR": {"step_size": 3},
+}
+LENGTH = {"CosineAnnealingLR": "T_max", "OneCycleLR": "total_steps"}
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_torchs_schedules_are_what_their_settings_say(name: str) -> None:
+    made = schedule(_target_=f"torch.optim.lr_scheduler.{name}", _partial_=True, **TORCH[name])
+    length = {LENGTH[name]: STEPS} if name in LENGTH else {}
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=RATE)
+    same = getattr(lr_scheduler, name)(optimizer, **TORCH[name], **length)
+    for _ in range(STEPS - 1):
+        assert made.get_last_lr()[0] == same.get_last_lr()[0]
+        for one in (made, same):
+            one.optimizer.step()
+            one.step()
+
+
+def test_a_length_that_is_set_is_kept() -> None:
+    name = "torch.optim.lr_scheduler.CosineAnnealingLR"
+    assert schedule(_target_=name, _partial_=True, T_max=9).T_max == 9
+
+
+def test_the_projects_own_takes_the_trainings_steps() -> None:
+    made = schedule(_target_="posefilter.models.lr_schedulers.warmup_cosine", _partial_=True)
+    optimizer = torch.optim.Adam([torch.zeros(1, requires_grad=True)], lr=RATE)
+    same = partial(warmup_cosine)(optimizer, STEPS)
+    assert [made.lr_lambdas[0](i) for i in range(STEPS)] == [
+        same.lr_lambdas[0](i) for i in range(STEPS)
+    ]
+
+
+MISTAKES = {
+    ("ExponentialLR", True): r"scheduler\.gamma: is missing, and has no default; the number of",
+    ("StepLR", True): r"scheduler\.step_size: is missing",
+    ("ConstantLR", False): r"scheduler\.optimizer: is missing.*add `_partial_: true`",
+}
+
+
+@pytest.mark.parametrize(("name", "partial"), MISTAKES)
+def test_what_is_missing_is_told_when_the_method_is_built(name: str, partial: bool) -> None:
+    with pytest.raises(UserError, match=MISTAKES[name, partial]) as told:
+        build(_target_=f"torch.optim.lr_scheduler.{name}", _partial_=partial)
+    assert "\n" not in str(told.value)
