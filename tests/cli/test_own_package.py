@@ -1,13 +1,16 @@
 """What the author of a plug-in gets wrong is told in one line, and what he typed is told again."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from posefilter.cli import run_command, trust
+import posefilter
+from posefilter.cli import console, run_command, trust
 from posefilter.cli.command import compose_job
 from posefilter.cli.fit import check_fit
+from posefilter.cli.instantiate import instantiate
 from posefilter.cli.trust import Scope
 from posefilter.errors import UserError
 
@@ -96,3 +99,126 @@ def test_a_capability_that_is_none_is_told(
     with pytest.raises(UserError) as error:
         check_fit(job.cfg, job.choices, Scope.CONFIG)
     assert str(error.value) == told
+
+
+@pytest.fixture
+def own_folder(tmp_path: Path) -> Path:
+    """Return a folder of settings with the one choice loss=own."""
+    file = tmp_path / "my own" / "loss" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text((CONF / "loss" / "bce.yaml").read_text() + "\ngama: 2.0\n")
+    return file.parents[1]
+
+
+def test_a_choice_with_the_name_of_another_is_refused(
+    own_folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    same = own_folder / "loss" / "add.yaml"
+    same.write_text((CONF / "loss" / "add.yaml").read_text())
+    typed = ["--config-dir", str(own_folder), "--cfg", "job", "model=patch_pf", "loss=own"]
+    assert run_command("train", HOME, typed) == 0  # the same file twice
+    capfd.readouterr()
+    same.write_text("_target_: ownpf.method.Own\n")
+    assert run_command("train", HOME, typed) == 2
+    (said,) = capfd.readouterr().err.strip().splitlines()
+    assert str(same) in said
+    assert str(CONF / "loss" / "add.yaml") in said
+
+
+def test_a_hint_knows_the_choices_of_ones_own(
+    own_folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["--config-dir", str(own_folder), "model=patch_pf", "loss=own", "loss.gamma=3"]
+    assert run_command("train", HOME, typed) == 2
+    said = capfd.readouterr().err
+    assert "loss.gamma: there is no such setting; did you mean 'loss.gama'?" in said
+
+
+def test_advice_has_what_was_typed_of_plug_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = ["train.py", "--config-dir", "my own", "plugins=[ownpf,more]", "loss=own"]
+    monkeypatch.setattr(sys, "argv", typed)
+    line = "python train.py --config-dir 'my own' resume=run 'plugins=[ownpf,more]'"
+    assert console.typed("train", resume="run") == line
+    assert console.typed("train", resume="run", plugins=["ownpf", "more"]) == line
+    assert "--config-dir 'my own'" in console.typed_prediction(Path("a.ckpt"))
+    monkeypatch.setattr(sys, "argv", ["train.py", "loss=own", "plugins=[]"])
+    assert console.typed("train", resume="run") == "python train.py resume=run"
+
+
+@pytest.fixture
+def with_choices(package: Path) -> Path:
+    """Return the folder of the plug-in with the choice loss=own inside."""
+    file = package / "conf" / "loss" / "own.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text((CONF / "loss" / "bce.yaml").read_text())
+    return package
+
+
+@pytest.fixture
+def entry_point(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Have the plug-in installed rather than named."""
+
+    class Point:
+        name, value = "mine", "ownpf"
+
+    trust.installed.cache_clear()
+    monkeypatch.setattr(trust, "_trusted", set())
+    monkeypatch.setattr(trust, "entry_points", lambda group: [Point()])
+    yield
+    trust.installed.cache_clear()
+
+
+def test_a_trusted_package_brings_its_choices(
+    with_choices: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed = ["model=patch_pf", "loss=own"]
+    assert posefilter.compose(typed).loss._target_ == "posefilter.losses.likelihood.Bce"
+    monkeypatch.setattr(trust, "_trusted", set())
+    with pytest.raises(posefilter.UserError, match="loss=own: there is no such choice"):
+        posefilter.compose(typed)
+    posefilter.trust("ownpf")
+    assert posefilter.compose(typed).loss._target_ == "posefilter.losses.likelihood.Bce"
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_so_it_does_on_the_command_line(
+    named: bool,
+    with_choices: Path,
+    entry_point: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    plugins = ["plugins=[ownpf]"] if named else []
+    if named:
+        monkeypatch.setattr(trust, "entry_points", lambda group: [])
+    typed = [*plugins, "model=patch_pf", "loss=own"]
+    assert run_command("train", HOME, [*typed, "--cfg", "job"]) == 0
+    assert run_command("train", HOME, [*plugins, "--help"]) == 0
+    assert " own " in capfd.readouterr().out
+
+
+def test_an_installed_plug_in_that_cannot_be_used_is_warned_of(
+    with_choices: Path, entry_point: None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It stops those commands alone that use it."""
+    (with_choices / "__init__.py").write_text("import no_such_package_at_all\n")
+    run_command("report", HOME, [f"run={tmp_path}"])
+    first, *others = capfd.readouterr().err.strip().splitlines()
+    assert first == (
+        "warning: installed plug-in ownpf (entry point mine): there is no package "
+        "'no_such_package_at_all' (is it installed?)"
+    )
+    assert not any("ownpf" in line for line in others)
+    with pytest.raises(UserError, match="needs the package 'no_such_package_at_all'"):
+        instantiate({"_target_": "ownpf.method.OwnScore"}, "loss")
+
+
+def test_so_is_one_whose_choice_has_the_name_of_another(
+    with_choices: Path, entry_point: None, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (with_choices / "conf" / "loss" / "add.yaml").write_text("_target_: ownpf.method.Own\n")
+    run_command("report", HOME, [f"run={tmp_path}"])
+    assert "which would be read in its place" in capfd.readouterr().err
+    posefilter.trust("ownpf")
+    with pytest.raises(UserError, match="which would be read in its place"):
+        posefilter.compose()

@@ -12,6 +12,15 @@ import pytest
 HOME = Path(__file__).parents[2]
 
 
+def build(source: Path, out: Path) -> set[str]:
+    """Build a wheel, and return what is in it."""
+    command = [sys.executable, "-m", "pip", "wheel", str(source), "--no-deps", "--quiet"]
+    subprocess.run([*command, "--no-build-isolation", "-w", str(out)], check=True)
+    (wheel,) = out.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        return set(archive.namelist())
+
+
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
     """Build the wheel from a copy of the sources, and return what is in it."""
@@ -22,11 +31,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
         shutil.copytree(HOME / folder, source / folder, ignore=ignored)
     for file in ("setup.py", "pyproject.toml", "MANIFEST.in", "README.md", "LICENSE"):
         shutil.copy(HOME / file, source)
-    build = [sys.executable, "-m", "pip", "wheel", str(source), "--no-deps", "--quiet"]
-    subprocess.run([*build, "--no-build-isolation", "-w", str(out)], check=True)
-    (wheel,) = out.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        return set(archive.namelist())
+    return build(source, out)
 
 
 def test_every_file_that_is_read_is_in_the_wheel(names: set[str]) -> None:
@@ -50,3 +55,13 @@ def test_nothing_else_is_installed(names: set[str]) -> None:
         "posefilter",
         f"posefilter-{version('posefilter')}.dist-info",
     }
+
+
+def test_the_examples_wheel_has_its_choices(tmp_path: Path) -> None:
+    pytest.importorskip("setuptools", minversion="69")
+    shutil.copytree(HOME / "examples" / "plugin", tmp_path / "source")
+    names = build(tmp_path / "source", tmp_path / "out")
+    package = HOME / "examples" / "plugin"
+    choices = {str(f.relative_to(package)) for f in package.rglob("conf/**/*.yaml")}
+    assert len(choices) >= 4
+    assert choices <= names

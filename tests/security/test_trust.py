@@ -64,12 +64,12 @@ def test_what_it_imports_is_not(name: str, package: str) -> None:
 def test_some_packages_cannot_be_plug_ins(name: str, package: str) -> None:
     with pytest.raises(UserError, match="plugins="):
         trust.trust(name)
-    assert trust.trusted() == trust.installed()
+    assert trust.trusted() == {*trust.installed()}
 
 
 def test_an_installed_entry_point_is_trusted(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Point:
-        value = "my_plugin"
+        name, value = "own", "my_plugin"
 
     trust.installed.cache_clear()
     monkeypatch.setattr(

@@ -34,14 +34,24 @@ def npz_scenes(tiny_scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def train(root: Path, out: Path, *typed: str) -> int:
-    folder = ["--config-dir", str(PLUGIN / "conf"), "plugins=[posefilter_example]"]
-    return run_command("train", None, [*folder, *TINY, f"data.root={root}", f"out={out}", *typed])
+    own = ["plugins=[posefilter_example]", *TINY, f"data.root={root}", f"out={out}"]
+    return run_command("train", None, [*own, *typed])
+
+
+@pytest.fixture
+def forget_trust(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Trust nothing that another test has, and forget what this one does."""
+    monkeypatch.setattr("posefilter.cli.trust._trusted", set())
+    installed.cache_clear()
+    yield
+    installed.cache_clear()
 
 
 @pytest.mark.slow
 def test_method_reader_and_loss_of_ones_own(
     npz_scenes: Path,
     tmp_path: Path,
+    forget_trust: None,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
@@ -95,15 +105,6 @@ def entry_point(tmp_path: Path) -> Path:
     return about.parent
 
 
-@pytest.fixture
-def forget_trust(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Trust nothing that another test has, and forget what this one does."""
-    monkeypatch.setattr("posefilter.cli.trust._trusted", set())
-    installed.cache_clear()
-    yield
-    installed.cache_clear()
-
-
 @pytest.mark.slow
 def test_likelihood_of_ones_own(
     tiny_scenes: Path,
@@ -135,4 +136,5 @@ def test_likelihood_of_ones_own(
     installed.cache_clear()
     monkeypatch.syspath_prepend(str(entry_point))
     assert run_command("predict", None, typed) == 0
+    assert run_command("train", None, ["--cfg", "job", "model/likelihood=linear"]) == 0
     assert json.loads((tmp_path / "found" / "pose.json").read_text())["score"] == pose["score"]

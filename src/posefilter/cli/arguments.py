@@ -10,6 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from posefilter.cli.instantiate import hint
 from posefilter.cli.renamed import rename
+from posefilter.cli.trust import find_folders, named, trusted
 from posefilter.errors import UserError
 
 MULTIRUN = ("-m", "--multirun")
@@ -175,13 +176,13 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         if own and group != key:
             raise UserError(f"{argument}: names a choice; type {group}={value}")
         if own and _is_several(group, value):
-            check_several(group, value, [conf, *config_folders(arguments)])
+            check_several(group, value, [conf, *choice_folders(arguments)])
         elif own and value.startswith(("[", "{")):
             options = list_choices(conf / group)
             there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
             raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
         if key == "preset" and value != "null":
-            check_preset(value, [conf, *config_folders(arguments)])
+            check_preset(value, [conf, *choice_folders(arguments)])
         now = (
             None
             if own and (conf / group / f"{value}.yaml").is_file()
@@ -190,6 +191,22 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         if now is not None:
             raise UserError(f"{argument}: is now {now}")
     check_variants(arguments, conf)
+    check_names([conf, *find_folders(named()), *config_folders(arguments)])
+
+
+def check_names(folders: Sequence[Path]) -> None:
+    """Raise UserError where a file of a later folder has the name of one of an earlier folder,
+    which Hydra would read instead.
+    """
+    first = dict[Path, Path]()
+    for folder in folders:
+        for file in sorted(folder.rglob("*.yaml")):
+            other = first.setdefault(file.relative_to(folder), file)
+            if other.read_bytes() != file.read_bytes():
+                raise UserError(
+                    f"{file}: has the name of {other}, which would be read in its place; give it "
+                    "another name"
+                )
 
 
 def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
@@ -242,9 +259,23 @@ def check_preset(name: str, folders: Sequence[Path]) -> None:
 
 
 def config_folders(arguments: Sequence[str]) -> list[Path]:
-    """Return the folders of settings that were typed by --config-dir (or -cd)."""
+    """Return the folder of settings that was typed by --config-dir (or -cd): of several, Hydra
+    takes the last.
+    """
     words = [part for a in arguments for part in a.split("=", 1)]
-    return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")]
+    return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")][-1:]
+
+
+def choice_folders(arguments: Sequence[str]) -> list[Path]:
+    """Return the folders that add to the choices: of plug-ins, and typed ones."""
+    return [*find_folders(trusted()), *config_folders(arguments)]
+
+
+def typed_plugins(arguments: Sequence[str]) -> list[str]:
+    """Return the packages that were typed by `plugins=[...]`."""
+    typed = [a.partition("=")[2] for a in arguments if re.match(r"\+{0,2}plugins=", a)]
+    words = re.split(r"[\[\],\s'\"]+", typed[-1]) if typed else []
+    return [word for word in words if re.fullmatch(r"[A-Za-z_][\w.]*", word) and word != "null"]
 
 
 def defer_settings(arguments: Sequence[str], conf: Path) -> list[str]:

@@ -27,6 +27,7 @@ from posefilter.cli.arguments import (
     quoted,
     spelled,
     told_apart,
+    typed_plugins,
     with_home,
     without_deletion,
     without_trace,
@@ -40,6 +41,8 @@ from posefilter.cli.ranks import STARTED
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.running import EXPECTED, run_job
+from posefilter.cli.search_path import add_plugin_folders
+from posefilter.cli.trust import trust
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
     FAILURE,
@@ -75,12 +78,15 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
     register_resolvers()
+    add_plugin_folders()
     show_all_signs()
     before, begun, kept = sys.argv, list[Job](), list[Job]()
     started = os.environ.get(STARTED)
     os.environ[STARTED] = name
     record: dict[Path, bytes] = {}
     try:
+        for package in typed_plugins(arguments):  # whose choices Hydra is to find
+            trust(package)
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
             return 0
@@ -162,6 +168,7 @@ def register_resolvers() -> None:
 def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Job:
     """Compose a job as the command line would, for tests, tools, and commands that run others."""
     register_resolvers()
+    add_plugin_folders()
     running = GlobalHydra.instance().is_initialized()
     with (
         nullcontext() if running else initialize_config_dir(str(conf.resolve()), version_base="1.3")

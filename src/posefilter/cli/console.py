@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from posefilter.cli.arguments import config_folders, typed_plugins
 from posefilter.cli.ranks import is_follower
 
 JSON = "json"
@@ -73,9 +74,15 @@ def show_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
 def typed(command: str, **settings: Any) -> str:
     """Return a command line that survives the shell and Hydra: `python train.py data.root=DIR`, or
     `posefilter train ...` where that was typed; `__` stands for a dot.
+
+    It has the folder of settings and the plug-ins of the command that is running.
     """
-    program = f"posefilter {command}" if is_installed() else f"python {command}.py"
-    return " ".join([program, *(setting(k.replace("__", "."), v) for k, v in settings.items())])
+    words = [f"posefilter {command}" if is_installed() else f"python {command}.py"]
+    for folder in config_folders(sys.argv[1:]):
+        words += ["--config-dir", shlex.quote(str(folder))]
+    plugins = typed_plugins(sys.argv[1:])
+    settings |= {"plugins": plugins} if plugins and "plugins" not in settings else {}
+    return " ".join([*words, *(setting(k.replace("__", "."), v) for k, v in settings.items())])
 
 
 def typed_prediction(checkpoint: Path) -> str:

@@ -16,6 +16,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from posefilter.cli.arguments import config_folders
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename, rename_argument
@@ -132,6 +133,8 @@ def compose_without(wrong: str, name: str, conf: Path, arguments: list[str]) -> 
     others are wrong too.
     """
     good = [a for a in arguments if "=" in a and not a.startswith(("-", wrong)) and "," not in a]
+    folders = ",".join(f"'file://{folder.resolve()}'" for folder in config_folders(arguments))
+    good += [f"hydra.searchpath=[{folders}]"] if folders else []
     with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
         try:
             return compose(name, good, return_hydra_config=True)

@@ -11,6 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from posefilter.cli.plain import to_plain
+from posefilter.cli.search_path import add_plugin_folders
 from posefilter.paths import find_conf
 
 
@@ -101,7 +102,10 @@ def _merge(old: Any, new: Any) -> Any:
 
 @contextmanager
 def open_groups() -> Iterator[Groups]:
-    """Yield the groups of the running command, else those of the project's own folder."""
+    """Yield the groups of the running command, else those of the project's own folder and of
+    plug-ins.
+    """
+    add_plugin_folders()
     if GlobalHydra.instance().is_initialized():
         yield Groups(GlobalHydra.instance().config_loader())
     else:

@@ -14,6 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from posefilter.cli.arguments import check_names
 from posefilter.cli.console import JSON, say, settle_logging
 from posefilter.cli.explain import first_line
 from posefilter.cli.fit import check_fit
@@ -27,9 +28,10 @@ from posefilter.cli.folders import (
 from posefilter.cli.job import Job, check_settings
 from posefilter.cli.preflight import check_files
 from posefilter.cli.replaced import replace_typed
-from posefilter.cli.trust import Scope, installed, trust
+from posefilter.cli.trust import Scope, find_folders, installed, named, trust
 from posefilter.errors import Carrier, UserError
 from posefilter.locks import release
+from posefilter.paths import find_conf
 
 Work = Callable[[Job], Any]
 EXPECTED = (
@@ -101,27 +103,48 @@ def finish_wandb() -> None:
 def use_plugins(cfg: DictConfig) -> None:
     """Trust the packages that the user names in `plugins`; import them, and installed plug-ins.
 
-    Raises UserError where one is not there.
+    An installed plug-in that cannot be used is warned of: the command may not need it.
+
+    Raises UserError where one that is named is not there.
     """
-    named = cfg.get("plugins") or ListConfig([])
-    if not isinstance(named, ListConfig):
+    packages = cfg.get("plugins") or ListConfig([])
+    if not isinstance(packages, ListConfig):
         raise UserError(
-            f"plugins={named}: must be a list of packages, such as plugins=[my_package]"
+            f"plugins={packages}: must be a list of packages, such as plugins=[my_package]"
         )
-    for package in named:
+    for package in packages:
         trust(package)
-    for package in (*named, *installed()):  # they may register readers
+    for package in packages:
+        import_plugin(package)
+    import_installed()
+
+
+def import_installed() -> None:
+    """Import installed plug-ins, which may register readers; warn of one that cannot be used."""
+    for package, name in installed().items():
         try:
-            importlib.import_module(package)
-        except ModuleNotFoundError as error:
-            raise UserError(
-                f"plugins={package}: there is no package '{error.name}' (is it installed?)"
-            ) from error
-        except (Exception, SystemExit) as error:  # a plug-in may not end the run as if it were done
-            raise UserError(
-                f"plugins={package}: could not be imported ({type(error).__name__}: "
-                f"{first_line(error)}); debug=traceback shows where"
-            ) from error
+            import_plugin(package)
+            if package not in named():
+                check_names([find_conf(), *find_folders([package])])
+        except UserError as error:
+            reason = str(error).removeprefix(f"plugins={package}: ")
+            told = f"warning: installed plug-in {package} (entry point {name}): {reason}"
+            print(told, file=sys.stderr)
+
+
+def import_plugin(package: str) -> None:
+    """Import a plug-in, which may register readers.  Raises UserError where that fails."""
+    try:
+        importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"plugins={package}: there is no package '{error.name}' (is it installed?)"
+        ) from error
+    except (Exception, SystemExit) as error:  # a plug-in may not end the run as if it were done
+        raise UserError(
+            f"plugins={package}: could not be imported ({type(error).__name__}: "
+            f"{first_line(error)}); debug=traceback shows where"
+        ) from error
 
 
 def job_of(cfg: DictConfig) -> Job:

@@ -9,13 +9,17 @@ process.
 
 A plug-in is trusted by the user alone: `plugins=[my_package]` on the command line,
 `trust("my_package")` in Python, or an installed distribution with an entry point of the group
-`posefilter.plugins`. What is trusted may be built in both scopes.
+`posefilter.plugins`. What is trusted may be built in both scopes, and the folder `conf` inside the
+package adds its files to the choices.
 """
 
 import sys
+from collections.abc import Iterable
 from enum import Enum
 from functools import cache
 from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
 
 from posefilter.errors import UserError
 
@@ -115,13 +119,33 @@ def trust(package: str) -> None:
 
 def trusted() -> frozenset[str]:
     """Return the plug-ins that the user trusts, installed ones included."""
-    return frozenset(_trusted) | installed()
+    return named() | installed().keys()
+
+
+def named() -> frozenset[str]:
+    """Return the plug-ins that the user has named himself."""
+    return frozenset(_trusted)
 
 
 @cache
-def installed() -> frozenset[str]:
-    """Return the packages of installed plug-ins."""
-    return frozenset(point.value.partition(":")[0] for point in entry_points(group=ENTRY_POINTS))
+def installed() -> dict[str, str]:
+    """Return the packages of installed plug-ins, each with the name of its entry point."""
+    return {point.value.partition(":")[0]: point.name for point in entry_points(group=ENTRY_POINTS)}
+
+
+def find_folders(packages: Iterable[str]) -> list[Path]:
+    """Return the folders of settings inside packages that have one; the packages are not imported,
+    but those around them.
+    """
+    found = []
+    for package in sorted(packages):
+        try:
+            spec = find_spec(package)
+        except (Exception, SystemExit):  # told where it is imported
+            continue
+        places = spec.submodule_search_locations if spec is not None else None
+        found += [Path(place).resolve() / "conf" for place in places or ()]
+    return [folder for folder in found if folder.is_dir()]
 
 
 def is_plugin(name: str) -> bool:

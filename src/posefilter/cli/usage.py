@@ -13,7 +13,7 @@ from typing import NamedTuple
 import yaml
 from hydra.core.config_store import ConfigStore
 
-from posefilter.cli.arguments import config_folders, list_choices
+from posefilter.cli.arguments import choice_folders, list_choices
 from posefilter.cli.console import is_installed
 from posefilter.cli.main import COMMANDS
 
@@ -65,7 +65,8 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
     Args:
         name: The command, such as `train`.
         conf: The folder of the settings.
-        arguments: The command line; folders typed by `--config-dir` add their choices.
+        arguments: The command line; folders typed by `--config-dir`, and those of plug-ins, add
+            their choices.
     """
     text = (conf / f"{name}.yaml").read_text(encoding="utf-8")
     width = max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size((100, 24)).columns))
@@ -75,7 +76,7 @@ def describe_command(name: str, conf: Path, arguments: Sequence[str] = ()) -> st
         for line in text.splitlines()
         if line.startswith(f"# {script}")
     ]
-    groups = list(list_groups(name, [conf, *config_folders(arguments)]))
+    groups = list(list_groups(name, [conf, *choice_folders(arguments)]))
     lines = [f"{name}: {COMMANDS[name]}", ""]
     lines += [
         part
