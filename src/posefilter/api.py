@@ -1,6 +1,6 @@
 """The library's verbs: load what is trained, compose a configuration, build what it describes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,8 +103,11 @@ def compose(overrides: Sequence[str] = (), command: str = "train") -> DictConfig
         The configuration; `folder` is missing in it, since no run has begun.
 
     Raises:
-        UserError: An override names what there is not.
+        UserError: An override names what there is not, or a choice of a training that does not fit
+            the others.
     """
+    if isinstance(overrides, str | Mapping) or not all(isinstance(one, str) for one in overrides):
+        raise UserError(f"overrides={overrides!r}: must be a list, such as ['model=patch_pf']")
     from posefilter.cli.command import compose_config  # Hydra: `load` answers without it
 
     return compose_config(command, [*overrides])
@@ -131,6 +134,7 @@ def build(config: DictConfig, data: "PoseDataModule | None" = None) -> PoseEstim
     Raises:
         UserError: A setting does not fit; the message names it.
     """
+    _check_config(config, "model")
     method = build_method(recipe(Job(config, {}, [], Path(), "train", False)))
     if data is not None:
         data.prepare_data()
@@ -149,9 +153,22 @@ def build_data(config: DictConfig) -> "PoseDataModule":
         UserError: A setting does not fit; the message names it.
     """
     from posefilter.cli.instantiate import instantiate
+    from posefilter.cli.running import import_trusted
     from posefilter.data.module import PoseDataModule  # readers and meshes: `load` needs none
 
+    _check_config(config, "data")
+    import_trusted()  # plug-ins register readers
     data: Any = instantiate(config.data, "data")
     if not isinstance(data, PoseDataModule):
         raise UserError(f"data._target_={config.data.get('_target_')}: is no data module")
     return data
+
+
+def _check_config(config: Any, section: str) -> None:
+    """Raise UserError for what `compose` does not return, or returns for another command."""
+    if not isinstance(config, DictConfig):
+        raise UserError(
+            f"config: is a {type(config).__name__}; give what posefilter.compose returns"
+        )
+    if config.get(section) is None:
+        raise UserError(f"config: has no {section}; give what posefilter.compose returns for train")

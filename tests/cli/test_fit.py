@@ -72,7 +72,11 @@ REFUSED = {
     # which refers to a setting of the methods that see patches
     "model=pose_pf loss=bce": ("loss=bce does not fit model=pose_pf", "choose loss=contrastive"),
     "model=pose_pf loss=add": ("loss=add does not fit model=pose_pf", "choose loss=contrastive"),
-    "model=pose_pf loss=regression": ("labeled rays", "choose loss=contrastive"),
+    "model=pose_pf loss=regression": (
+        "labeled rays",
+        "choose loss=contrastive, or model/candidate_sampler=labeled_rays with "
+        "model/likelihood=paper",
+    ),
     "model=patch_pf loss=contrastive": (
         "candidate poses",
         "choose loss=add, add_s, balanced_bce, bce, belief_nll, belief_nll_pose, chamfer, "
@@ -111,6 +115,9 @@ def test_a_refusal_names_the_choices_that_fit(typed: str, tmp_path: Path) -> Non
     kept = [t for t in typed.split() if not t.startswith(f"{group}=")]
     for name in re.split(r", | or ", names):
         job = compose_job("train", CONF, [*kept, f"{group}={name}"], tmp_path)
+        check_fit(job.cfg, job.choices, Scope.CONFIG)
+    if pair := re.search(r" or (\S+=\S+) with (\S+=\S+)$", said):
+        job = compose_job("train", CONF, [*typed.split(), *pair.groups()], tmp_path)
         check_fit(job.cfg, job.choices, Scope.CONFIG)
 
 

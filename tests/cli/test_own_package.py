@@ -5,13 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.models.toy import square
 
 import posefilter
 from posefilter.cli import console, run_command, trust
+from posefilter.cli.checkpoints import build_method, method_of, recipe
 from posefilter.cli.command import compose_job
 from posefilter.cli.fit import check_fit
 from posefilter.cli.instantiate import instantiate
 from posefilter.cli.trust import Scope
+from posefilter.data.splits import split_records
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -222,3 +225,48 @@ def test_so_is_one_whose_choice_has_the_name_of_another(
     posefilter.trust("ownpf")
     with pytest.raises(UserError, match="which would be read in its place"):
         posefilter.compose()
+
+
+def test_a_package_that_is_not_trusted_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError) as told:
+        instantiate({"_target_": "somebodys.method.Own"}, "model")
+    assert str(told.value).endswith(
+        "packages that you trust: plugins=[somebodys], in Python posefilter.trust('somebodys')"
+    )
+    with pytest.raises(UserError, match=r"plugins=\[\.\.\.\]$"):
+        instantiate({"_target_": "os.system"}, "model")
+
+
+def test_what_is_there_but_not_on_the_list_is_told_so() -> None:
+    name = "torch.optim.lr_scheduler.ReduceLROnPlateau"
+    with pytest.raises(UserError) as told:
+        instantiate({"_target_": name, "_partial_": True}, "scheduler")
+    assert f"scheduler._target_={name}: is not on the list" in str(told.value)
+    assert "StepLR" in str(told.value)
+    assert "a function of a plug-in of yours" in str(told.value)
+    with pytest.raises(UserError, match=r"there is no .StepL. defined .*; did you mean .StepLR."):
+        instantiate({"_target_": "torch.optim.lr_scheduler.StepL", "_partial_": True}, "scheduler")
+
+
+def test_weights_of_another_width_name_the_first(tmp_path: Path) -> None:
+    job = compose_job("train", CONF, ["model=cnn_patch"], tmp_path)
+    method = build_method(recipe(job))
+    method.set_object(square())
+    checkpoint = {
+        "recipe": method.recipe,
+        "object_model": dict(square()._asdict()),
+        "state_dict": dict(method.state_dict()),
+    }
+    assert method_of(checkpoint, lightning=False).latent_width == method.latent_width
+    name = next(key for key, value in checkpoint["state_dict"].items() if value.dim() > 1)
+    shape = tuple(checkpoint["state_dict"][name].shape)
+    checkpoint["state_dict"][name] = checkpoint["state_dict"][name][:1, :1]
+    with pytest.raises(UserError) as told:
+        method_of(checkpoint, lightning=False)
+    other = (1, 1, *shape[2:])
+    assert f"({name} is {other} there, and {shape} here)" in str(told.value)
+
+
+def test_a_dataset_without_any_frame_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=f"data.root: no frames in {tmp_path}$"):
+        split_records([], {"train": 0.8, "val": 0.1, "test": 0.1}, 0, tmp_path)

@@ -127,7 +127,7 @@ def test_likelihood_of_ones_own(
     typed += ["intrinsics=150,150,80,60", "console=json", "threads=1", f"out={tmp_path / 'found'}"]
     posefilter.cli.trust._trusted.clear()
     assert run_command("predict", None, typed) == 2
-    assert "packages that you trust: plugins=[...]" in capfd.readouterr().err
+    assert "packages that you trust: plugins=[posefilter_example]" in capfd.readouterr().err
     assert run_command("predict", None, [*typed, "plugins=[posefilter_example]"]) == 0
     pose = json.loads((tmp_path / "found" / "pose.json").read_text())
     assert pose["object"] == "carton"

@@ -1,5 +1,6 @@
 """Build a method, from a configuration or from a checkpoint that carries its own."""
 
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -144,14 +145,21 @@ def method_of(
     try:
         missing, foreign = method.load_state_dict(state, strict=False)
     except RuntimeError as error:  # tensors of other shapes
+        own = method.state_dict()
+        others = (key for key in own if key in state and state[key].shape != own[key].shape)
+        first = "".join(
+            f" ({key} is {tuple(state[key].shape)} there, and {tuple(own[key].shape)} here)"
+            for key in islice(others, 1)
+        )
         raise UserError(
-            "checkpoint: its weights do not fit the method; they were trained by another version "
-            "of this code"
+            f"checkpoint: its weights do not fit the method{first}; they were trained by another "
+            "version of this code, or of a plug-in"
         ) from error
     if missing or foreign:
+        first = f"{missing[0]} is not there" if missing else f"{foreign[0]} is unknown"
         raise UserError(
             f"checkpoint: its weights do not fit the method ({len(missing)} missing, "
-            f"{len(foreign)} unknown)"
+            f"{len(foreign)} unknown: {first})"
         )
     if checkpoint.get("calibration") is not None:
         if same:

@@ -35,6 +35,7 @@ from posefilter.cli.arguments import (
 from posefilter.cli.components import loosen
 from posefilter.cli.console import logging_for
 from posefilter.cli.explain import explain, explain_hydra, is_launchers
+from posefilter.cli.fit import check_fit
 from posefilter.cli.job import Job, first, plain_name, run_of
 from posefilter.cli.main import COMMANDS
 from posefilter.cli.ranks import STARTED
@@ -42,7 +43,7 @@ from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
 from posefilter.cli.running import EXPECTED, run_job
 from posefilter.cli.search_path import add_plugin_folders
-from posefilter.cli.trust import trust
+from posefilter.cli.trust import Scope, trust
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
     FAILURE,
@@ -185,13 +186,16 @@ def compose_job(name: str, conf: Path, overrides: list[str], folder: Path) -> Jo
 def compose_config(name: str, overrides: list[str]) -> DictConfig:
     """Compose a command's settings as the command line would, for the library.
 
-    Raises UserError where they name what there is not.
+    Raises UserError where they name what there is not, or choices of a training that do not fit.
     """
     conf = find_conf()
     if not (conf / f"{name}.yaml").is_file():
         raise UserError(f"command={name}: there is none; choose {', '.join(COMMANDS)}")
     try:
         check_choices(overrides, conf, name)
-        return compose_job(name, conf, loosen(bracketed(overrides), name), Path()).cfg
+        job = compose_job(name, conf, loosen(bracketed(overrides), name), Path())
+        if name == "train":
+            check_fit(job.cfg, job.choices, Scope.CONFIG)
+        return job.cfg
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(explain(error, name, conf, overrides)) from error

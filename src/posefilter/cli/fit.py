@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
+from itertools import permutations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from omegaconf.errors import InterpolationResolutionError
 
 from posefilter.capabilities import MEANINGS, Declared, find_missing, read_declared
 from posefilter.cli.instantiate import locate
-from posefilter.cli.options import Groups, list_places, list_targets, open_groups
+from posefilter.cli.options import Groups, Option, list_places, list_targets, open_groups
 from posefilter.cli.plain import find
 from posefilter.cli.trust import Scope, check_name, is_component, is_listed, is_plugin
 from posefilter.errors import UserError
@@ -198,16 +199,14 @@ def list_fitting(
         need: What the choice must provide as well; null for nothing.
     """
     options = groups.list_options(group)
-    places = {place for option in options for place in option.targets()}
-    others = [p.declared for p in components if not any(_within(p.key, place) for place in places)]
+    others = _list_others([group], groups, components)
     provided = _union(declared.provides for declared in others)
     required = _union(declared.requires for declared in others)
     found = {name for _, name in find_missing(component.declared for component in components)}
     fitting = []
     for option in options:
-        try:
-            own = [declared_by(target, key, scope) for key, target in option.targets().items()]
-        except UserError:  # a draft, which is not chosen
+        own = _declared_by_option(option, scope)
+        if own is None:
             continue
         offered = _union(declared.provides for declared in own)
         fits = _union(declared.requires for declared in own) <= provided | offered
@@ -215,6 +214,58 @@ def list_fitting(
         if fits and not breaks and (need is None or need in offered):
             fitting.append(option.name)
     return fitting
+
+
+def list_pairs(
+    names: Sequence[str],
+    groups: Groups,
+    components: Sequence[Component],
+    scope: Scope,
+    need: str,
+) -> list[str]:
+    """Return the choices that provide what is needed where another group's choice changes too, as
+    they are typed.
+
+    Args:
+        names: The groups to choose from.
+        groups: Where their choices are read.
+        components: All that is chosen.
+        scope: Where the settings come from.
+        need: What the first choice must provide.
+    """
+    found = {name for _, name in find_missing(component.declared for component in components)}
+    pairs = []
+    for first, second in permutations(names, 2):
+        others = _list_others([first, second], groups, components)
+        for one in groups.list_options(first):
+            own = _declared_by_option(one, scope) or []
+            if need not in _union(declared.provides for declared in own):
+                continue
+            for two in groups.list_options(second):
+                with_it = _declared_by_option(two, scope)
+                if with_it is None:
+                    continue
+                left = {name for _, name in find_missing([*others, *own, *with_it])}
+                if left <= found - {need}:
+                    pairs.append(f"{first}={one.name} with {second}={two.name}")
+    return pairs
+
+
+def _declared_by_option(option: Option, scope: Scope) -> list[Declared] | None:
+    """Return what the classes of a choice declare; None for a draft, which cannot be chosen."""
+    try:
+        return [declared_by(target, key, scope) for key, target in option.targets().items()]
+    except UserError:
+        return None
+
+
+def _list_others(
+    names: Sequence[str], groups: Groups, components: Sequence[Component]
+) -> list[Declared]:
+    """Return what those components declare that no choice of these groups replaces."""
+    options = [option for name in names for option in groups.list_options(name)]
+    places = {place for option in options for place in option.targets()}
+    return [p.declared for p in components if not any(_within(p.key, place) for place in places)]
 
 
 def find_choice(
@@ -257,7 +308,7 @@ def _explain(
         component.key,
         component.target,
     )
-    advice = []
+    advice, others = list[str](), list[str]()
     if group in choices and group != "model":
         fitting = list_fitting(group, groups, components, scope)
         advice += [f"{group}={_either(fitting)}"] if fitting else []
@@ -267,7 +318,12 @@ def _explain(
         }:
             fitting = list_fitting(option.group, groups, components, scope, need)
             advice += [f"{option.group}={_either(fitting)}"] if fitting else []
-    model = "" if group == "model" else f" does not fit model={choices.get('model')}, as it"
+            others.append(option.group)
+    if not any(one.partition("=")[0] in others for one in advice):
+        advice += list_pairs(others, groups, components, scope, need)
+    kinds = [part.target.rpartition(".")[2] for part in components if part.key == "model"]
+    chosen = choices.get("model") or "".join(kinds)
+    model = "" if group == "model" else f" does not fit model={chosen}, as it"
     choose = f"; choose {', or '.join(advice)}" if advice else ""
     return f"{group}={name}{model} needs {MEANINGS.get(need, need)} ({need}){choose}"
 

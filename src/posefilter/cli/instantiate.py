@@ -146,6 +146,11 @@ def locate(name: str, where: str, scope: Scope = Scope.CONFIG) -> Callable[..., 
     found = vars(home).get(attribute)
     if found is None or not (listed or (own and _defined_in(found, module, attribute))):
         known = listed_in(module, scope)
+        if found is not None and not own:
+            raise UserError(
+                f"{where}._target_={name}: is not on the list of what may be built of {module} "
+                f"({', '.join(known)}); a function of a plug-in of yours may return one"
+            )
         known += [
             key for key, value in vars(home).items() if own and _defined_in(value, module, key)
         ]

@@ -119,6 +119,13 @@ def use_plugins(cfg: DictConfig) -> None:
     import_installed()
 
 
+def import_trusted() -> None:
+    """Import the plug-ins that the user of the library trusts, and installed ones."""
+    for package in sorted(named()):
+        import_plugin(package)
+    import_installed()
+
+
 def import_installed() -> None:
     """Import installed plug-ins, which may register readers; warn of one that cannot be used."""
     for package, name in installed().items():

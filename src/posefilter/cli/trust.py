@@ -81,6 +81,7 @@ _CONFIG_NAMES = _RECIPE_NAMES | DATA_NAMES | {
     *(f"lightning.pytorch.loggers.{name}" for name in _LOGGERS),
     *(f"lightning.pytorch.profilers.{name}" for name in _PROFILERS),
 }  # fmt: skip
+_FOREIGN = ("hydra", "lightning", "omegaconf", "posefilter", "torch")  # that are no plug-ins
 _trusted: set[str] = set()
 
 
@@ -106,15 +107,13 @@ def trust(package: str) -> None:
     parts = package.split(".") if isinstance(package, str) else [""]
     if not all(part.isidentifier() for part in parts):
         raise UserError(f"plugins={package!r}: not the name of a package")
-    if parts[0] in sys.stdlib_module_names or parts[0] in (
-        "hydra",
-        "lightning",
-        "omegaconf",
-        "posefilter",
-        "torch",
-    ):
+    if not _may_be_plugin(parts[0]):
         raise UserError(f"plugins={package}: only a package of your own can be a plug-in")
     _trusted.add(package)
+
+
+def _may_be_plugin(package: str) -> bool:
+    return package not in sys.stdlib_module_names and package not in _FOREIGN
 
 
 def trusted() -> frozenset[str]:
@@ -180,10 +179,13 @@ def check_name(name: str, where: str, scope: Scope) -> None:
         or is_plugin(name)
     ):
         return
+    top = name.partition(".")[0]
+    own = plain and "." in name and _may_be_plugin(top)
+    how = f"plugins=[{top}], in Python posefilter.trust('{top}')" if own else "plugins=[...]"
     raise UserError(
         f"{where}._target_={name[:100]!r}: may not be built from {scope.value}; allowed are "
         f"posefilter's own components, "
-        "a list of torch and lightning classes, and packages that you trust: plugins=[...]"
+        f"a list of torch and lightning classes, and packages that you trust: {how}"
     )
 
 

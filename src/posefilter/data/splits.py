@@ -105,6 +105,8 @@ def _divide_images(
     """Return the split of each image: blocks of neighbors, since neighbors are alike."""
     images = sorted({_image(record) for record in records if record.group in scenes})
     parts = ", ".join(fractions)
+    if not records:
+        raise UserError(f"data.root: no frames in {root}")
     if not images:
         raise UserError(
             f"data.split: nothing is left for {parts}, since lists name all scenes; a list alone "

@@ -1,0 +1,35 @@
+"""What a caller of the library gets wrong is told as on the command line."""
+
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+import posefilter
+
+
+def test_choices_that_do_not_fit_are_told_with_what_fits() -> None:
+    with pytest.raises(posefilter.UserError) as told:
+        posefilter.compose(["model=pose_pf", "loss=add"])
+    assert "loss=add does not fit model=pose_pf" in str(told.value)
+    assert str(told.value).endswith("; choose loss=contrastive")
+
+
+def test_a_configuration_that_was_changed_is_told_by_its_classes() -> None:
+    config = posefilter.compose(["model=pose_pf"])
+    config.loss = posefilter.compose(["model=patch_pf", "loss=add"]).loss
+    with pytest.raises(posefilter.UserError, match=r"Add\S* does not fit model=PosePF, as"):
+        posefilter.build(config)
+
+
+@pytest.mark.parametrize("given", ["model=patch_pf", {"model": "patch_pf"}, [1]])
+def test_what_is_no_list_of_settings_is_told(given: Any) -> None:
+    with pytest.raises(posefilter.UserError, match=r"must be a list, such as \['model=patch_pf'\]"):
+        posefilter.compose(given)
+
+
+@pytest.mark.parametrize("given", [None, {"data": {}}, [], OmegaConf.create({"seed": 0})])
+def test_what_is_no_configuration_is_told(given: Any) -> None:
+    for build in (posefilter.build, posefilter.build_data):
+        with pytest.raises(posefilter.UserError, match=r"^config: .*posefilter\.compose returns"):
+            build(given)
