@@ -1,10 +1,18 @@
-"""Every protocol on one page.  Each verb of the filter is one injected component; a Hydra group
-chooses which.
+"""The protocols of the filter on one page.  Each verb of the filter is one injected component; a
+Hydra group chooses which.
 
 DataModule -> Batch -> method.encode -> [measure -> reweight -> resample -> propagate] x
 steps -> estimate -> refine -> BeliefBatch
 
-The order on this page is the order in which filters/loop.py calls them.
+The order on this page is the order in which filters/loop.py calls them.  Elsewhere are
+
+- readers: `BaseReader` in data/readers/base.py; augmentations: `Augment` in data/augmentation.py;
+- pose_pf's candidate samplers: `CandidateSampler` in models/candidate_samplers.py, with
+  `ScoresSamples`; its likelihoods: `PoseLikelihood` in nets/likelihood.py;
+- the displacements of the methods that see patches: `Displacement` in nets/heads.py; box heads:
+  `BoxHead` in models/box_heads.py;
+- encodings with object coordinates: `HasCoordinates` in nets/coordinates.py; likelihoods of points
+  that a figure shows: `ScoresPoints` in callbacks/fields.py.
 """
 
 from typing import Any, Protocol, runtime_checkable

@@ -147,3 +147,9 @@ def test_parts_put_together_in_python_are_matched_too(tmp_path: Path) -> None:
     method.filter.estimate = Agreement()
     with pytest.raises(UserError, match=r"CnnPatch: its Agreement needs .*pose"):
         method.set_object(square())
+
+
+def test_what_each_name_obliges_to_is_written_down() -> None:
+    text = (CONF.parent / "docs" / "architecture.md").read_text()
+    table = text.split("## Capabilities")[1]
+    assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(MEANINGS)
