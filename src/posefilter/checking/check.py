@@ -18,6 +18,7 @@ from posefilter.checking.contact_figure import tile, write_sheet
 from posefilter.checking.frames import Suspect, describe_suspects, is_suspect
 from posefilter.data.frames import Implausible, NotShown
 from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData, UserError
 from posefilter.files import write_whole
@@ -56,10 +57,11 @@ def check_dataset(
         of a single one. Left out are look-alikes of rendered scenes, which have no mesh file.
 
     Raises:
-        UserError: The limit is not positive.
+        UserError: The limit is not positive, or the reader does not keep to its protocol.
     """
     if limit is not None and limit < 1:
         raise UserError(f"max_frames={limit}: compare at least one frame of each object")
+    index_records(reader, reader.records())
     geometry = Geometry(meshes)
     problems = [
         f"{reader.examples.get(cause, cause)} ({count} such)"
@@ -111,7 +113,8 @@ def _check_object(
     reader: BaseReader, geometry: Geometry, name: str, limit: int | None, drawn: int, progress: bool
 ) -> tuple[dict[str, Any], list[str], list[np.ndarray]]:
     """Return an object's row, its problems and its tiles."""
-    mine = [i for i, record in enumerate(reader.records()) if record.object == name]
+    records = reader.records()
+    mine = [i for i, record in enumerate(records) if record.object == name]
     mesh = geometry.mesh(name)
     if mesh is None:
         return _row(name, 0, []), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
@@ -128,7 +131,7 @@ def _check_object(
         flaw = ""
         try:
             try:
-                sample = reader.read(i)
+                sample = read_checked(reader, i, records[i])
             except Implausible as error:
                 sample, flaw = error.sample, str(error)
             view = View(sample, reader.others(i), mesh, native)
@@ -141,11 +144,11 @@ def _check_object(
         fit = compare(view, geometry)
         fits.append(fit)
         if (flaw or is_suspect(view, fit)) and len(suspects) < _LISTED:
-            suspects.append(Suspect(f"{reader.records()[i].name} {name}", view, fit, flaw))
+            suspects.append(Suspect(f"{records[i].name} {name}", view, fit, flaw))
         if len(views) < _TRIED:
             views.append(view)
         if len(tiles) < drawn:
-            tiles.append(tile(view, fit, f"{reader.records()[i].name} {name}"))
+            tiles.append(tile(view, fit, f"{records[i].name} {name}"))
     problems = [
         f"{examples[cause]} ({count} such of {len(chosen)} frames looked at)"
         for cause, count in broken.items()

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from posefilter.data.cache import FrameCache, Prepared
 from posefilter.data.frames import FrameRecord, Sample
 from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.checked import index_records, read_checked
 from posefilter.data.resize import network_size, resize
 from posefilter.errors import BadData
 
@@ -19,6 +20,9 @@ class FrameDecoder:
         width: Of the network's images [px]; None: by the height, or as stored.
         height: Likewise.
         cache: Opens the cache, given `read`.
+
+    Raises:
+        UserError: Two records cannot be told apart.
     """
 
     def __init__(
@@ -31,7 +35,7 @@ class FrameDecoder:
     ) -> None:
         self._reader, self._size = reader, (width, height)
         self.cache = cache(self.read)
-        self._index = {record.key: i for i, record in enumerate(records)}
+        self._index = index_records(reader, records)
 
     def fetch(self, record: FrameRecord) -> Prepared | BadData:
         """Decode a frame into the cache, unless it is there; return the error of a bad one."""
@@ -46,7 +50,7 @@ class FrameDecoder:
         return self.cache.keep(record, sample)
 
     def read(self, record: FrameRecord) -> Sample:
-        """Decode a frame and resize it."""
-        sample = self._reader.read(self._index[record.key])
+        """Decode a frame, see whether it can be right, and resize it."""
+        sample = read_checked(self._reader, self._index[record.key], record)
         height, width = sample.mask.shape
         return resize(sample, *network_size(height, width, *self._size))

@@ -11,6 +11,7 @@ import numpy as np
 
 from posefilter.data.frames import FrameRecord, NotShown
 from posefilter.data.readers.base import BaseReader
+from posefilter.data.readers.checked import read_checked
 from posefilter.data.readers.decode import expect_size, list_folder, read_color, read_depth
 from posefilter.errors import UserError
 
@@ -159,7 +160,7 @@ class SceneVideo(Video):
             if sample is not None and not wanted:
                 continue
             try:
-                sample = self._reader.read(number)
+                sample = read_checked(self._reader, number, record)
             except NotShown:
                 continue
             if wanted:
