@@ -9,7 +9,7 @@ import numpy as np
 from lightning import Callback, LightningModule, Trainer
 
 from posefilter.cli.job import Job
-from posefilter.cli.train import build, rehearse
+from posefilter.cli.train import build, look_once
 
 _STEPS, _SKIPPED = 9, 3  # the first steps fill caches
 _IMAGES = 3
@@ -49,7 +49,7 @@ def measure_speed(job: Job) -> Speed:
     trial = Job(cfg, job.choices, job.overrides, job.folder, job.name, False)
     try:
         run, clock = build(trial), _Clock()
-        images = [_time(lambda: rehearse(run.method, run.data)) for _ in range(_IMAGES)]
+        images = [_time(lambda: look_once(run.method, run.data)) for _ in range(_IMAGES)]
         run.trainer.callbacks.append(clock)  # type: ignore[attr-defined]
         run.trainer.fit(run.method, datamodule=run.data)
     finally:

@@ -30,6 +30,7 @@ from posefilter.data.module import PoseDataModule
 from posefilter.errors import Stopped, UserError
 from posefilter.metrics.results import compute_checkpoint_score
 from posefilter.models.base import PoseEstimator
+from posefilter.models.rehearsal import check_method
 from posefilter.paths import stays_inside
 
 log = logging.getLogger(__name__)
@@ -95,7 +96,19 @@ def build(job: Job) -> Run:
 
 
 def rehearse(method: PoseEstimator, data: PoseDataModule) -> None:
-    """Run the filter on one image before it is trained, as a validation will."""
+    """See whether a method's parts fit before it is trained, on an image of a validation and one
+    of the training.
+
+    Raises:
+        UserError: A part returns other than its protocol says.
+    """
+    frames = data.train_dataset
+    learned = default_collate([frames[0]] * 2) if len(frames) else None
+    check_method(method, default_collate([data.val_dataset[0]]), learned)
+
+
+def look_once(method: PoseEstimator, data: PoseDataModule) -> None:
+    """Run the filter on one image, as a validation will."""
     was_training = method.training
     with torch.no_grad():
         batch = default_collate([data.val_dataset[0]])
