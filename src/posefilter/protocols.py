@@ -75,7 +75,9 @@ class Method(Protocol):
         ...
 
     def encode(self, batch: Batch) -> Encoding:
-        """Encode the images.  Must not use `batch.mask` or `batch.camera_from_object`."""
+        """Encode the images.  Must not use `batch.mask` or `batch.camera_from_object`, which are
+        blank in validation and test.
+        """
         ...
 
     def measure(

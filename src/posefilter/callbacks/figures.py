@@ -23,6 +23,7 @@ from posefilter.callbacks.gallery import (
 )
 from posefilter.callbacks.tensorboard import Budget, post_image
 from posefilter.callbacks.trace_callback import TraceCallback
+from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.geometry.pose_error import subsample
 from posefilter.models.base import PoseEstimator
@@ -130,7 +131,7 @@ class Figures(TraceCallback):
         one, trace, batch = example
         with evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
-            shape, encoding = find_shape(trainer, method), method.encode(batch)
+            shape, encoding = find_shape(trainer, method), method.encode(hide_annotation(batch))
             occasion = Occasion(method, shape, kept, one, trace, batch, encoding, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)

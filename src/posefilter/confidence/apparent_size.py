@@ -84,7 +84,7 @@ def _seen(coordinates: Coordinates, cells: Cells, image: int) -> _Seen:
 def _measure(pose: Tensor, seen: _Seen, object_model: ObjectModel) -> tuple[Tensor, Tensor, Tensor]:
     """Return scale, gain and share of one image."""
     member, share, points, measured = seen
-    if len(member) < _FEWEST:
+    if len(member) < _FEWEST or not bool(pose.isfinite().all()):
         return pose.new_tensor(math.nan), pose.new_zeros(()), pose.new_zeros(())
     exponents = torch.linspace(math.log(_LEAST), math.log(_MOST), _STEPS, device=pose.device)
     scales = exponents.exp().to(pose)  # 1 is the middle one

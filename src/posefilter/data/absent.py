@@ -44,7 +44,9 @@ def find_absent(
 
 
 def hide_annotation(batch: Batch) -> Batch:
-    """Return a batch of images without the object: what is known of other objects is left out."""
+    """Return a batch without mask, pose and visibility: of images without the object, where they
+    are another's, and for a method that is tested, which must not see them.
+    """
     count = len(batch.rgb)
     return batch._replace(
         mask=torch.zeros_like(batch.mask),

@@ -24,6 +24,7 @@ from posefilter.confidence.features import measure_belief, measure_depth, measur
 from posefilter.confidence.second_look import look_again
 from posefilter.confidence.tolerance import RIGHT, measure_pose_errors
 from posefilter.confidence.verdicts import Costs, score_verdicts
+from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.boxes import box_of_pose
@@ -114,7 +115,8 @@ class PoseEstimator(Module):
         """Encode the images; called once for each batch.
 
         Args:
-            batch: B images. `mask` and `camera_from_object` must not be used.
+            batch: B images. `mask` and `camera_from_object` must not be used: in training they are
+                the truth, in validation and test there is nothing in them.
 
         Returns:
             What `measure` is given as `encoding`.
@@ -203,9 +205,15 @@ class PoseEstimator(Module):
         """Set the object, and forget the metrics of another.
 
         Raises:
-            UserError: The method's components do not fit each other; see capabilities.py.
+            UserError: The method's components do not fit each other, see capabilities.py; or it has
+                neither a pose nor a box of its own.
         """
         check_parts(self)
+        if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
+            raise UserError(
+                f"{type(self).__name__}: `provides` lacks pose, so that it needs a box() of its "
+                "own, such as models/box_heads.py has: the default is the box of the pose"
+            )
         self._object_model = object_model
         self._scores = None
 
@@ -355,6 +363,7 @@ class PoseEstimator(Module):
         return self._run(batch, self.generator("predict", batch_number))
 
     def _run(self, batch: Batch, generator: Generator) -> Trace:
+        batch = hide_annotation(batch)  # the truth is for the metrics alone
         return look_again(self, self.filter(batch, self, generator), batch, generator)
 
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
@@ -436,7 +445,10 @@ class PoseEstimator(Module):
         )
 
     def box(self, trace: Trace, batch: Batch) -> Tensor:
-        """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px]."""
+        """Return the bounding box of the object's hull at the estimated pose, (B, 4) [px].
+
+        A method without a pose has one of its own.
+        """
         return PoseBox()(trace, batch, self.object_model)
 
     def particle_pixels(self, particles: Particles, batch: Batch) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 from posefilter.capabilities import Capabilities
 from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
 from posefilter.confidence.features import measure_coordinates
+from posefilter.data.absent import hide_annotation
 from posefilter.errors import UserError
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
@@ -254,16 +255,16 @@ class PosePF(PoseParticles):
         from posefilter.metrics.errors import add, add_s  # trees of scipy: prediction needs none
 
         super().update_metrics(trace, batch)
-        encoding = self.encode(batch)
-        pair = torch.stack([trace.belief.best, batch.camera_from_object], dim=1)
+        encoding = self.encode(hide_annotation(batch))
+        truth, best = batch.camera_from_object, trace.belief.best
+        known = best.isfinite().flatten(1).all(1)  # any other is a miss
+        best = torch.where(known[:, None, None], best, truth)
+        pair = torch.stack([best, truth], dim=1)
         generator = torch.Generator(device=self.device).manual_seed(self.seed)
         sigma = pair.new_tensor(self.comparison_sigma)
         scores = self._score(encoding, pair, sigma, generator, self.comparison_pixels)
-        outscored = scores[:, 0] > scores[:, 1]
-        errors = (
-            error(trace.belief.best, batch.camera_from_object, self.object_model.points)
-            for error in (add, add_s)
-        )
+        outscored = known & (scores[:, 0] > scores[:, 1])
+        errors = (error(best, truth, self.object_model.points) for error in (add, add_s))
         wrong = [outscored & (error > 0.1 * self.object_model.diameter) for error in errors]
         for name, value in zip(_OUTSCORED, (outscored, *wrong), strict=True):
             self.scores[name].update(value.float())

@@ -1,0 +1,86 @@
+"""What validation and test ask of a method of one's own: no truth in its images, a miss where it
+gives no pose, and a box.
+"""
+
+from typing import Any
+
+import pytest
+import torch
+from tests.models.test_pose_pf import working
+from tests.models.test_rehearsal import Own, build
+from tests.models.toy import scenes, square
+
+from posefilter.errors import UserError
+from posefilter.filters.estimate import Argmax
+from posefilter.models.base import PoseEstimator
+from posefilter.types import BeliefBatch
+
+
+class Lost(Argmax):
+    """It has no answer to the first image."""
+
+    def __call__(self, *args: Any) -> BeliefBatch:
+        belief = super().__call__(*args)
+        best = belief.best.clone()
+        best[0] = torch.nan
+        return belief._replace(best=best)
+
+
+def test_an_estimate_that_is_no_number_is_a_miss() -> None:
+    method = working().eval()
+    method.filter.estimate = Lost()
+    with torch.no_grad():
+        method.validation_step(scenes(3), 0)
+    metrics = method.compute_metrics()
+    assert metrics["instances"] == 3
+    assert metrics["missed"] == 1
+    assert 0 <= metrics["belief"]["truth_outscored"] <= 0.67
+    assert metrics["iou"] <= 0.67
+    for name in ("iou", "particles_on_object"):
+        assert metrics[name] == metrics[name]
+
+
+class Peeks(Own):
+    """Its images are the mask and the place of the truth."""
+
+    def encode(self, batch: Any) -> Any:
+        self.asked = (batch.mask.clone(), batch.camera_from_object.clone())
+        return super().encode(batch)
+
+
+@pytest.mark.parametrize("step", ["validation_step", "test_step", "predict_step"])
+def test_the_truth_does_not_reach_a_methods_images(step: str) -> None:
+    method, batch = build(Peeks).eval(), scenes(2)
+    with torch.no_grad():
+        getattr(method, step)(batch, 0)
+    mask, pose = method.asked  # type: ignore[misc]
+    assert not bool(mask.any())
+    assert torch.equal(pose, torch.eye(4).expand(2, 4, 4))
+    method.train().training_step(batch, 0)
+    mask, pose = method.asked  # type: ignore[misc]
+    assert torch.equal(mask, batch.mask)
+    assert torch.equal(pose, batch.camera_from_object)
+
+
+def test_a_score_of_the_truth_sees_no_truth_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    method, seen = working().eval(), []
+    encode = type(method).encode
+    monkeypatch.setattr(
+        type(method), "encode", lambda self, batch: seen.append(batch) or encode(self, batch)
+    )
+    with torch.no_grad():
+        method.validation_step(scenes(2), 0)
+    assert len(seen) == 2
+    assert not any(bool(batch.mask.any()) for batch in seen)
+
+
+def test_a_method_without_pose_and_box_is_refused() -> None:
+    class NoBox(Own):
+        box = PoseEstimator.box
+
+    class HasPose(NoBox):
+        provides = ("pixel_space", "rollout", "displacement", "pose")
+
+    with pytest.raises(UserError, match=r"NoBox: `provides` lacks pose, so .* box\(\) of its own"):
+        build(NoBox)
+    assert build(HasPose).object_model.name == square().name
