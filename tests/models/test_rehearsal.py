@@ -253,7 +253,7 @@ LOSSES = {
     "scalar": (lambda x: x.mean(), r"Bad: the loss has the shape \(\), not \(2,\)"),
     "particles": (lambda x: x[:, None].expand(-1, 16), r"the shape \(2, 16\), not \(2,\)"),
     "none": (lambda x: None, "Bad: the loss is a NoneType, not a tensor"),
-    "float": (lambda x: float(x.mean()), "Bad: the loss is a float, not a tensor"),
+    "float": (lambda x: float(x.detach().mean()), "Bad: the loss is a float, not a tensor"),
     "detached": (lambda x: x.detach(), "Bad: the loss requires no gradient"),
     "nan": (lambda x: x * torch.nan, "Bad: the loss is not finite"),
 }
@@ -291,6 +291,7 @@ def measuring(**change: Any) -> type[PoseEstimator]:
 METHODS = {
     "likelihood": ({"log_likelihood": lambda x: x[..., None]}, "log_likelihood has the shape"),
     "nan": ({"log_likelihood": lambda x: x * torch.nan}, "log_likelihood is not finite"),
+    "impossible": ({"log_likelihood": lambda x: x - torch.inf}, "log_likelihood is -inf for all"),
     "double": ({"log_likelihood": lambda x: x.double()}, "log_likelihood is float64"),
     "no displacement": ({"displacement": lambda x: None}, "displacement is a NoneType"),
     "no pose": ({"pose": lambda x: None}, "pose is a NoneType"),

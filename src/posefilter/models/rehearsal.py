@@ -52,6 +52,7 @@ def check_method(method: PoseEstimator, seen: Batch, learned: Batch | None) -> N
         # whatever cannot be copied: it is looked at without the watching, as it will be used
         except (TypeError, RuntimeError, AttributeError) as error:
             log.debug("the method cannot be copied (%s)", error)
+            _check_checkpoint(method)
             training = method.training
             with torch.no_grad():
                 method.eval().box(method.predict_step(seen, 0), seen)
@@ -313,6 +314,8 @@ class _Watcher:
         _need(isinstance(out, ParticleOutput), who, told)
         B, N = particles.log_weights.shape
         _check_tensor(who, "log_likelihood", out.log_likelihood, (B, N), infinite=True)
+        told = "log_likelihood is -inf for all particles of an image"
+        _need(bool((out.log_likelihood > -torch.inf).any(1).all()), who, told)
         sizes = {
             "displacement": (B, N, self.method.space.dimensions),
             "pose": (B, N, 4, 4),
