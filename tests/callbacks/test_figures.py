@@ -99,7 +99,9 @@ class Told(PoseEstimator):
     def encode(self, batch: Batch) -> torch.Tensor:
         shift = torch.zeros(len(batch.rgb), 6)
         shift[:, 0] = 0.01 * batch.frame_id
-        return move_about(batch.camera_from_object, shift, torch.zeros(3))
+        known = scenes()  # the batch of a validation holds no truth
+        truth = torch.stack([known[i].camera_from_object for i in batch.frame_id.tolist()])
+        return move_about(truth, shift, torch.zeros(3))
 
     def measure(
         self, encoding: torch.Tensor, particles: Particles, step: Step, generator: torch.Generator
