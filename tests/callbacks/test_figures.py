@@ -280,7 +280,7 @@ def test_drawing_that_costs_too_much_is_put_off_until_the_end(
         self.drawn += 1.0
 
     monkeypatch.setattr(Budget, "spend", spend)
-    monkeypatch.setattr(Figures, "_draw", lambda *given: drawn.append(int(given[-1].split()[1])))
+    monkeypatch.setattr(Figures, "_draw", lambda *given: drawn.append(given[-1]))
     monkeypatch.setattr(Trainer, "global_step", property(lambda self: now[0]))
     batch = torch.utils.data.default_collate(scenes()[:2])
     trace = method.filter(batch, method, torch.Generator().manual_seed(0))

@@ -8,14 +8,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from posefilter.cli import run_command
 from posefilter.cli.arguments import (
     bracketed,
+    check_choices,
     defer_settings,
     maximized,
+    name_places,
     options_first,
     quoted,
     told_apart,
     with_home,
 )
 from posefilter.cli.job import Job
+from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
 
@@ -248,3 +251,25 @@ def test_the_home_folder_is_written_out(
 ) -> None:
     monkeypatch.setenv("HOME", "/home/u")
     assert with_home([typed]) == [passed]
+
+
+def test_without_a_home_folder_only_what_needs_it_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def missing() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", missing)
+    assert with_home(["out=a", "~logger"]) == ["out=a", "~logger"]
+    with pytest.raises(UserError, match="no home folder is known"):
+        with_home(["out=~/a"])
+
+
+def test_bags_at_home_are_places() -> None:
+    typed = ["~/in.bag", "~/out.bag", "~logger"]
+    assert name_places(typed) == ["bag=~/in.bag", "out=~/out.bag", "~logger"]
+
+
+def test_a_choice_that_is_typed_as_a_setting_is_told_by_todays_name() -> None:
+    with pytest.raises(UserError, match=r"type filter/resample=adaptive$"):
+        check_choices(["filter.resample=below_ess"], HOME / "conf")

@@ -4,9 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from posefilter.cli import run_command
 from posefilter.cli.evaluate import keep_training_results
+from posefilter.cli.folders import KeepResults
+from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
 
@@ -114,3 +117,17 @@ def test_the_folder_of_all_runs_is_no_runs_own(
         f"train: out={run.parent}: holds other runs, such as first; choose a folder of its own"
     )
     assert [path.name for path in run.parent.iterdir()] == ["first"]
+
+
+def test_a_run_with_another_inside_is_resumed(tmp_path: Path) -> None:
+    """Such as one that was warm-started from it."""
+    run = fill(tmp_path / "first")
+    (fill(run / "second") / ".hydra" / "config.yaml").write_text("seed: 7")
+    config = OmegaConf.create(
+        {"resume": str(run), "out": str(run), "hydra": {"run": {"dir": str(run)}}}
+    )
+    config.hydra.job = {"name": "train"}
+    KeepResults()._check_run(config)
+    config.resume = None
+    with pytest.raises(UserError, match="holds a run already"):
+        KeepResults()._check_run(config)

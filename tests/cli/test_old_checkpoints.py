@@ -36,9 +36,10 @@ OLD = {
     },
     "data": {
         "_target_": "posefilter.data.module.PoseDataModule",
+        "source": "bop",
         "points": 500,
         "model_points": None,
-        "options": {"part": "test", "parts": ["data"], "inverted": False},
+        "options": {"part": "test", "inverted": False},
         "generate": {
             "_target_": "posefilter.synthetic.generate.generate",
             "occlusion": 0.75,
@@ -76,7 +77,8 @@ NEW = {
         "_target_": "posefilter.data.module.PoseDataModule",
         "num_model_points": 500,
         "model_points_dir": None,
-        "options": {"split": "test", "subsets": ["data"], "inverted": False},
+        "source": "bop",
+        "options": {"split": "test", "inverted": False},
         "generate": {
             "_target_": "posefilter.synthetic.generate.generate",
             "max_occlusion": 0.75,

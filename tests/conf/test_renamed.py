@@ -6,7 +6,8 @@ import pytest
 
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices
-from posefilter.cli.renamed import rename
+from posefilter.cli.renamed import rename, rename_missing, upgrade
+from posefilter.cli.resume import _with_todays_name
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -114,11 +115,8 @@ RENAMED = {
     "loss/aux/displacement=towards": "loss/aux/displacement=towards_object",
     "model/glimpse=smooth": "model/glimpse=bilinear",
     "model/candidate_sampler=candidates": "model/candidate_sampler=poses",
-    "model.reach=1.5": "model.crop_radius=1.5",
     "data.points=500": "data.num_model_points=500",
     "data.model_points=models": "data.model_points_dir=models",
-    "data.options.part=test": "data.options.split=test",
-    "data.options.parts=[single]": "data.options.subsets=[single]",
     "lookalike_texture=own": "lookalike_texture=same",
     "data.generate.lookalike_texture=other": "data.generate.lookalike_texture=different",
     "occlusion=0.5": "max_occlusion=0.5",
@@ -181,3 +179,45 @@ def test_the_command_ends_in_that_line(tmp_path: Path, capfd: pytest.CaptureFixt
     assert run_command("train", HOME, [f"out={tmp_path}", "rung=c5_lesson"]) == 2
     said = capfd.readouterr().err
     assert said == "train: rung=c5_lesson: is now ablation=c5_displacement_loss\n"
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [("bop", "split"), ("fat", "part"), ("mine", "part")],  # FAT had `parts`
+)
+def test_options_of_readers_are_renamed_by_their_reader(source: str, name: str) -> None:
+    """A reader of one's own may have an option of the same name."""
+    settings = {
+        "data": {
+            "_target_": "posefilter.data.module.PoseDataModule",
+            "source": source,
+            "options": {"part": "x"},
+        }
+    }
+    upgraded = upgrade({"choices": {}, "settings": settings})
+    assert upgraded["settings"]["data"]["options"] == {name: "x"}
+    assert rename("data.options.part=x") is None
+    assert rename_missing("data.options.part") == "data.options.split"
+
+
+@pytest.mark.parametrize(
+    ("typed", "now"),
+    [
+        (["data=bop", "data.options.part=test"], "data.options.part: is now data.options.split"),
+        (["model=rotation_grid", "model.reach=1"], "model.reach: is now model.crop_radius"),
+    ],
+)
+def test_names_that_others_may_have_are_answered_where_they_are_missing(
+    typed: list[str], now: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command("train", HOME, [*typed, "data.root=/nonexistent"]) == 2
+    assert capfd.readouterr().err.strip() == f"train: {now}"
+
+
+def test_what_a_resumed_run_was_started_with_has_todays_names() -> None:
+    recorded = ["filter.first_particles=32", "model/likelihood=contrastive", "seed=1"]
+    assert [_with_todays_name(one) for one in recorded] == [
+        "filter.initial_particles=32",
+        "model/likelihood=pointwise",
+        "seed=1",
+    ]

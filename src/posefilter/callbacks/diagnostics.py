@@ -70,10 +70,13 @@ class Diagnostics(TraceCallback):
             logger.log_metrics(
                 {f"diagnostics/{name}/last": found[name][-1] for name in LISTS}, trainer.global_step
             )
-        title = f"Diagnostics\nstep {trainer.global_step}"
-        self.budget.draw(
-            lambda: post_image(trainer, "diagnostics", draw_diagnostics(found, title), self.folder)
-        )
+        step = trainer.global_step
+
+        def draw() -> None:
+            picture = draw_diagnostics(found, f"Diagnostics\nstep {step}")
+            post_image(trainer, "diagnostics", picture, self.folder, step=step)
+
+        self.budget.draw(draw)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""

@@ -112,9 +112,9 @@ class Figures(TraceCallback):
         if self._example is None:
             return
         if trainer.is_global_zero:
-            kept, when = self._selection.kept, f"step {trainer.global_step}"
+            kept, step = self._selection.kept, trainer.global_step
             method = _method(pl_module)
-            self.budget.draw(partial(self._draw, trainer, method, self._example, kept, when))
+            self.budget.draw(partial(self._draw, trainer, method, self._example, kept, step))
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""
@@ -126,17 +126,18 @@ class Figures(TraceCallback):
         method: PoseEstimator,
         example: tuple[KeptImage, Trace, Batch],
         kept: dict[str, list[KeptImage]],
-        when: str,
+        step: int,
     ) -> None:
         one, trace, batch = example
         with evaluate_quietly(method):
             batch = Batch(*(x.to(method.device) for x in batch))
             shape, encoding = find_shape(trainer, method), method.encode(hide_annotation(batch))
+            when = f"step {step}"
             occasion = Occasion(method, shape, kept, one, trace, batch, encoding, when)
             for name, drawing in self.drawings.items():
                 drawn = drawing(occasion)
                 if drawn is not None:
-                    post_image(trainer, name, drawn, self.folder)
+                    post_image(trainer, name, drawn, self.folder, step=step)
 
 
 @contextmanager

@@ -61,10 +61,13 @@ class FilterHealth(TraceCallback):
             return
         for logger in trainer.loggers:
             logger.log_metrics(name_scalars(curves, self.max_iterations), trainer.global_step)
-        images, title = self._images, f"Filter health\nstep {trainer.global_step}"
-        self.budget.draw(
-            lambda: post_image(trainer, "health", draw_health(curves, images, title), self.folder)
-        )
+        images, step = self._images, trainer.global_step
+
+        def draw() -> None:
+            picture = draw_health(curves, images, f"Filter health\nstep {step}")
+            post_image(trainer, "health", picture, self.folder, step=step)
+
+        self.budget.draw(draw)
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""

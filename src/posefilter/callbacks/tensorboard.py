@@ -42,8 +42,9 @@ def post_image(
     drawn: np.ndarray | bytes,
     folder: Path | None,
     stage: str = "validation",
+    step: int | None = None,
 ) -> None:
-    """Show a figure in TensorBoard at the trainer's step, and write it to a file.
+    """Show a figure in TensorBoard, and write it to a file.
 
     It is packed once for all: `add_image` would pack it again for each logger, slowly, and knows no
     animations.  As a JPEG: TensorBoard computes a checksum byte by byte in Python, which for a PNG
@@ -55,6 +56,7 @@ def post_image(
         drawn: An image (H, W, 3) uint8, or an animation as the bytes of a GIF.
         folder: Where it is written as `<stage>_<name>`, nowhere if None.
         stage: "validation" or "test".
+        step: Where TensorBoard shows it; None: at the trainer's.
     """
     packed, suffix = (drawn, ".gif") if isinstance(drawn, bytes) else (to_jpeg(drawn), ".jpg")
     tag = name_tag(name, stage)
@@ -63,7 +65,8 @@ def post_image(
         image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=packed)
         for writer in get_writers(trainer):
             writer.add_summary(
-                Summary(value=[Summary.Value(tag=tag, image=image)]), trainer.global_step
+                Summary(value=[Summary.Value(tag=tag, image=image)]),
+                trainer.global_step if step is None else step,
             )
     if folder is not None:
         write_whole(folder / f"{stage}_{name}{suffix}", packed)

@@ -53,11 +53,15 @@ def with_home(arguments: Sequence[str]) -> list[str]:
     """Return settings with the home folder for `~` before the first `/` of a path: a shell leaves
     it where a setting is in quotes, and some shells where it is not.
     """
-    home = str(Path.home()).replace("\\", "\\\\")
-    return [
-        a if a.startswith("-") else re.sub(r"(?<=[=,\[])(['\"]?)~(?=/)", rf"\1{home}", a)
-        for a in arguments
-    ]
+    tilde = re.compile(r"(?<=[=,\[])(['\"]?)~(?=/)")
+    return [a if a.startswith("-") else tilde.sub(_at_home, a) for a in arguments]
+
+
+def _at_home(found: re.Match[str]) -> str:
+    try:
+        return found[1] + str(Path.home())
+    except RuntimeError as error:
+        raise UserError("~: no home folder is known; type the path in full") from error
 
 
 def bracketed(arguments: list[str]) -> list[str]:
@@ -174,7 +178,8 @@ def check_choices(arguments: list[str], conf: Path, command: str | None = None) 
         group = key.replace(".", "/") if re.fullmatch(r"\w+", value) else key
         own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
         if own and group != key:
-            raise UserError(f"{argument}: names a choice; type {group}={value}")
+            choice = f"{group}={value}"
+            raise UserError(f"{argument}: names a choice; type {rename(choice, command) or choice}")
         if own and _is_several(group, value):
             check_several(group, value, [conf, *choice_folders(arguments)])
         elif own and value.startswith(("[", "{")):
@@ -313,7 +318,8 @@ def name_places(arguments: Sequence[str]) -> list[str]:
     names = iter(("bag", "out"))
     out = []
     for argument in arguments:
-        bare = "=" not in argument and not argument.startswith(("-", "~", "+"))
+        sign = argument.startswith(("-", "~", "+")) and not argument.startswith("~/")
+        bare = "=" not in argument and not sign
         key = next(names, None) if bare else None
         out.append(argument if key is None else f"{key}={argument}")
     return out

@@ -74,7 +74,6 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     arguments = sys.argv[1:] if arguments is None else arguments
     arguments = spelled(arguments) if name == "report" else arguments
     arguments = name_places(arguments) if name == "convert_bag" else arguments
-    arguments = with_home(arguments)
     trace = "debug=traceback" in arguments
     conf = find_conf() if home is None else home / "conf"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # so that errors arrive here, not in Hydra's own printer
@@ -86,6 +85,7 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
     os.environ[STARTED] = name
     record: dict[Path, bytes] = {}
     try:
+        arguments = with_home(arguments)
         for package in typed_plugins(arguments):  # whose choices Hydra is to find
             trust(package)
         if {"--help", "-h"} & {*arguments}:

@@ -19,7 +19,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from posefilter.cli.arguments import config_folders
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
-from posefilter.cli.renamed import rename, rename_argument
+from posefilter.cli.renamed import rename_argument, rename_missing
 from posefilter.errors import find_reason
 
 # choices that packages of others bring
@@ -55,7 +55,7 @@ def explain(error: BaseException, name: str, conf: Path, arguments: list[str]) -
             # within a mapping, the cause names the key: tracker={rounds: 2}
             key = str(getattr(error.__cause__, "full_key", None) or found[1])
             key = re.sub(r"\[(\d+)\]", r".\1", key)
-            new = rename(key, name)
+            new = rename_missing(key, name)
             if new is not None:
                 return f"{key}: is now {new}"
             cfg = compose_without(found[1], name, conf, arguments)

@@ -51,9 +51,14 @@ class KeepResults(Callback):
                 refuse(folder, "an evaluation already; choose another folder: out=DIR")
         elif holds_run(folder) and not config.get("resume") and not is_follower():
             refuse(folder, f"a run already; choose another folder, or resume it: resume={folder}")
-        elif config.hydra.job.name == "train" and (other := find_run_within(folder)):
-            refuse(folder, f"other runs, such as {other.name}; choose a folder of its own")
+        elif config.hydra.job.name == "train" and not config.get("resume") and not is_follower():
+            self._check_within(folder)
         hold_folder(folder)
+
+    def _check_within(self, folder: Path) -> None:
+        other = find_run_within(folder)
+        if other is not None:
+            refuse(folder, f"other runs, such as {other.name}; choose a folder of its own")
 
 
 @contextmanager

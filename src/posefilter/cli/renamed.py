@@ -64,12 +64,9 @@ KEYS = {
     "most_mb": "max_mb",
     "compact": "quantize",
     "model.relevance": "model.objectness_weight",
-    "model.reach": "model.crop_radius",
     "model.candidate_sampler.turns": "model.candidate_sampler.rotations",
     "data.points": "data.num_model_points",
     "data.model_points": "data.model_points_dir",
-    "data.options.part": "data.options.split",
-    "data.options.parts": "data.options.subsets",
     **{f"data.generate.{old}": f"data.generate.{new}" for old, new in _GENERATE.items()},
     "filter.looks": "filter.max_searches",
     "filter.first_particles": "filter.initial_particles",
@@ -316,7 +313,13 @@ ARGUMENTS = {
 _VALUES = {("synthetic.generate.generate", "lookalike_texture"): _LOOKALIKE_TEXTURE}
 # options of the data module, which its readers take
 _DATA = "data.module.PoseDataModule"
-_OPTIONS = {"part": "split", "parts": "subsets"}
+_OPTIONS = {
+    "bop": {"part": "split"},
+    **{source: {"parts": "subsets"} for source in ("fat", "scenes", "ycb_video")},
+}
+_MISSING = {
+    f"data.options.{o}": f"data.options.{n}" for own in _OPTIONS.values() for o, n in own.items()
+}
 _BUDGET = "the preset, with its size apart: preset/size="
 
 
@@ -340,6 +343,13 @@ def rename(override: str, command: str | None = None) -> str | None:
     if (new, values) == (key, value):
         return None
     return f"{sign}{new}{equals}{values}"
+
+
+def rename_missing(key: str, command: str | None = None) -> str | None:
+    """Return what a setting that there is not is called today: also of those whose name a reader of
+    one's own may have.
+    """
+    return rename(key, command) or _MISSING.get(key)
 
 
 def _split(override: str) -> tuple[str, str, str, str]:
@@ -411,8 +421,9 @@ def _upgrade(node: Any) -> Any:
         if name == "loss_weights" and isinstance(value, Mapping):  # in a stage of a training
             value = {_LOSSES.get(loss, loss): factor for loss, factor in value.items()}
         if key == "options" and isinstance(value, Mapping) and _below(target) == _DATA:
-            both = {old for old, new in _OPTIONS.items() if new in value}  # refused by the reader
-            value = {n if n in both else _OPTIONS.get(n, n): v for n, v in value.items()}
+            renamed = _OPTIONS.get(str(node.get("source")), {})  # a reader of one's own has its own
+            both = {old for old, new in renamed.items() if new in value}  # refused by the reader
+            value = {n if n in both else renamed.get(n, n): v for n, v in value.items()}
         values = _VALUES.get((_below(target), name), {})
         if isinstance(value, str):
             value = values.get(value, value)

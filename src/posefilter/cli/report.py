@@ -1,6 +1,7 @@
 """Explain a run or a sweep on one HTML page."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from hydra.core.global_hydra import GlobalHydra
@@ -11,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from posefilter.cli.console import ended
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
+from posefilter.cli.renamed import rename, upgrade
 from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.paths import check_links
@@ -44,17 +46,18 @@ def report(job: Job) -> None:
     if kind != "runs":
         check_links(folder)
     if kind == "run":
-        record = read_run(folder)
+        record = with_todays_names(read_run(folder))
         page = make_run_page(record, compared(record), command)
     elif kind == "runs":
-        first, second = read_two_runs(str(value))
+        first, second = map(with_todays_names, read_two_runs(str(value)))
         check_links(first.folder)
         check_links(second.folder)
         page, folder = make_comparison_page(first, second, command), second.folder
     else:
         found = read_sweep(folder)
         winner = folder / find_best_job(found).folder
-        best = read_run(winner) if (winner / "metrics.json").is_file() else None
+        there = (winner / "metrics.json").is_file()
+        best = with_todays_names(read_run(winner)) if there else None
         page = make_sweep_page(found, best, compared(best) if best else None, command)
     out = (
         Path(str(job.cfg.out))
@@ -66,6 +69,17 @@ def report(job: Job) -> None:
     for name, png in files.items():
         write_whole(out / name, png)
     ended(job.cfg.console, "reported", {"report": out / "report.html", f"{len(files)} charts": out})
+
+
+def with_todays_names(run: Run) -> Run:
+    """Return a run of an earlier version as one of this, so that no renaming is a difference."""
+    upgraded = upgrade({"choices": run.choices, "settings": run.config})
+    return replace(
+        run,
+        config=upgraded["settings"],
+        choices=upgraded["choices"],
+        overrides=[rename(one, "train") or one for one in run.overrides],
+    )
 
 
 def compared(run: Run) -> list[Change] | None:

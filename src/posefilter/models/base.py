@@ -500,9 +500,10 @@ class PoseEstimator(Module):
 
     def _log_step(self) -> None:
         """Have the logger put what is logged at the step that the model has come to: by itself
-        Lightning counts from 0, one less.
+        Lightning counts from 0, one less, and adds the epoch.
         """
         self.log("step", float(self.trainer.global_step))
+        self.log("epoch", float(self.trainer.current_epoch))
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""

@@ -19,6 +19,7 @@ READERS: dict[str, Callable[..., BaseReader]] = {
     "ycb_video": YCBVideoReader,
     "bop": BopReader,
 }
+_BUILTIN = tuple(READERS)
 
 
 def register_reader(source: str, reader: Callable[..., BaseReader]) -> None:
@@ -61,8 +62,12 @@ def open_reader(
         base = split_part(part)[0]
         whole = open_reader(source, root, base, meshes, on_error, **options)
         return PartReader(whole, part, meshes)
-    if "eyes" in options:
-        raise UserError("data.options.eyes: is now called data.options.cameras")
+    renamed = {"eyes": "cameras"}
+    if source in _BUILTIN:
+        renamed |= {"part": "split"} if source == "bop" else {"parts": "subsets"}
+    for old, new in renamed.items():
+        if old in options:
+            raise UserError(f"data.options.{old}: is now data.options.{new}")
     try:
         return READERS[source](root, objects, meshes=meshes, on_error=on_error, **options)
     except OSError as error:
