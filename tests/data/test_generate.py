@@ -5,6 +5,8 @@ files show it.
 import json
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -378,3 +380,20 @@ def test_named_cameras_are_the_published_ones() -> None:
 def test_depth_is_stored_in_tenths_of_millimeters_and_never_wraps() -> None:
     units = fat_format.depth_units(np.array([[0.0, 0.5, 6.5535, 6.6]], np.float32))
     np.testing.assert_array_equal(units, [[0, 5000, 65535, 0]])
+
+
+def test_a_script_needs_no_guard_to_render_with_workers(tmp_path: Path) -> None:
+    """Spawned processes run a script once more; one that renders would wait for its own lock."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from pathlib import Path\n"
+        "from posefilter.synthetic.generate import generate\n"
+        "print('once')\n"
+        f"generate(Path({str(tmp_path / 'out')!r}), 2, object='carton', frames_per_scene=1, "
+        "workers=2, progress=False)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=100, check=True
+    )
+    assert done.stdout.split() == ["once"]
+    assert len(list((tmp_path / "out").glob("mixed/*/*.left.jpg"))) == 2

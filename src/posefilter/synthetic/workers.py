@@ -3,12 +3,14 @@
 import multiprocessing
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
@@ -70,7 +72,8 @@ def _render_chunks(
     with _single_threaded_children():
         pool = ProcessPoolExecutor(min(workers, len(chunks)), context, _start_worker, (job, out))
         with pool:
-            futures = [pool.submit(_render_chunk, chunk) for chunk in chunks]
+            with _main_left_alone():
+                futures = [pool.submit(_render_chunk, chunk) for chunk in chunks]
             try:
                 for future in as_completed(futures):
                     yield future.result()
@@ -102,6 +105,22 @@ def _render_chunk(chunk: list[int]) -> int:
     for frame in chunk:
         _frame_renderer.write(frame)
     return len(chunk)
+
+
+@contextmanager
+def _main_left_alone() -> Iterator[None]:
+    """Let processes that start meanwhile not run the user's script once more, as spawned ones do:
+    what renders is all in this package, and a script that is not under `if __name__ ==
+    "__main__":` would render in each of them, and wait for the lock on the folder.
+    """
+    main = sys.modules["__main__"]
+    names = [name for name in ("__file__", "__spec__") if name in main.__dict__]
+    hidden: dict[str, Any] = {name: main.__dict__.pop(name) for name in names}
+    main.__spec__ = None
+    try:
+        yield
+    finally:
+        main.__dict__.update(hidden)
 
 
 @contextmanager
