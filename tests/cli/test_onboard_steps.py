@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from posefilter.cli import run_command
 from posefilter.cli.measure_speed import Speed
 from posefilter.cli.onboard import STAGES, Onboarding, choose_steps
 from posefilter.cli.stages import Stages
@@ -46,3 +47,20 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
     assert work.rest(speed) == 0
     cfg.test_frames = 30  # the test is to be made again
     assert work.rest(speed) == 30 + 25
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("filter/resample=below_ess", "is now filter/resample=adaptive"),
+        ("filter.partcles=20", "filter.partcles: there is no such setting"),
+    ],
+)
+def test_mistakes_in_overrides_are_told_before_anything_is_written(
+    override: str, told: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    typed = ["mesh=banana", f"train_overrides=['{override}']", f"out={tmp_path / 'out'}"]
+    assert run_command("onboard", arguments=typed) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert told in line
+    assert not (tmp_path / "out").exists()

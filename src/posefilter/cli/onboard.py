@@ -15,6 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
+from posefilter.cli.arguments import check_choices
 from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
@@ -205,6 +206,10 @@ def onboard(job: Job) -> None:
     """Write weights, symmetries, renders, the training's run and a report."""
     cfg = job.cfg
     settle(cfg.threads, cfg.seed)
+    if cfg.train_overrides:  # a mistake in them is told before anything is written
+        overrides = [*map(str, cfg.train_overrides)]
+        check_choices(overrides, find_conf(), "train")
+        compose_job("train", find_conf(), overrides, Path())
     mesh = read_onboarded(cfg)
     out = Path(str(cfg.out)) if cfg.out else Path("outputs") / "onboard" / mesh.name
     hold_folder(out)
