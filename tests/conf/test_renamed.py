@@ -6,8 +6,7 @@ import pytest
 
 from posefilter.cli import run_command
 from posefilter.cli.arguments import check_choices
-from posefilter.cli.renamed import rename, rename_missing, upgrade
-from posefilter.cli.resume import _with_todays_name
+from posefilter.cli.renamed import rename, rename_missing, update, upgrade
 from posefilter.errors import UserError
 
 HOME = Path(__file__).parents[2]
@@ -216,7 +215,7 @@ def test_names_that_others_may_have_are_answered_where_they_are_missing(
 
 def test_what_a_resumed_run_was_started_with_has_todays_names() -> None:
     recorded = ["filter.first_particles=32", "model/likelihood=contrastive", "seed=1"]
-    assert [_with_todays_name(one) for one in recorded] == [
+    assert [update(one, "train") for one in recorded] == [
         "filter.initial_particles=32",
         "model/likelihood=pointwise",
         "seed=1",

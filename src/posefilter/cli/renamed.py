@@ -345,6 +345,12 @@ def rename(override: str, command: str | None = None) -> str | None:
     return f"{sign}{new}{equals}{values}"
 
 
+def update(override: str, command: str | None = None) -> str:
+    """Return a recorded override as it is typed today."""
+    # for a budget there is no one override of today
+    return override if override.startswith("budget=") else rename(override, command) or override
+
+
 def rename_missing(key: str, command: str | None = None) -> str | None:
     """Return what a setting that there is not is called today: also of those whose name a reader of
     one's own may have.

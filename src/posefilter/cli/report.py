@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from posefilter.cli.console import ended
 from posefilter.cli.job import Job
 from posefilter.cli.plain import to_plain
-from posefilter.cli.renamed import rename, upgrade
+from posefilter.cli.renamed import update, upgrade
 from posefilter.errors import UserError
 from posefilter.files import write_whole
 from posefilter.paths import check_links
@@ -78,7 +78,7 @@ def with_todays_names(run: Run) -> Run:
         run,
         config=upgraded["settings"],
         choices=upgraded["choices"],
-        overrides=[rename(one, "train") or one for one in run.overrides],
+        overrides=[update(one, "train") for one in run.overrides],
     )
 
 

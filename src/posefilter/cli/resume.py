@@ -9,7 +9,7 @@ from hydra.errors import HydraException
 
 from posefilter.cli.arguments import quoted
 from posefilter.cli.plain import find
-from posefilter.cli.renamed import rename
+from posefilter.cli.renamed import update
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_bytes, read_yaml
 from posefilter.paths import check_links, stays_inside
@@ -72,16 +72,11 @@ def with_resumed(arguments: list[str]) -> list[str]:
     for argument in arguments:
         check_kept(argument, folder)
     named = {a.split("=", 1)[0].lstrip("+~") for a in arguments}
-    before = [_with_todays_name(one) for one in overrides_of(folder)]
+    before = [update(one, "train") for one in overrides_of(folder)]
     kept = [one for one in before if _key(one) not in named and _key(one) not in _DROPPED]
     for override in kept:
         check_override(override, folder)
     return [*kept, *arguments, f"out={folder}"]
-
-
-def _with_todays_name(override: str) -> str:
-    """Return what was typed to start a run as it is typed today."""
-    return override if override.startswith("budget=") else rename(override, "train") or override
 
 
 def keep_record(arguments: list[str]) -> dict[Path, bytes]:

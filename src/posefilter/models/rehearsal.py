@@ -7,14 +7,14 @@ each of its parts is watched. The method itself is left as it is, and so are the
 import inspect
 import io
 import logging
-import random
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import torch
+from lightning import LightningModule
+from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor, nn
 
 from posefilter.errors import UserError
@@ -46,7 +46,7 @@ def check_method(method: PoseEstimator, seen: Batch, learned: Batch | None) -> N
     for name in _FUNCTIONS:
         offered = name in type(method).provides and not callable(getattr(method, name, None))
         _need(not offered, type(method).__name__, f"`provides` {name}, but has no {name}()")
-    with _kept_randomness():
+    with isolate_rng():
         try:
             twin = deepcopy(method)
         # whatever cannot be copied: it is looked at without the watching, as it will be used
@@ -75,8 +75,6 @@ def _look(method: PoseEstimator, seen: Batch) -> None:
 
 def _is_prepared_by_trainer(method: PoseEstimator) -> bool:
     """Tell whether a method has work of its own to do before a training's first step."""
-    from lightning import LightningModule  # takes seconds: prediction needs none
-
     return getattr(type(method), "on_fit_start", None) not in (
         None,
         LightningModule.on_fit_start,
@@ -136,18 +134,6 @@ def _check_checkpoint(method: PoseEstimator) -> None:
             ) from error
         file.seek(0)
         file.truncate()
-
-
-@contextmanager
-def _kept_randomness() -> Iterator[None]:
-    """Put the global random generators back to where they were."""
-    state = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(state[0])
-        np.random.set_state(state[1])  # noqa: NPY002
-        torch.set_rng_state(state[2])
 
 
 def _need(good: bool, who: str, told: str) -> None:
