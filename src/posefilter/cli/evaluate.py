@@ -2,8 +2,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping
-from math import nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +36,7 @@ from posefilter.metrics.apparent_size import describe_mismatch
 from posefilter.metrics.bop import BopErrors
 from posefilter.metrics.bop_results import read_poses_csv, to_mesh, write_poses_csv
 from posefilter.metrics.collect import BoxIoU, PoseErrors
+from posefilter.metrics.errors import add
 from posefilter.metrics.image_errors import FILE as ERRORS
 from posefilter.metrics.image_errors import ImageError, write_errors
 from posefilter.metrics.results import compute_checkpoint_score
@@ -187,22 +187,25 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     assigned = assign_estimates(rows, data.records("test"), data)
     models = [data.object_model(i) for i in range(len(data.objects))]
     errors, bop, iou = PoseErrors(models), BopErrors(models), BoxIoU()
-    errors_in_mesh_frame = PoseErrors(models)  # were they of the meshes' frames
+    in_mesh_frame = list[float]()  # ADD [m], were they of the meshes' frames
     used, table = 0, list[ImageError]()
     for batch in data.test_dataloader():
         own = [data.records("test")[i] for i in batch.frame_id.tolist()]
         estimates = [assigned.get(r.key) for r in own]
         poses = torch.full_like(batch.camera_from_object, torch.nan)
-        as_they_are = poses.clone()
         for i, estimate in enumerate(estimates):
             if estimate is not None:
                 used += 1
                 native = data.reader.native_from_mesh(own[i].object)
                 pose = to_mesh(estimate.camera_from_native, native)
                 poses[i] = torch.from_numpy(pose.astype(np.float32))
-                as_they_are[i] = torch.from_numpy(estimate.camera_from_native.astype(np.float32))
+                as_it_is = torch.from_numpy(estimate.camera_from_native)[None]
+                truth = batch.camera_from_object[i : i + 1].double()
+                points = models[int(batch.object_id[i])].points.double()
+                in_mesh_frame += add(as_it_is, truth, points).tolist()
+            else:
+                in_mesh_frame.append(inf)
         errors.update(poses, batch.camera_from_object, batch.object_id)
-        errors_in_mesh_frame.update(as_they_are, batch.camera_from_object, batch.object_id)
         height, width = batch.rgb.shape[-2:]
         bop.update(poses, batch.camera_from_object, batch.intrinsics, width, batch.object_id)
         pairs = [
@@ -225,7 +228,9 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             f"an instance of this data"
         )
     found = errors.compute()
-    warn_of_frame(found, errors_in_mesh_frame.compute(), job.cfg.console)
+    warn_of_frame(
+        found["add"]["median_mm"], 1000 * float(np.median(in_mesh_frame)), job.cfg.console
+    )
     results = {
         **found,
         **bop.compute(),
@@ -244,9 +249,10 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
     return metrics, {"errors": job.folder / ERRORS}
 
 
-def warn_of_frame(found: Mapping[str, Any], in_mesh_frame: Mapping[str, Any], console: str) -> None:
-    """Say where estimates fit the truth in the meshes' frames, and not in the dataset's."""
-    own, other = (one["add"]["median_mm"] for one in (found, in_mesh_frame))
+def warn_of_frame(own: float, other: float, console: str) -> None:
+    """Say where estimates fit the truth in the meshes' frames, and not in the dataset's: the median
+    ADD in the dataset's, and in the meshes' [mm].
+    """
     if other < 0.5 * own:
         sentence = (
             f"warning: the poses fit the meshes' frames (median ADD {other:.1f} mm) better than "
