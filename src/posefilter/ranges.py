@@ -215,6 +215,7 @@ RANGES: dict[str, Range] = {
     "particles": _whole(1, 100_000),
     "initial_particles": _whole(1, 100_000),
     "filter.steps": _whole(1, 10_000),
+    "filter.zoom_diameter": Range(0, 1, above=True),
     "depth_offset": Range(-10, 10, many=True),
     "uniform_fraction": SHARE,
     "object_fraction": SHARE,

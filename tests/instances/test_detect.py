@@ -52,6 +52,7 @@ class SimpleFilter:
     """What the search needs of a filter."""
 
     particles = initial_particles = 8
+    zoom_diameter = None
 
     def __call__(self, batch: Batch, method: Any, generator: Generator) -> Any:
         seen = method.encode(batch)[0] * (batch.depth[0, 0] > 0)

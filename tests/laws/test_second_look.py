@@ -16,9 +16,10 @@ from torch import Generator, Tensor
 
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration, Logistic
-from posefilter.confidence.second_look import look_again, measure_worth, with_encoding
+from posefilter.confidence.second_look import look_again, measure_worth
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
+from posefilter.models.zoom import with_encoding
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Particles, Trace
 
 H, W, SIDE = 48, 64, 6  # [px]
@@ -45,6 +46,9 @@ class Toy:
 
     def encode(self, batch: Batch) -> Tensor:
         return batch.rgb
+
+    def search(self, batch: Batch, generator: Generator, encoding: Any = None) -> Trace:
+        return self.filter(batch, with_encoding(self, encoding), generator)
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         return {"green": self._read(trace, batch, 1)}

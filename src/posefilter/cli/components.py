@@ -9,7 +9,8 @@ from posefilter.cli.job import Job
 from posefilter.errors import UserError
 
 SECTIONS = ("filter", "model")
-_LATER = ("filter.max_searches",)  # settings that recipes of earlier versions leave out
+# settings that recipes of earlier versions leave out
+_LATER = ("filter.max_searches", "filter.zoom_diameter")
 LOOSE = ("evaluate", "predict", "track", "convert_bag", "export", "calibrate")
 
 

@@ -11,7 +11,6 @@ print in another size, as of a package of the same brand. No answer of that kind
 """
 
 import math
-from copy import copy
 from typing import Any, Protocol
 
 import torch
@@ -47,6 +46,10 @@ class Searcher(Protocol):
         """Encode images."""
         ...
 
+    def search(self, batch: Batch, generator: Generator, encoding: Any = None) -> Trace:
+        """Run the filter on images, which may be encoded already."""
+        ...
+
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name."""
         ...
@@ -54,17 +57,6 @@ class Searcher(Protocol):
     def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
         """Return how large the object appears; None where the method cannot tell."""
         ...
-
-
-def with_encoding(method: Any, encoding: Any) -> Any:
-    """Return a method whose images are encoded already.
-
-    It is a copy, whose class has all that protocols ask for: from Python 3.12 on `isinstance` does
-    not see what `__getattr__` would find.
-    """
-    out = copy(method)
-    out.encode = lambda batch: encoding
-    return out
 
 
 def measure_worth(encoding: Any) -> float:
@@ -142,7 +134,7 @@ def _search(
         encoding = whole if part is image else method.encode(part)
         if measure_worth(encoding) < _WORTH:
             continue
-        found = method.filter(part, with_encoding(method, encoding), generator)
+        found = method.search(part, generator, encoding)
         # what was hidden is there: judged by the whole image, as the first answer
         found = found._replace(encoding=whole)
         value = float(calibration.rank(method.collect_features(found, image))[0])

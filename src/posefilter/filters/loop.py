@@ -26,6 +26,8 @@ References:
 """
 
 import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
@@ -33,6 +35,7 @@ from torch import Generator, Tensor, nn
 from posefilter.errors import UserError
 from posefilter.filters.auxiliary import bind_to_encoding
 from posefilter.protocols import (
+    Encoding,
     Estimate,
     Initialize,
     Method,
@@ -44,6 +47,15 @@ from posefilter.protocols import (
     Space,
 )
 from posefilter.types import Batch, ParticleOutput, Particles, Resampled, Step, Trace
+
+
+class Iteration(NamedTuple):
+    """What one step of the filter leaves."""
+
+    particles: Particles  # weighted by what the step measured
+    output: ParticleOutput
+    step: Step
+    log_evidence: Tensor  # (B,) log of the weights' sum before they were normalized
 
 
 class ParticleFilter(nn.Module):
@@ -65,9 +77,12 @@ class ParticleFilter(nn.Module):
         initial_particles: Number of particles at the first step; `particles` if None.
         max_searches: How often an image is searched at most, while a calibrated answer is doubtful
             (confidence/second_look.py); 1 to 3.
+        zoom_diameter: Where the object is smaller in the image, in widths of the image, a method
+            that estimates poses searches a magnified window in which it has this diameter
+            (models/zoom.py); None: nowhere.
 
     Raises:
-        UserError: A number is below 1, or `max_searches` above 3.
+        UserError: A number is below 1, `max_searches` above 3, or `zoom_diameter` not in (0, 1].
     """
 
     def __init__(
@@ -83,6 +98,7 @@ class ParticleFilter(nn.Module):
         refine: Refine,
         initial_particles: int | None = None,
         max_searches: int = 3,
+        zoom_diameter: float | None = None,
     ) -> None:
         super().__init__()
         first = particles if initial_particles is None else initial_particles
@@ -93,7 +109,10 @@ class ParticleFilter(nn.Module):
             )
         if not 1 <= max_searches <= 3:
             raise UserError(f"filter.max_searches={max_searches}: must be 1, 2 or 3")
+        if zoom_diameter is not None and not 0 < zoom_diameter <= 1:
+            raise UserError(f"filter.zoom_diameter={zoom_diameter}: must be above 0, 1 at most")
         self.particles, self.steps, self.max_searches = particles, steps, max_searches
+        self.zoom_diameter = zoom_diameter
         self.initial_particles = first
         self.initialize, self.schedule = initialize, schedule
         self.reweight, self.resample, self.propagate = reweight, resample, propagate
@@ -122,22 +141,30 @@ class ParticleFilter(nn.Module):
             FloatingPointError: All weights of an image are zero, or not numbers.
         """
         encoding = method.encode(batch)
+        iterations = self.iterate(batch, encoding, method, generator)
+        return self.finish(list(iterations), encoding, method, generator)
+
+    def iterate(
+        self, batch: Batch, encoding: Encoding, method: Method, generator: Generator
+    ) -> Iterator[Iteration]:
+        """Run the filter step by step; arguments as of `forward`, with the images encoded.
+
+        Yields:
+            What each step leaves, the first one's initial particles measured.
+        """
         state = self.initialize(batch, encoding, method, self.initial_particles, generator)
         particles = make_particles(state, method.latent_width)
         ancestor_log_likelihood = torch.zeros_like(particles.log_weights)
-        steps = self.make_steps(state)
         resample = bind_to_encoding(self.resample, encoding, batch)
-        history: list[Particles] = []
-        outputs: list[ParticleOutput] = []
-        evidence: list[Tensor] = []
-        for step in steps:
-            if outputs:
+        output: ParticleOutput | None = None
+        for step in self.make_steps(state):
+            if output is not None:
                 resampled = resample(particles, self.particles, method.space, generator)
                 state = inherit(particles.state, resampled, method.space)
-                displacement = inherit(outputs[-1].displacement, resampled)
+                displacement = inherit(output.displacement, resampled)
                 state = self.propagate(state, displacement, step, method.space, generator)
-                latent = inherit(outputs[-1].latent, resampled)
-                ancestor_log_likelihood = inherit(outputs[-1].log_likelihood[..., None], resampled)[
+                latent = inherit(output.latent, resampled)
+                ancestor_log_likelihood = inherit(output.log_likelihood[..., None], resampled)[
                     ..., 0
                 ]
                 particles = Particles(state, latent, resampled.log_weights, resampled.ancestors)
@@ -147,14 +174,26 @@ class ParticleFilter(nn.Module):
             )
             increment = log_weights.logsumexp(1)
             particles = particles._replace(log_weights=log_weights - increment[:, None])
-            history.append(particles)
-            outputs.append(output)
-            evidence.append(increment)
+            yield Iteration(particles, output, step, increment)
+
+    def finish(
+        self,
+        iterations: Sequence[Iteration],
+        encoding: Encoding,
+        method: Method,
+        generator: Generator,
+    ) -> Trace:
+        """Return the trace of all iterations, with the belief of the last one's particles.
+
+        Raises:
+            FloatingPointError: All weights of an image are zero, or not numbers.
+        """
+        particles, outputs, steps, evidence = zip(*iterations, strict=True)
         log_evidence = torch.stack(evidence, dim=1)
         check_finite(log_evidence)
-        belief = self.estimate(history[-1], outputs[-1], encoding, method, generator)
+        belief = self.estimate(particles[-1], outputs[-1], encoding, method, generator)
         belief = self.refine(belief, encoding, method, generator)
-        return Trace(tuple(history), tuple(outputs), steps, belief, log_evidence, encoding)
+        return Trace(particles, outputs, steps, belief, log_evidence, encoding)
 
     def make_steps(self, like: Tensor) -> tuple[Step, ...]:
         """Return the steps with their noise levels, in the dtype and on the device of `like`."""

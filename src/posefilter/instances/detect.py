@@ -10,12 +10,13 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.confidence.calibration import Assessment
-from posefilter.confidence.second_look import measure_worth, with_encoding
+from posefilter.confidence.second_look import measure_worth
 from posefilter.confidence.verdicts import Costs, Verdict, decide
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.filters.loop import ParticleFilter
 from posefilter.instances.pixels import keep_pixels, resize_mask
 from posefilter.models.base import PoseEstimator
+from posefilter.models.zoom import search
 from posefilter.protocols import Encoding
 from posefilter.types import Batch, BeliefBatch, Trace
 
@@ -165,7 +166,7 @@ def _search(
     image, encoding = _encode(job, hidden)
     one = None
     if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
-        trace = job.filter(image, with_encoding(job.method, encoding), job.generator)
+        trace = search(job.method, image, job.generator, encoding, job.filter)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         visible = find_visible(trace.belief.best, job.method.object_model, depth, K)[0]
         assessment = _assess(job.method, trace.belief, image, encoding)

@@ -35,6 +35,7 @@ from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import clip_submodules
 from posefilter.models.lr_schedulers import find_length
+from posefilter.models.zoom import search
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -87,6 +88,11 @@ class PoseEstimator(Module):
         super().__init__()
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
+        if filter.zoom_diameter is not None and "pose_space" not in self.provides:
+            raise UserError(
+                "filter.zoom_diameter: needs a method whose particles are poses, such as pose_pf; "
+                f"those of {type(self).__name__} are places in one image"
+            )
         if scheduler is not None:
             find_length(scheduler)  # a setting that is missing is told before the training begins
         self._object_model: ObjectModel | None = None
@@ -364,7 +370,17 @@ class PoseEstimator(Module):
 
     def _run(self, batch: Batch, generator: Generator) -> Trace:
         batch = hide_annotation(batch)  # the truth is for the metrics alone
-        return look_again(self, self.filter(batch, self, generator), batch, generator)
+        return look_again(self, self.search(batch, generator), batch, generator)
+
+    def search(self, batch: Batch, generator: Generator, encoding: Any = None) -> Trace:
+        """Run the filter once, in a magnified window where the object is small (models/zoom.py).
+
+        Args:
+            batch: B images; mask and pose are not used.
+            generator: Draws the particles.
+            encoding: What `encode` returns of them, where it is known.
+        """
+        return search(self, batch, generator, encoding)
 
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()

@@ -1,0 +1,213 @@
+"""Search a magnified window of the image where the object is small in it.
+
+A network sees little of an object of a few cells, and learns most from larger ones. Where the first
+steps of the filter agree on a place, and the object is small there, the image's part about it is
+magnified and the filter runs on that. Where they do not agree, the filter runs to its end on the
+whole image, and once more about its answer where that is small. A window is an image of another
+camera: its poses are those of the whole image.
+"""
+
+from collections.abc import Callable
+from copy import copy
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Generator, Tensor
+
+from posefilter.data.resize import resize_depth
+from posefilter.filters.loop import ParticleFilter
+from posefilter.geometry.camera import project, resize_intrinsics
+from posefilter.geometry.pose import origin_of
+from posefilter.protocols import Encoding
+from posefilter.types import Batch, ObjectModel, Particles, Trace
+
+LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
+_STEPS = 3  # of the filter, after which particles that agree are near the object
+_HEAVIEST = 200  # particles that a place may be about
+_AGREED = 0.7  # weight of the particles within half a diameter of each other
+
+
+class Place(NamedTuple):
+    """Where most of the weight of B images' particles is."""
+
+    center: Tensor  # (B, 3) of the object, in camera axes [m]
+    weight: Tensor  # (B,) that is there, in [0, 1]
+
+
+def with_encoding(method: Any, encoding: Encoding) -> Any:
+    """Return a method whose images are encoded already.
+
+    It is a copy, whose class has all that protocols ask for: from Python 3.12 on `isinstance` does
+    not see what `__getattr__` would find.
+    """
+    out = copy(method)
+    out.encode = lambda batch: encoding
+    return out
+
+
+def search(
+    method: Any,
+    batch: Batch,
+    generator: Generator,
+    encoding: Encoding = None,
+    particle_filter: ParticleFilter | None = None,
+) -> Trace:
+    """Run a filter on B images, on magnified windows of those in which the object is small.
+
+    Where it is small in none the trace is that of the filter alone, bit for bit.
+
+    Args:
+        method: A method whose particles are poses.
+        batch: The images; mask and pose are not used.
+        generator: Draws the particles.
+        encoding: What `encode` returns of them, where it is known.
+        particle_filter: The filter; None: the method's own.
+
+    Returns:
+        The trace, with the encoding of the whole images. Log-likelihoods are those of what was
+        searched.
+    """
+    run = method.filter if particle_filter is None else particle_filter
+    encoding = method.encode(batch) if encoding is None else encoding
+    if run.zoom_diameter is None:
+        trace: Trace = run(batch, with_encoding(method, encoding), generator)
+        return trace
+    object_model, target = method.object_model, run.zoom_diameter
+    steps = run.iterate(batch, encoding, method, generator)
+    begun = list(islice(steps, _STEPS))
+    centers, weight = find_place(begun[-1].particles, object_model)
+    zoom = measure_zoom(centers, batch, object_model, target)
+    small = (zoom > 1) & (weight >= _AGREED)
+    whole: Trace | None = None
+    if not small.all():
+        if small.any():
+            whole = run(select(batch, ~small), method, generator)
+        else:  # it goes on as if nobody had looked
+            whole = run.finish([*begun, *steps], encoding, method, generator)
+        centers = centers.clone()
+        centers[~small] = origin_of(whole.belief.best, object_model.center.to(centers.device))
+        zoom = measure_zoom(centers, batch, object_model, target)
+        late = ~small & (zoom > 1)
+        if not (small | late).any():
+            return whole._replace(encoding=encoding)
+        whole, small = take(whole, ~late[~small]), small | late
+    pixels = project(centers[:, None], batch.intrinsics)[:, 0]
+    view = magnify(select(batch, small), pixels[small], zoom[small])
+    near: Trace = run(view, method, generator)
+    return merge(whole, near, small)._replace(encoding=encoding)
+
+
+def find_place(particles: Particles, object_model: ObjectModel) -> Place:
+    """Return the place with the most weight within half a diameter of it."""
+    centers = origin_of(particles.state, object_model.center.to(particles.state.device))
+    weights = particles.log_weights.exp()
+    heaviest = weights.topk(min(_HEAVIEST, weights.shape[1])).indices
+    about = centers.gather(1, heaviest[..., None].expand(-1, -1, 3))
+    near = torch.cdist(about, centers) < object_model.diameter / 2  # (B, M, N)
+    most, index = (near * weights[:, None]).sum(-1).max(1)
+    own = near[torch.arange(len(index), device=index.device), index] * weights
+    mean = (own[..., None] * centers).sum(1) / own.sum(1, keepdim=True)
+    return Place(mean, most)
+
+
+def measure_zoom(
+    centers: Tensor, batch: Batch, object_model: ObjectModel, zoom_diameter: float
+) -> Tensor:
+    """Return how much images are magnified for an object at `centers`, (B,): 1 where it is not
+    small, or not before the camera.
+
+    Args:
+        centers: (B, 3) of the object, in camera axes [m].
+        batch: The images.
+        object_model: The object.
+        zoom_diameter: Its diameter after that, in widths of the image.
+    """
+    z = centers[:, 2]
+    diameter = batch.intrinsics[:, 0, 0] * object_model.diameter / z.clamp_min(1e-3)  # [px]
+    zoom = (zoom_diameter * batch.rgb.shape[-1] / diameter).clamp_max(MOST_ZOOM)
+    return torch.where((z > 0) & (zoom >= LEAST_ZOOM), zoom, 1.0)
+
+
+def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
+    """Return windows of images, magnified to the images' size.
+
+    A window is as many whole pixels as `zoom` makes of it, about `pixels` and inside of the image.
+
+    Args:
+        batch: The images; their masks and poses are kept.
+        pixels: (B, 2) centers of the windows [px].
+        zoom: (B,) magnification, 1 or more.
+    """
+    height, width = batch.rgb.shape[-2:]
+    color, depth, mask, cameras = [], [], [], []
+    places = zip(pixels.tolist(), zoom.tolist(), strict=True)
+    for i, ((u, v), factor) in enumerate(places):
+        left, columns = _place(u, width, factor)
+        top, rows = _place(v, height, factor)
+        part = (..., slice(top, top + rows), slice(left, left + columns))
+        seen = F.interpolate(
+            batch.rgb[i : i + 1][part], (height, width), mode="bilinear", align_corners=False
+        )
+        z = resize_depth(batch.depth[i, 0][part].cpu().numpy(), height, width)
+        color.append(seen)
+        depth.append(torch.from_numpy(np.ascontiguousarray(z)).to(batch.depth))
+        mask.append(F.interpolate(batch.mask[i : i + 1][part].float(), (height, width)) > 0.5)
+        K = batch.intrinsics[i].clone()
+        K[:2, 2] -= K.new_tensor([left, top])
+        cameras.append(resize_intrinsics(K, width / columns, height / rows))
+    return batch._replace(
+        rgb=torch.cat(color),
+        depth=torch.stack(depth)[:, None],
+        mask=torch.cat(mask),
+        intrinsics=torch.stack(cameras),
+    )
+
+
+def _place(center: float, size: int, zoom: float) -> tuple[int, int]:
+    """Return the first pixel of a window, and how many it has."""
+    count = min(size, max(1, round(size / zoom)))
+    return min(max(0, round(center - (count - 1) / 2)), size - count), count
+
+
+def select(batch: Batch, rows: Tensor) -> Batch:
+    """Return some images of a batch; rows (B,) bool."""
+    return Batch(*(x[rows] for x in batch))
+
+
+def take(trace: Trace, rows: Tensor) -> Trace:
+    """Return the trace of some images; rows (B,) bool."""
+    return _each(lambda x: x[rows], trace)
+
+
+def merge(first: Trace | None, second: Trace, is_second: Tensor) -> Trace:
+    """Return the trace of images that were searched in two parts.
+
+    Args:
+        first: Of the images that are not the second's; None where there are none.
+        second: Of the others.
+        is_second: (B,) bool.
+    """
+    if first is None:
+        return second
+    order = torch.cat([(~is_second).nonzero()[:, 0], is_second.nonzero()[:, 0]]).argsort()
+    return _each(lambda a, b: torch.cat([a, b])[order], first, second)
+
+
+def _each(change: Callable[..., Tensor], *traces: Trace) -> Trace:
+    """Return a trace whose tensors are made of those of others; what belongs to no image stays."""
+
+    def make(*parts: Any) -> Any:
+        one = parts[0]
+        if isinstance(one, Tensor):
+            return one if one.dim() == 0 else change(*parts)
+        if isinstance(one, tuple):
+            made = [make(*same) for same in zip(*parts, strict=True)]
+            return type(one)(*made) if hasattr(one, "_fields") else tuple(made)
+        return one
+
+    bare = [trace._replace(encoding=None) for trace in traces]
+    out: Trace = make(*bare)
+    return out
