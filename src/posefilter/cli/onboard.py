@@ -137,6 +137,7 @@ class Onboarding:
         quoted |= {"data.meshes": self.out / "meshes"}
         words = [
             "model=pose_pf",
+            "filter.zoom_diameter=0.4",
             "data=scenes",
             "data/augment=camera",
             *(f"{key}='{value}'" for key, value in quoted.items()),
