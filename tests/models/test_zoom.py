@@ -172,3 +172,12 @@ def test_how_much_an_object_is_magnified(z: float, zoom: float) -> None:
     center = torch.tensor([[0.0, 0.0, z]])
     found = measure_zoom(center, draw((0, 0, 1.0)), MODEL, 0.3)
     assert float(found) == pytest.approx(zoom)
+
+
+def test_a_window_without_depth_is_not_searched() -> None:
+    batch = draw((20, 20, 0.5))
+    center = back_project(torch.tensor([[20.0, 20]]), torch.tensor([0.5]), K)
+    assert float(measure_zoom(center, batch, MODEL, 0.3)) > 1
+    batch.depth[..., :40, :44] = 0
+    batch.depth[..., 20, 20] = 0.5  # a single pixel knows it
+    assert float(measure_zoom(center, batch, MODEL, 0.3)) == 1

@@ -26,6 +26,7 @@ from posefilter.types import Batch, ObjectModel, Particles, Trace
 
 LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
 _STEPS = 3  # of the filter, after which particles that agree are near the object
+_LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
 _HEAVIEST = 200  # particles that a place may be about
 _AGREED = 0.7  # weight of the particles within half a diameter of each other
 
@@ -117,7 +118,7 @@ def measure_zoom(
     centers: Tensor, batch: Batch, object_model: ObjectModel, zoom_diameter: float
 ) -> Tensor:
     """Return how much images are magnified for an object at `centers`, (B,): 1 where it is not
-    small, or not before the camera.
+    small, not before the camera, or where hardly a pixel about it has depth.
 
     Args:
         centers: (B, 3) of the object, in camera axes [m].
@@ -128,7 +129,13 @@ def measure_zoom(
     z = centers[:, 2]
     diameter = batch.intrinsics[:, 0, 0] * object_model.diameter / z.clamp_min(1e-3)  # [px]
     zoom = (zoom_diameter * batch.rgb.shape[-1] / diameter).clamp_max(MOST_ZOOM)
-    return torch.where((z > 0) & (zoom >= LEAST_ZOOM), zoom, 1.0)
+    zoom = torch.where((z > 0) & (zoom >= LEAST_ZOOM), zoom, 1.0)
+    pixels = project(centers[:, None], batch.intrinsics)[:, 0]
+    for i in (zoom > 1).nonzero()[:, 0].tolist():
+        part = _place_window(batch, pixels[i], zoom[i])
+        if float((batch.depth[i][part] > 0).float().mean()) < _LEAST_DEPTH:
+            zoom[i] = 1.0
+    return zoom
 
 
 def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
@@ -143,21 +150,20 @@ def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
     """
     height, width = batch.rgb.shape[-2:]
     color, depth, mask, cameras = [], [], [], []
-    places = zip(pixels.tolist(), zoom.tolist(), strict=True)
-    for i, ((u, v), factor) in enumerate(places):
-        left, columns = _place(u, width, factor)
-        top, rows = _place(v, height, factor)
-        part = (..., slice(top, top + rows), slice(left, left + columns))
+    for i in range(len(pixels)):
+        part = _place_window(batch, pixels[i], zoom[i])
+        _, rows, columns = part
         seen = F.interpolate(
-            batch.rgb[i : i + 1][part], (height, width), mode="bilinear", align_corners=False
+            batch.rgb[i][part][None], (height, width), mode="bilinear", align_corners=False
         )
-        z = resize_depth(batch.depth[i, 0][part].cpu().numpy(), height, width)
+        z = resize_depth(batch.depth[i][part][0].cpu().numpy(), height, width)
         color.append(seen)
         depth.append(torch.from_numpy(np.ascontiguousarray(z)).to(batch.depth))
-        mask.append(F.interpolate(batch.mask[i : i + 1][part].float(), (height, width)) > 0.5)
+        mask.append(F.interpolate(batch.mask[i][part][None].float(), (height, width)) > 0.5)
         K = batch.intrinsics[i].clone()
-        K[:2, 2] -= K.new_tensor([left, top])
-        cameras.append(resize_intrinsics(K, width / columns, height / rows))
+        K[:2, 2] -= K.new_tensor([columns.start, rows.start])
+        scales = width / (columns.stop - columns.start), height / (rows.stop - rows.start)
+        cameras.append(resize_intrinsics(K, *scales))
     return batch._replace(
         rgb=torch.cat(color),
         depth=torch.stack(depth)[:, None],
@@ -166,10 +172,18 @@ def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
     )
 
 
-def _place(center: float, size: int, zoom: float) -> tuple[int, int]:
-    """Return the first pixel of a window, and how many it has."""
+def _place_window(batch: Batch, pixel: Tensor, zoom: Tensor) -> tuple[slice, slice, slice]:
+    """Return the channels, rows and columns of a window; pixel (2,) [px], zoom ()."""
+    height, width = batch.rgb.shape[-2:]
+    (u, v), factor = pixel.tolist(), float(zoom)
+    return slice(None), _place(v, height, factor), _place(u, width, factor)
+
+
+def _place(center: float, size: int, zoom: float) -> slice:
+    """Return the pixels of a window along one side of the image."""
     count = min(size, max(1, round(size / zoom)))
-    return min(max(0, round(center - (count - 1) / 2)), size - count), count
+    first = min(max(0, round(center - (count - 1) / 2)), size - count)
+    return slice(first, first + count)
 
 
 def select(batch: Batch, rows: Tensor) -> Batch:
