@@ -38,11 +38,15 @@ class PoseFilter:
         and the belief: poses (N, 4, 4), weights (N,).
         """
         s, rng = self.settings, np.random.default_rng(seed)
-        names = [output.name for output in self.encode.get_outputs()]
         size = (s["camera"][1], s["camera"][0])
         if rgb.shape[:2] != size or depth.shape != size:
             sys.exit(f"exported for images of {size[1]}x{size[0]}: export with width=, height=")
         image = {"rgb": rgb, "depth": np.float32(depth), "intrinsics": np.float32(intrinsics)}
+        return self.search(image, rng, s.get("zoom"))
+
+    def search(self, image, rng, zoom):
+        """Run the filter on an image; with `zoom`, on a magnified window if the object is small."""
+        s, names = self.settings, [output.name for output in self.encode.get_outputs()]
         encoding = dict(zip(names, self.encode.run(names, image), strict=True))
         poses = draw_poses(*(encoding[name] for name in ("point", "weight", "share", "position")),
                            self.center, self.radius, s["first_particles"], rng)  # fmt: skip
@@ -55,6 +59,10 @@ class PoseFilter:
                     poses = self.propagate(poses, kernel, sigma, rng)
             scores = self.score(encoding, poses, sigma, s["points"], rng)
             weights = softmax(scores)
+            if zoom and number + 1 == zoom["steps"]:  # is it small where the particles agree?
+                window = self.magnify(image, poses, weights, **zoom)
+                if window:
+                    return self.search(window, rng, None)
         best, score = poses[scores.argmax()], scores.max()
         for step in s["refine"]:
             if step["kind"] == "icp":
@@ -65,7 +73,39 @@ class PoseFilter:
                 continue
             refine = self.rescore if step["kind"] == "rescore" else self.shift
             best, score = refine(encoding, best, poses, weights, rng, **step)
-        return best, float(score), poses, weights
+        window = self.magnify(image, best[None], np.ones(1), **zoom) if zoom else None
+        return self.search(window, rng, None) if window else (best, float(score), poses, weights)
+
+    def magnify(self, image, poses, weights, diameter, least, most, heaviest, agreed,
+                least_depth, **_):  # fmt: skip
+        """A window about the place with the most weight within half a diameter, as an image of
+        another camera; None where that is too little weight, the object is not small there, or
+        hardly a pixel has depth.
+        """
+        own, K = self.settings["diameter"], image["intrinsics"].copy()
+        centers = poses[:, :3, :3] @ self.center + poses[:, :3, 3]
+        some = centers[np.argsort(-weights)[:heaviest], None]
+        near = (np.linalg.norm(some - centers, axis=-1) < own / 2) * weights
+        near = near[near.sum(1).argmax()]
+        center = near @ centers / near.sum()
+        size = np.array(image["depth"].shape[::-1])
+        zoom = min(diameter * size[0] * center[2] / (K[0, 0] * own), most)
+        if near.sum() < agreed or zoom < least:
+            return None
+        count = np.round(size / zoom).astype(int)
+        pixel = K.diagonal()[:2] * center[:2] / center[2] + K[:2, 2]
+        first = np.round(pixel - (count - 1) / 2).astype(int).clip(0, size - count)
+        (left, top), (right, bottom) = first, first + count
+        rgb, depth = (image[name][top:bottom, left:right] for name in ("rgb", "depth"))
+        if (depth > 0).mean() < least_depth:
+            return None
+        at = np.stack(np.meshgrid(*map(np.arange, size)), -1)
+        at = ((at + 0.5) * count / size - 0.5).clip(0, count - 1)
+        K[:2, 2] += 0.5 - first
+        K[:2] *= (size / count)[:, None]
+        K[:2, 2] -= 0.5
+        rgb = np.uint8(look(rgb, at) + 0.5)
+        return {"rgb": rgb, "depth": look_at_depth(depth, at), "intrinsics": K}
 
     def score(self, encoding, poses, sigma, points, rng):
         """Log-likelihoods (N,) at a noise level [m], from so many image points."""
@@ -218,6 +258,16 @@ def look(image, at):
         value = value + share[..., None] * image[v.clip(0, image.shape[0] - 1),
                                                  u.clip(0, image.shape[1] - 1)]  # fmt: skip
     return value
+
+
+def look_at_depth(depth, at):
+    """Sample depth bilinearly within a surface, else take the nearest: (H, W), (*, 2) -> (*)."""
+    u, v = np.moveaxis(np.minimum(at.astype(int), np.array(depth.shape)[::-1] - 2), -1, 0)
+    four = [depth[v + j, u + i] for i in (0, 1) for j in (0, 1)]
+    low, high = np.min(four, 0), np.max(four, 0)
+    u, v = np.moveaxis(np.ceil(at - 0.5).astype(int), -1, 0)
+    between = look(depth[..., None], at)[..., 0]
+    return np.float32(np.where((low > 0) & (high - low <= 0.02 * low), between, depth[v, u]))
 
 
 def distance(a, b, center, radius):

@@ -5,6 +5,7 @@ import io
 import json
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -24,11 +25,13 @@ from posefilter.deploy.write import make_graphs, to_program, write_filter
 from posefilter.errors import UserError
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.texture import TextureRotations, list_rotations
+from posefilter.geometry.camera import project
 from posefilter.geometry.pose import fit_rigid, is_rigid, make_pose, move_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.images import check_images, make_batch
 from posefilter.models.base import PoseEstimator
-from posefilter.types import BeliefBatch
+from posefilter.models.zoom import find_place, magnify, measure_zoom
+from posefilter.types import BeliefBatch, Particles
 from printed_objects import load, look
 
 HOME = Path(__file__).parents[2]
@@ -48,6 +51,18 @@ def read_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return rgb, depth.astype(np.float32), K
 
 
+def shrink_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the scene that ships at half its size, in an image that is blank elsewhere."""
+    rgb, depth, K = read_scene()
+    half = make_batch(check_images(rgb, depth, K)[0], depth.shape[1] // 2, None)
+    small, z = (255 * half.rgb[0]).round().byte().movedim(0, 2).numpy(), half.depth[0, 0].numpy()
+    high, wide = z.shape
+    top, left = high // 4, wide // 2  # of the place in an image of 2 high x 2 wide
+    room = (top, high - top), (left, wide - left)
+    K = half.intrinsics[0].numpy() + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
+    return np.pad(small, (*room, (0, 0))), np.pad(z, room), K
+
+
 @pytest.fixture(scope="module")
 def poses(load_script: Callable[[str], ModuleType]) -> ModuleType:
     pytest.importorskip("onnxruntime", reason="needs the extra export")
@@ -64,6 +79,11 @@ def pixels(poses: ModuleType, load_script: Callable[[str], ModuleType]) -> Modul
 @pytest.fixture(scope="module")
 def estimator() -> posefilter.Estimator:
     return posefilter.load("003_cracker_box", device="cpu")
+
+
+@pytest.fixture(scope="module")
+def zoomed() -> posefilter.Estimator:
+    return posefilter.load("003_cracker_box", device="cpu", overrides=["filter.zoom_diameter=0.4"])
 
 
 @pytest.fixture(scope="module")
@@ -187,20 +207,94 @@ def test_the_example_turns_as_torch_does(name: str, poses: ModuleType) -> None:
     assert all(is_rigid(torch.from_numpy(one)) for one in particles)
 
 
+def measure_apart(estimator: posefilter.Estimator, one: np.ndarray, other: np.ndarray) -> float:
+    """Return the mean distance of the object's points under two poses [m]."""
+    points = estimator.object_models[0].points.numpy()
+    turned = points @ (one[:3, :3] - other[:3, :3]).T
+    return float(np.linalg.norm(turned + one[:3, 3] - other[:3, 3], axis=1).mean())
+
+
 def test_an_estimate_is_that_of_torch(
     exported: Path, estimator: posefilter.Estimator, poses: ModuleType
 ) -> None:
     rgb, depth, K = read_scene()
     pose, _, particles, weights = poses.PoseFilter(exported).estimate(rgb, depth, K)
-    points = estimator.object_models[0].points.numpy()
-    theirs = estimator.predict(rgb, depth, K).pose
-    apart = np.linalg.norm(
-        points @ (pose[:3, :3] - theirs[:3, :3]).T + pose[:3, 3] - theirs[:3, 3], axis=1
-    )
-    assert apart.mean() < 0.004
+    assert measure_apart(estimator, pose, estimator.predict(rgb, depth, K).pose) < 0.004
     assert is_rigid(torch.from_numpy(pose))
     assert particles.shape == (estimator.methods[0].filter.particles, 4, 4)
     assert weights.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_a_small_object_is_estimated_in_a_window_as_by_torch(
+    early: bool, exported: Path, zoomed: posefilter.Estimator, poses: ModuleType
+) -> None:
+    rgb, depth, K = shrink_scene()
+    own = poses.PoseFilter(exported)
+    own.settings |= json.loads(json.dumps(describe_filter(zoomed.methods[0])))
+    if not early:  # as where no place has enough weight after the first steps
+        own.settings["zoom"]["steps"] = 0
+    encode, seen, calls = own.encode, [], []  # images that were encoded, steps on each
+
+    def watch(names: list[str], image: dict[str, np.ndarray]) -> Any:
+        seen.append(image)
+        return encode.run(names, image)
+
+    def call(name: str, step: Callable[..., Any], *given: Any, **settings: Any) -> Any:
+        assert all(one is seen[-1] for one in given if isinstance(one, dict) and "rgb" in one)
+        calls.append((name, len(seen)))
+        return step(*given, **settings)
+
+    own.encode = SimpleNamespace(get_outputs=encode.get_outputs, run=watch)
+    for name in ("score", "align", "turn"):
+        setattr(own, name, partial(call, name, getattr(own, name)))
+    pose, _, particles, _ = own.estimate(rgb, depth, K)
+    whole, window = seen
+    assert (calls.count(("score", 1)) == 3) == early
+    assert {("score", 2), ("align", 2), ("turn", 2)} <= set(calls)
+    z = (pose @ np.append(own.center, 1))[2]
+    share = own.settings["diameter"] / z / depth.shape[1]
+    assert share * whole["intrinsics"][0, 0] < 0.3
+    assert share * window["intrinsics"][0, 0] == pytest.approx(0.4, abs=0.005)
+    assert measure_apart(zoomed, pose, zoomed.predict(rgb, depth, K).pose) < 0.004
+    assert measure_apart(zoomed, particles[0], pose) < 0.03  # they are of the whole image's camera
+
+
+@pytest.mark.parametrize(
+    ("z", "share", "zoom"),
+    [(1.6, 0.8, 1.4), (9.0, 0.8, 4.0), (0.8, 0.8, None), (1.6, 0.6, None), (-1.6, 0.8, None)],
+)
+def test_the_example_magnifies_as_torch_does(
+    z: float, share: float, zoom: float | None, zoomed: posefilter.Estimator, poses: ModuleType
+) -> None:
+    rgb, depth, K = read_scene()
+    model = zoomed.object_models[0]
+    batch = make_batch(check_images(rgb, depth, K)[0], None, None)
+    R = random_rotation(250, generator=torch.Generator().manual_seed(3))
+    centers = torch.tensor([0.2, -0.3, 1.0]) * z + 0.02 * torch.randn(250, 3)
+    centers[200:] += 1.0  # another place, whose particles have all the rest of the weight
+    states = make_pose(R, centers - R @ model.center)
+    weights = torch.cat([torch.rand(200) + 0.5, torch.rand(50) + 0.5])
+    weights[:200] *= share / weights[:200].sum()
+    weights[200:] *= (1 - share) / weights[200:].sum()
+    nothing = torch.zeros(1, 250, 0)
+    particles = Particles(states[None], nothing, weights.log()[None], torch.arange(250)[None])
+    center, most = find_place(particles, model)
+    factor = measure_zoom(center, batch, model, 0.4)
+    own = poses.PoseFilter.__new__(poses.PoseFilter)
+    own.center, own.settings = model.center.numpy(), describe_filter(zoomed.methods[0])
+    image = {"rgb": rgb, "depth": depth, "intrinsics": np.float32(K)}
+    window = own.magnify(image, states.numpy(), weights.numpy(), **own.settings["zoom"])
+    assert float(most) == pytest.approx(share)
+    assert (window is None) == (zoom is None)
+    if window is None:
+        assert share < 0.7 or float(factor) == 1
+        return
+    assert float(factor) == pytest.approx(zoom, abs=0.1)
+    view = magnify(batch, project(center[:, None], batch.intrinsics)[:, 0], factor)
+    np.testing.assert_allclose(window["rgb"], 255 * view.rgb[0].movedim(0, 2), atol=0.51)
+    np.testing.assert_allclose(window["depth"], view.depth[0, 0], atol=1e-5)
+    np.testing.assert_allclose(window["intrinsics"], view.intrinsics[0], rtol=1e-5)
 
 
 def test_a_filter_over_pixels_takes_the_same_steps(

@@ -8,10 +8,12 @@ from posefilter.errors import UserError
 from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
 from posefilter.filters.agreement import Agreement
 from posefilter.filters.icp import PointToPlaneIcp
+from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.texture import TextureRotations, list_rotations, read_print
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
+from posefilter.models.zoom import AGREED, HEAVIEST, LEAST_DEPTH, LEAST_ZOOM, MOST_ZOOM, STEPS
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.types import ObjectModel
 
@@ -42,6 +44,7 @@ def describe_filter(method: PoseEstimator) -> dict[str, Any]:
         "points": method.pixels if isinstance(method, PosePF) else None,
         "quasi_monte_carlo": isinstance(method, PosePF) and method.quasi_monte_carlo,
         "latent_width": method.latent_width,
+        "zoom": _describe_zoom(own),
         "initialize": _describe_start(own.initialize),
         "resample": _choose(own.resample, "resample", systematic=resample.Systematic,
                             none=resample.NoResampling),
@@ -92,6 +95,21 @@ def _choose(component: Any, group: str, **kinds: type) -> str:
         if type(component) is kind:
             return name
     raise _refuse(component, group, *kinds)
+
+
+def _describe_zoom(own: ParticleFilter) -> dict[str, Any] | None:
+    """Return when a magnified window is searched; None: never."""
+    if own.zoom_diameter is None:
+        return None
+    return {
+        "diameter": own.zoom_diameter,  # [widths of the image]
+        "least": LEAST_ZOOM,
+        "most": MOST_ZOOM,
+        "steps": min(STEPS, own.steps),
+        "heaviest": HEAVIEST,
+        "agreed": AGREED,
+        "least_depth": LEAST_DEPTH,
+    }
 
 
 def _describe_start(start: Any) -> dict[str, Any]:

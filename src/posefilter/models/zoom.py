@@ -25,10 +25,10 @@ from posefilter.protocols import Encoding
 from posefilter.types import Batch, ObjectModel, Particles, Trace
 
 LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
-_STEPS = 3  # of the filter, after which particles that agree are near the object
-_LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
-_HEAVIEST = 200  # particles that a place may be about
-_AGREED = 0.7  # weight of the particles within half a diameter of each other
+STEPS = 3  # of the filter, after which particles that agree are near the object
+LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
+HEAVIEST = 200  # particles that a place may be about
+AGREED = 0.7  # weight of the particles within half a diameter of each other
 
 
 class Place(NamedTuple):
@@ -78,10 +78,10 @@ def search(
         return trace
     object_model, target = method.object_model, run.zoom_diameter
     steps = run.iterate(batch, encoding, method, generator)
-    begun = list(islice(steps, _STEPS))
+    begun = list(islice(steps, STEPS))
     centers, weight = find_place(begun[-1].particles, object_model)
     zoom = measure_zoom(centers, batch, object_model, target)
-    small = (zoom > 1) & (weight >= _AGREED)
+    small = (zoom > 1) & (weight >= AGREED)
     whole: Trace | None = None
     if not small.all():
         if small.any():
@@ -105,7 +105,7 @@ def find_place(particles: Particles, object_model: ObjectModel) -> Place:
     """Return the place with the most weight within half a diameter of it."""
     centers = origin_of(particles.state, object_model.center.to(particles.state.device))
     weights = particles.log_weights.exp()
-    heaviest = weights.topk(min(_HEAVIEST, weights.shape[1])).indices
+    heaviest = weights.topk(min(HEAVIEST, weights.shape[1])).indices
     about = centers.gather(1, heaviest[..., None].expand(-1, -1, 3))
     near = torch.cdist(about, centers) < object_model.diameter / 2  # (B, M, N)
     most, index = (near * weights[:, None]).sum(-1).max(1)
@@ -133,7 +133,7 @@ def measure_zoom(
     pixels = project(centers[:, None], batch.intrinsics)[:, 0]
     for i in (zoom > 1).nonzero()[:, 0].tolist():
         part = _place_window(batch, pixels[i], zoom[i])
-        if float((batch.depth[i][part] > 0).float().mean()) < _LEAST_DEPTH:
+        if float((batch.depth[i][part] > 0).float().mean()) < LEAST_DEPTH:
             zoom[i] = 1.0
     return zoom
 
