@@ -57,3 +57,5 @@ def test_a_small_object_is_magnified_as_in_single_images_up_to_a_limit() -> None
     assert far.seen_width / far.width == pytest.approx(4 * 0.5)
     near = place_window(at(0.0, 0.6), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
     assert near == place_window(at(0.0, 0.6), MODEL, K, (960, 1280), 0.5, 320, 1.25)
+    little = place_window(at(0.0, 0.86), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
+    assert little == place_window(at(0.0, 0.86), MODEL, K, (960, 1280), 0.5, 320, 1.25)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.images import Images
-from posefilter.models.zoom import MOST_ZOOM
+from posefilter.models.zoom import LEAST_ZOOM, MOST_ZOOM
 from posefilter.types import ObjectModel
 
 _CELL = 32  # [px] the network's coarsest cell
@@ -57,8 +57,9 @@ def place_window(
     if z <= object_model.radius / 2:
         return None
     half = window_scale * object_model.radius * float(K[0, 0]) / z
-    magnified = diameter / (object_model.diameter * float(K[0, 0]) / z)
-    scale = min(max(scale, min(magnified, MOST_ZOOM * scale)), side / (2 * half))
+    zoom = diameter / (scale * object_model.diameter * float(K[0, 0]) / z)
+    scale *= min(zoom, MOST_ZOOM) if zoom >= LEAST_ZOOM else 1.0
+    scale = min(scale, side / (2 * half))
     # a whole number of the network's cells, so that no pixel is padding
     cells = min(-(-round(2 * half * scale) // _CELL), side // _CELL)
     seen = max(2, cells) * _CELL
