@@ -38,6 +38,7 @@ class Toy:
     """Finds the pixel that is most red; with `filter.draws`, one that its generator draws."""
 
     object_model = MODEL
+    part: Batch | None = None  # that the fourth search is of
 
     def __init__(
         self, max_searches: int = 3, calibration: Calibration | None = CALIBRATION
@@ -49,6 +50,9 @@ class Toy:
 
     def search(self, batch: Batch, generator: Generator, encoding: Any = None) -> Trace:
         return self.filter(batch, with_encoding(self, encoding), generator)
+
+    def choose_part(self, image: Batch) -> Batch | None:
+        return self.part
 
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         return {"green": self._read(trace, batch, 1)}
@@ -178,6 +182,17 @@ def test_two_looks_are_one_more() -> None:
     toy = Toy(max_searches=2)
     run(toy, draw([[(5, 5, 1.0, 0.0), (40, 30, 0.8, 0.1)]]))
     assert toy.filter.runs == 2
+
+
+def test_the_fourth_search_is_of_the_part_that_most_likely_shows_the_object() -> None:
+    small = (40, 30, 0.4, 1.0)  # and not seen beside what is more red
+    batch = draw([[(5, 5, 1.0, 0.0), (20, 20, 0.9, 0.0), small]])
+    for searches, place in ((3, (5, 5)), (4, (40, 30))):
+        toy = Toy(max_searches=searches)
+        toy.part = draw([[small]])
+        _, last = run(toy, batch)
+        assert places(last) == [place]
+        assert toy.filter.runs == searches
 
 
 def test_an_image_without_depth_beside_the_answer_is_not_searched_for_more() -> None:

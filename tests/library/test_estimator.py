@@ -460,5 +460,5 @@ def test_fewer_looks_keep_the_calibration() -> None:
     assert once.methods[0].filter.max_searches == 1
     assert result.probability is not None
     assert 0 <= result.probability <= result.presence
-    with pytest.raises(posefilter.UserError, match=r"filter\.max_searches=4: must be 1, 2 or 3"):
-        posefilter.load("003_cracker_box", overrides=["filter.max_searches=4"], device="cpu")
+    with pytest.raises(posefilter.UserError, match=r"filter\.max_searches=5: must be 1, 2, 3 or 4"):
+        posefilter.load("003_cracker_box", overrides=["filter.max_searches=5"], device="cpu")

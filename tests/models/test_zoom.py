@@ -1,5 +1,6 @@
 """An object that is small in the image is searched in a magnified window, and only there."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.models.zoom import MOST_ZOOM, magnify, measure_zoom, search
+from posefilter.models.zoom import MOST_ZOOM, choose_part, magnify, measure_zoom, search
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 H, W = 48, 64  # [px]
@@ -181,3 +182,37 @@ def test_a_window_without_depth_is_not_searched() -> None:
     batch.depth[..., :40, :44] = 0
     batch.depth[..., 20, 20] = 0.5  # a single pixel knows it
     assert float(measure_zoom(center, batch, MODEL, 0.3)) == 1
+
+
+class Looker(Seeker):
+    """Its network is sure of what is bright."""
+
+    def encode(self, batch: Batch) -> Any:
+        self.seen.append(batch)
+        return SimpleNamespace(objectness=batch.rgb.mean(1, keepdim=True))
+
+
+@pytest.mark.parametrize(("u", "v"), [(4, 4), (31, 24), (60, 10), (50, 44)])
+def test_the_part_shows_what_the_network_is_surest_of_twice_as_large(u: int, v: int) -> None:
+    looker, image = Looker(None), draw((u, v, 0.5))
+    part = choose_part(looker, image)
+    assert part is not None
+    assert part.rgb.shape == image.rgb.shape
+    assert float(part.intrinsics[0, 0, 0]) == 2 * 64
+    brightest = int(part.rgb[0, 0].argmax())
+    seen = torch.tensor([[brightest % W, brightest // W]]).float()
+    point = back_project(seen, torch.tensor([0.5]), part.intrinsics[0])
+    assert torch.allclose(project(point, K), torch.tensor([[u, v]]).float(), atol=0.6)
+
+
+def test_there_is_no_part_without_depth_or_without_objectness() -> None:
+    image = draw((20, 20, 0.5))
+    assert choose_part(Seeker(None), image) is None
+    assert choose_part(Looker(None), image._replace(depth=0 * image.depth)) is None
+    half = image._replace(depth=image.depth.clone())
+    half.depth[..., :40] = 0  # where the bright pixel is
+    looker = Looker(None)
+    part = choose_part(looker, half)
+    assert part is not None
+    assert float(part.depth.max()) > 0
+    assert len(looker.seen[0].rgb) < 9

@@ -138,6 +138,7 @@ class Onboarding:
         words = [
             "model=pose_pf",
             "filter.zoom_diameter=0.4",
+            "filter.max_searches=4",
             "data=scenes",
             "data/augment=camera",
             *(f"{key}='{value}'" for key, value in quoted.items()),

@@ -1,16 +1,20 @@
 """Search an image again while the answer is doubtful, and keep the one more probably right.
 
 A filter that has converged on a wrong mode does not come back from it: all its particles are there,
-and its likelihood prefers it. Two other searches may find the right one: of the image without what
-the first answer took for the object, and by other random draws. Which answer is right is then not
-asked of the likelihood, which has erred, but of a logistic regression on all that speaks for an
-answer: agreement of the particles, measured depth, print, and the network of object coordinates.
+and its likelihood prefers it. Other searches may find the right one: of the image without what the
+first answer took for the object, by other random draws, and of the magnified part of the image that
+most likely shows the object, which the network may miss where it is small. Which answer is right is
+then not asked of the likelihood, which has erred, but of a logistic regression on all that speaks
+for an answer: agreement of the particles, measured depth, print, and the network of object
+coordinates.
 
 An answer is doubtful, too, where the object appears larger or smaller there than it is: the same
 print in another size, as of a package of the same brand. No answer of that kind replaces another.
 """
 
 import math
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any, Protocol
 
 import torch
@@ -50,6 +54,12 @@ class Searcher(Protocol):
         """Run the filter on images, which may be encoded already."""
         ...
 
+    def choose_part(self, image: Batch) -> Batch | None:
+        """Return the magnified part of one image that most likely shows the object; None where it
+        cannot tell.
+        """
+        ...
+
     def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
         """Return what speaks for each estimate, by name."""
         ...
@@ -59,12 +69,14 @@ class Searcher(Protocol):
         ...
 
 
-def measure_worth(encoding: Any) -> float:
-    """Return the mean probability of the surest cells of one image; 1 where it has none."""
+def measure_worth(encoding: Any) -> Tensor:
+    """Return the mean probability of the surest cells of each image, (B,); (1,) of 1 where there
+    is none.
+    """
     if not isinstance(encoding, HasObjectness):
-        return 1.0
-    objectness = encoding.objectness.flatten()
-    return float(objectness.topk(min(_CELLS, len(objectness))).values.mean())
+        return torch.ones(1)
+    objectness = encoding.objectness.flatten(1)
+    return objectness.topk(min(_CELLS, objectness.shape[1])).values.mean(1)
 
 
 @torch.no_grad()
@@ -128,11 +140,12 @@ def _search(
     # of a single image, its first search has encoded it
     known = first.encoding is not None and len(first.belief.best) == 1
     whole = first.encoding if known else method.encode(image)
-    for part in (blank(image, hidden), image)[: method.filter.max_searches - 1]:
+    parts = _list_parts(method, image, blank(image, hidden))
+    for part in islice(parts, method.filter.max_searches - 1):
         if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
             continue
         encoding = whole if part is image else method.encode(part)
-        if measure_worth(encoding) < _WORTH:
+        if float(measure_worth(encoding)) < _WORTH:
             continue
         found = method.search(part, generator, encoding)
         # what was hidden is there: judged by the whole image, as the first answer
@@ -143,6 +156,15 @@ def _search(
             if value >= DOUBTFUL:
                 break
     return best
+
+
+def _list_parts(method: Searcher, image: Batch, rest: Batch) -> Iterator[Batch]:
+    """Yield where one image is searched again, in turn; `rest` is it without the first answer."""
+    yield rest
+    yield image
+    part = method.choose_part(image)
+    if part is not None:
+        yield part
 
 
 def _put(trace: Trace, row: int, found: Trace) -> Trace:

@@ -76,13 +76,13 @@ class ParticleFilter(nn.Module):
         refine: Improves the estimate, or replaces the particles.
         initial_particles: Number of particles at the first step; `particles` if None.
         max_searches: How often an image is searched at most, while a calibrated answer is doubtful
-            (confidence/second_look.py); 1 to 3.
+            (confidence/second_look.py); 1 to 4.
         zoom_diameter: Where the object is smaller in the image, in widths of the image, a method
             that estimates poses searches a magnified window in which it has this diameter
             (models/zoom.py); None: nowhere.
 
     Raises:
-        UserError: A number is below 1, `max_searches` above 3, or `zoom_diameter` not in (0, 1].
+        UserError: A number is below 1, `max_searches` above 4, or `zoom_diameter` not in (0, 1].
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class ParticleFilter(nn.Module):
                 f"filter: particles={particles}, initial_particles={initial_particles} and "
                 f"steps={steps} must be 1 or more"
             )
-        if not 1 <= max_searches <= 3:
-            raise UserError(f"filter.max_searches={max_searches}: must be 1, 2 or 3")
+        if not 1 <= max_searches <= 4:
+            raise UserError(f"filter.max_searches={max_searches}: must be 1, 2, 3 or 4")
         if zoom_diameter is not None and not 0 < zoom_diameter <= 1:
             raise UserError(f"filter.zoom_diameter={zoom_diameter}: must be above 0, 1 at most")
         self.particles, self.steps, self.max_searches = particles, steps, max_searches

@@ -165,7 +165,9 @@ def _search(
     hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
     image, encoding = _encode(job, hidden)
     one = None
-    if bool(image.depth.any()) and (job.searches == 1 or measure_worth(encoding) >= settings.worth):
+    if bool(image.depth.any()) and (
+        job.searches == 1 or float(measure_worth(encoding)) >= settings.worth
+    ):
         trace = search(job.method, image, job.generator, encoding, job.filter)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         visible = find_visible(trace.belief.best, job.method.object_model, depth, K)[0]

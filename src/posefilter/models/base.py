@@ -35,7 +35,7 @@ from posefilter.metrics.results import compute_checkpoint_score, flatten
 from posefilter.models.box_heads import PoseBox
 from posefilter.models.clipping import clip_submodules
 from posefilter.models.lr_schedulers import find_length
-from posefilter.models.zoom import search
+from posefilter.models.zoom import choose_part, search
 from posefilter.protocols import Loss, Space
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -381,6 +381,12 @@ class PoseEstimator(Module):
             encoding: What `encode` returns of them, where it is known.
         """
         return search(self, batch, generator, encoding)
+
+    def choose_part(self, image: Batch) -> Batch | None:
+        """Return the part of one image in which the method is surest of the object when it sees it
+        magnified; None where it cannot tell, or the particles are places in the image.
+        """
+        return choose_part(self, image) if "pose_space" in self.capabilities else None
 
     def _evaluate(self, batch: Batch, stage: str, batch_number: int) -> Trace:
         start = time.perf_counter()

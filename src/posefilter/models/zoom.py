@@ -17,14 +17,16 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
 
+from posefilter.confidence.second_look import measure_worth
 from posefilter.data.resize import resize_depth
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.camera import project, resize_intrinsics
 from posefilter.geometry.pose import origin_of
-from posefilter.protocols import Encoding
+from posefilter.protocols import Encoding, HasObjectness
 from posefilter.types import Batch, ObjectModel, Particles, Trace
 
 LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
+PART_ZOOM = 2.0  # of the parts in which a doubtful object is looked for
 STEPS = 3  # of the filter, after which particles that agree are near the object
 LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
 HEAVIEST = 200  # particles that a place may be about
@@ -99,6 +101,30 @@ def search(
     view = magnify(select(batch, small), pixels[small], zoom[small])
     near: Trace = run(view, method, generator)
     return merge(whole, near, small)._replace(encoding=encoding)
+
+
+def choose_part(method: Any, image: Batch) -> Batch | None:
+    """Return the part of one image in which the network is surest of the object when it sees it
+    twice as large; None where no part has depth, or the method's encoding has no objectness.
+
+    Nine parts overlap by half, so that one of them shows an object of a quarter of the image whole.
+    """
+    height, width = image.rgb.shape[-2:]
+    centers = [
+        ((width - 1) * u, (height - 1) * v) for v in (0.25, 0.5, 0.75) for u in (0.25, 0.5, 0.75)
+    ]
+    pixels = image.intrinsics.new_tensor(centers)
+    copies = Batch(*(x.expand(len(pixels), *x.shape[1:]) for x in image))
+    parts = magnify(copies, pixels, pixels.new_full((len(pixels),), PART_ZOOM))
+    known = (parts.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
+    if not known.any():
+        return None
+    parts = select(parts, known)
+    encoding = method.encode(parts)
+    if not isinstance(encoding, HasObjectness):
+        return None
+    surest = int(measure_worth(encoding).argmax())
+    return Batch(*(x[surest : surest + 1] for x in parts))
 
 
 def find_place(particles: Particles, object_model: ObjectModel) -> Place:
