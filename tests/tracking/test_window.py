@@ -45,17 +45,3 @@ def test_a_window_is_cut_at_the_photographs_edge() -> None:
     assert window.seen_width < window.seen_height == 320
     assert place_window(at(-5.0, 0.6), MODEL, K, (960, 1280), 1.0, 320, 1.25) is None
     assert place_window(at(0.0, 0.04), MODEL, K, (960, 1280), 1.0, 320, 1.25) is None
-
-
-def test_a_small_object_is_magnified_as_in_single_images_up_to_a_limit() -> None:
-    window = place_window(at(0.0, 2.0), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
-    assert window is not None
-    scale = window.seen_width / window.width
-    assert scale * 1000 * MODEL.diameter / 2.0 == pytest.approx(128, rel=0.02)
-    far = place_window(at(0.0, 8.0), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
-    assert far is not None
-    assert far.seen_width / far.width == pytest.approx(4 * 0.5)
-    near = place_window(at(0.0, 0.6), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
-    assert near == place_window(at(0.0, 0.6), MODEL, K, (960, 1280), 0.5, 320, 1.25)
-    little = place_window(at(0.0, 0.86), MODEL, K, (960, 1280), 0.5, 320, 1.25, diameter=128)
-    assert little == place_window(at(0.0, 0.86), MODEL, K, (960, 1280), 0.5, 320, 1.25)

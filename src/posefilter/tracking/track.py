@@ -369,17 +369,15 @@ class Track:
         if self._whole_is_due:
             return None
         motion = settings.motion
-        seen_width = network_size(height, width, *self.size)[1]
         more = 2 * (motion.noise_scale(predicted.squared_innovation) - 1) * max(motion.scale[:3])
         return place_window(
             predicted.best[0].double().cpu().numpy(),
             self.method.object_model,
             images.intrinsics[0],
             (height, width),
-            seen_width / width,
+            network_size(height, width, *self.size)[1] / width,
             settings.window_side,
             settings.window_scale + more / self.space.radius,
-            seen_width * (self.method.filter.zoom_diameter or 0.0),
         )
 
     def _take(self, batch: Batch) -> Batch:

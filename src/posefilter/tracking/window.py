@@ -1,8 +1,7 @@
 """The part of a photograph about the object, at no more pixels than tracking needs.
 
 What a filter costs does not depend on the image's size, but what its network costs does. While the
-object's place is known, the network is given a square window about it, magnified where it is small
-and single images are, too (models/zoom.py).
+object's place is known, the network is given a square window about it.
 """
 
 from typing import NamedTuple
@@ -10,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from posefilter.images import Images
-from posefilter.models.zoom import LEAST_ZOOM, MOST_ZOOM
 from posefilter.types import ObjectModel
 
 _CELL = 32  # [px] the network's coarsest cell
@@ -35,7 +33,6 @@ def place_window(
     scale: float,
     side: int,
     window_scale: float,
-    diameter: float = 0.0,
 ) -> Window | None:
     """Return the window about an object.
 
@@ -47,7 +44,6 @@ def place_window(
         scale: Seen pixels for one of the photograph's, at most; that of training.
         side: Seen pixels of the window's side, at most.
         window_scale: Half the window's side, in projected radii of the object.
-        diameter: Of the object, that it is magnified to where it is smaller [px, seen]; 0: never.
 
     Returns:
         The window, cut at the photograph's edges; None where it would hold the whole photograph or
@@ -57,8 +53,6 @@ def place_window(
     if z <= object_model.radius / 2:
         return None
     half = window_scale * object_model.radius * float(K[0, 0]) / z
-    zoom = diameter / (scale * object_model.diameter * float(K[0, 0]) / z)
-    scale *= min(zoom, MOST_ZOOM) if zoom >= LEAST_ZOOM else 1.0
     scale = min(scale, side / (2 * half))
     # a whole number of the network's cells, so that no pixel is padding
     cells = min(-(-round(2 * half * scale) // _CELL), side // _CELL)
