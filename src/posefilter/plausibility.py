@@ -70,5 +70,8 @@ def find_warnings(
     u = intrinsics[0, 0] * x / z + intrinsics[0, 2]
     v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
     if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
-        found.append("the object's center would be outside of the image: are the intrinsics right?")
+        found.append(
+            "the object's center would be outside of the image: are the intrinsics and the depth's "
+            "units (depth_scale) right?"
+        )
     return tuple(found)

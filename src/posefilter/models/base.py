@@ -88,11 +88,6 @@ class PoseEstimator(Module):
         super().__init__()
         self.filter, self.train_filter, self.loss = filter, train_filter or filter, loss
         self.make_optimizer, self.make_scheduler, self.seed = optimizer, scheduler, seed
-        if filter.zoom_diameter is not None and "pose_space" not in self.provides:
-            raise UserError(
-                "filter.zoom_diameter: needs a method whose particles are poses, such as pose_pf; "
-                f"those of {type(self).__name__} are places in one image"
-            )
         if scheduler is not None:
             find_length(scheduler)  # a setting that is missing is told before the training begins
         self._object_model: ObjectModel | None = None
@@ -215,6 +210,11 @@ class PoseEstimator(Module):
                 neither a pose nor a box of its own.
         """
         check_parts(self)
+        if self.filter.zoom_diameter is not None and "pose_space" not in self.capabilities:
+            raise UserError(
+                "filter.zoom_diameter: needs a method whose particles are poses, such as pose_pf; "
+                f"those of {type(self).__name__} are places in one image"
+            )
         if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
             raise UserError(
                 f"{type(self).__name__}: `provides` lacks pose, so that it needs a box() of its "

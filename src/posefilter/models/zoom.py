@@ -74,10 +74,11 @@ def search(
         searched.
     """
     run = method.filter if particle_filter is None else particle_filter
-    encoding = method.encode(batch) if encoding is None else encoding
     if run.zoom_diameter is None:
-        trace: Trace = run(batch, with_encoding(method, encoding), generator)
+        encoded = method if encoding is None else with_encoding(method, encoding)
+        trace: Trace = run(batch, encoded, generator)
         return trace
+    encoding = method.encode(batch) if encoding is None else encoding
     object_model, target = method.object_model, run.zoom_diameter
     steps = run.iterate(batch, encoding, method, generator)
     begun = list(islice(steps, STEPS))
