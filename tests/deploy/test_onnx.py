@@ -78,7 +78,7 @@ def pixels(poses: ModuleType, load_script: Callable[[str], ModuleType]) -> Modul
 
 @pytest.fixture(scope="module")
 def estimator() -> posefilter.Estimator:
-    return posefilter.load("003_cracker_box", device="cpu")
+    return posefilter.load("003_cracker_box", device="cpu", overrides=["filter.zoom_diameter=null"])
 
 
 @pytest.fixture(scope="module")

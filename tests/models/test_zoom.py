@@ -17,6 +17,7 @@ from posefilter.filters.schedule import Geometric
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.models import zoom
 from posefilter.models.zoom import MOST_ZOOM, choose_part, magnify, measure_zoom, search
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
@@ -153,6 +154,34 @@ def test_images_of_a_batch_keep_their_places() -> None:
         assert torch.allclose(poses, truth, atol=6e-3)
     assert [len(one.rgb) for one in seeker.seen] == [4, 2, 2]
     assert all(len(one.state) == 4 for one in trace.particles)
+
+
+def test_a_batch_of_all_kinds_keeps_its_places_about_a_center_that_is_not_the_origin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Small and agreed, large, small by the whole filter's answer alone, large again."""
+    agreed = zoom.find_place
+
+    def find_place(particles: Particles, object_model: ObjectModel) -> zoom.Place:
+        center, weight = agreed(particles, object_model)
+        disagreed = torch.tensor([False, False, True, False])
+        return zoom.Place(torch.where(disagreed[:, None], 0.1, center), weight * ~disagreed)
+
+    monkeypatch.setattr(zoom, "find_place", find_place)
+    batch = draw((27, 22, 0.5), (40, 30, 0.25), (34, 25, 0.6), (50, 10, 0.2))
+    seeker, offset = Seeker(0.3), torch.tensor([0.0, 0.0, -0.04])
+    seeker.object_model = MODEL._replace(center=offset)
+    trace = run(seeker, batch)
+    pixels = torch.tensor([[[27.0, 22]], [[40, 30]], [[34, 25]], [[50, 10]]])
+    depth = torch.tensor([[0.5], [0.25], [0.6], [0.2]])
+    truth = back_project(pixels, depth, batch.intrinsics)[:, 0]
+    assert torch.allclose(trace.belief.best[:, :3, 3], truth, atol=6e-3)
+    assert [len(one.rgb) for one in seeker.seen] == [4, 3, 2]
+    for row, cameras in ((0, 0), (2, 1)):  # windows about the center, as large as asked for there
+        camera, center = seeker.seen[-1].intrinsics[cameras], truth[row] + offset
+        at = project(center[None], camera)[0]
+        assert (at - torch.tensor([(W - 1) / 2, (H - 1) / 2])).abs().max() < 4
+        assert float(camera[0, 0] * MODEL.diameter / center[2]) / W == pytest.approx(0.3, abs=0.03)
 
 
 def test_particles_that_do_not_agree_see_the_whole_image_to_the_end() -> None:

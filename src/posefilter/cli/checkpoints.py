@@ -18,6 +18,7 @@ from posefilter.cli.recipe import NOT_KEPT, check_recipe, resolve_foreign, witho
 from posefilter.cli.trust import Scope
 from posefilter.confidence.calibration import read_calibration
 from posefilter.errors import UserError, find_reason
+from posefilter.filters.loop import MAX_SEARCHES
 from posefilter.models.base import PoseEstimator, with_lightning
 from posefilter.models.quantization import unpack
 from posefilter.types import ObjectModel
@@ -136,7 +137,7 @@ def method_of(
     """
     recipe = checkpoint["recipe"]
     settings = changed(recipe["settings"], wanted or {})
-    same = _without_max_searches(settings) == _without_max_searches(recipe["settings"])
+    same = is_calibrated_filter(settings, recipe["settings"])
     recipe = {**recipe, "settings": without_pretrained(settings)}
     state = unpack(checkpoint["state_dict"])
     elements = 4 * sum(value.numel() for value in state.values()) + _SPARE_ELEMENTS
@@ -169,14 +170,21 @@ def method_of(
     return method.eval()
 
 
-def _without_max_searches(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return settings without how often an image is searched: fewer answers to choose from are
-    judged by the same features.
+def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -> bool:
+    """Tell whether a checkpoint's calibration holds for settings: they are those that it was made
+    with, or have fewer searches. Then fewer answers to choose from are judged by the same features.
     """
-    own = settings.get("filter")
-    if not isinstance(own, dict):
-        return settings
-    return {
-        **settings,
-        "filter": {key: value for key, value in own.items() if key != "max_searches"},
-    }
+
+    def split(one: dict[str, Any]) -> tuple[dict[str, Any], int]:
+        own = dict(one["filter"]) if isinstance(one.get("filter"), dict) else {}
+        searches = own.pop("max_searches", None)
+        if own.get("zoom_diameter") is None:  # as recipes of earlier versions leave it out
+            own.pop("zoom_diameter", None)
+        return {**one, "filter": own or one.get("filter")}, _read_searches(searches)
+
+    new, old = split(settings), split(calibrated)
+    return new[0] == old[0] and new[1] <= old[1]
+
+
+def _read_searches(value: Any) -> int:
+    return value if isinstance(value, int) else MAX_SEARCHES

@@ -192,8 +192,8 @@ class Onboarding:
 
     def rest(self, speed: Speed) -> float:
         """Return how long what follows the training, and is not done, takes [s]."""
-        # frames with and without the object, run twice; doubtful ones, once or twice more each
-        searches = 7 * min(_CALIBRATED, self.frames // 10)
+        # frames with and without the object, run twice; doubtful ones, up to three times more each
+        searches = 10 * min(_CALIBRATED, self.frames // 10)
         images = {"train": _VALIDATED, "calibrate": searches, "test": int(self.cfg.test_frames)}
         ahead = [one.name for one in STAGES if not self.is_done(one)]
         seconds = speed.image * sum(images.get(name, 0) for name in ahead)

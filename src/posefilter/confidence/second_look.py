@@ -23,6 +23,7 @@ from torch import Generator, Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
+from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.protocols import HasObjectness
 from posefilter.types import Batch, ObjectModel, Trace
@@ -69,13 +70,24 @@ class Searcher(Protocol):
         ...
 
 
+def read_objectness(encoding: Any) -> Tensor | None:
+    """Return the objectness of each cell, (B, 1, h, w); None where an encoding has none."""
+    try:
+        return encoding.objectness if isinstance(encoding, HasObjectness) else None
+    except (
+        UserError
+    ):  # of a method without a proposal network: before Python 3.12 `isinstance` asks
+        return None
+
+
 def measure_worth(encoding: Any) -> Tensor:
     """Return the mean probability of the surest cells of each image, (B,); (1,) of 1 where there
     is none.
     """
-    if not isinstance(encoding, HasObjectness):
+    cells = read_objectness(encoding)
+    if cells is None:
         return torch.ones(1)
-    objectness = encoding.objectness.flatten(1)
+    objectness = cells.flatten(1)
     return objectness.topk(min(_CELLS, objectness.shape[1])).values.mean(1)
 
 

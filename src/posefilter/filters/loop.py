@@ -48,6 +48,8 @@ from posefilter.protocols import (
 )
 from posefilter.types import Batch, ParticleOutput, Particles, Resampled, Step, Trace
 
+MAX_SEARCHES = 3  # of an image, where nothing else is set
+
 
 class Iteration(NamedTuple):
     """What one step of the filter leaves."""
@@ -79,7 +81,8 @@ class ParticleFilter(nn.Module):
             (confidence/second_look.py); 1 to 4.
         zoom_diameter: Where the object is smaller in the image, in widths of the image, a method
             that estimates poses searches a magnified window in which it has this diameter
-            (models/zoom.py); None: nowhere.
+            (models/zoom.py); None: nowhere. The filter itself runs on the images that it is given:
+            `PoseEstimator.search` chooses them, in validation, test and prediction.
 
     Raises:
         UserError: A number is below 1, `max_searches` above 4, or `zoom_diameter` not in (0, 1].
@@ -97,7 +100,7 @@ class ParticleFilter(nn.Module):
         estimate: Estimate,
         refine: Refine,
         initial_particles: int | None = None,
-        max_searches: int = 3,
+        max_searches: int = MAX_SEARCHES,
         zoom_diameter: float | None = None,
     ) -> None:
         super().__init__()
@@ -150,7 +153,7 @@ class ParticleFilter(nn.Module):
         """Run the filter step by step; arguments as of `forward`, with the images encoded.
 
         Yields:
-            What each step leaves, the first one's initial particles measured.
+            What each step leaves; the first measures the initial particles.
         """
         state = self.initialize(batch, encoding, method, self.initial_particles, generator)
         particles = make_particles(state, method.latent_width)

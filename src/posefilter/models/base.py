@@ -210,11 +210,17 @@ class PoseEstimator(Module):
                 neither a pose nor a box of its own.
         """
         check_parts(self)
-        if self.filter.zoom_diameter is not None and "pose_space" not in self.capabilities:
-            raise UserError(
-                "filter.zoom_diameter: needs a method whose particles are poses, such as pose_pf; "
-                f"those of {type(self).__name__} are places in one image"
-            )
+        if getattr(self.filter, "zoom_diameter", None) is not None:
+            if "pose_space" not in self.capabilities:
+                raise UserError(
+                    "filter.zoom_diameter: needs a method whose particles are poses, such as "
+                    f"pose_pf; those of {type(self).__name__} are places in one image"
+                )
+            if type(self.filter).forward is not ParticleFilter.forward:
+                raise UserError(
+                    f"filter.zoom_diameter: {type(self.filter).__name__} has a forward() of its "
+                    "own, which windows would not run; choose null"
+                )
         if type(self).box is PoseEstimator.box and "pose" not in collect_provided(self):
             raise UserError(
                 f"{type(self).__name__}: `provides` lacks pose, so that it needs a box() of its "

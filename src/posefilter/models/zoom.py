@@ -17,12 +17,13 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
 
-from posefilter.confidence.second_look import measure_worth
+from posefilter.confidence.second_look import measure_worth, read_objectness
 from posefilter.data.resize import resize_depth
 from posefilter.filters.loop import ParticleFilter
 from posefilter.geometry.camera import project, resize_intrinsics
 from posefilter.geometry.pose import origin_of
-from posefilter.protocols import Encoding, HasObjectness
+from posefilter.nets.pose_votes import measure_cells
+from posefilter.protocols import Encoding
 from posefilter.types import Batch, ObjectModel, Particles, Trace
 
 LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
@@ -30,7 +31,7 @@ PART_ZOOM = 2.0  # of the parts in which a doubtful object is looked for
 STEPS = 3  # of the filter, after which particles that agree are near the object
 LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
 HEAVIEST = 200  # particles that a place may be about
-AGREED = 0.7  # weight of the particles within half a diameter of each other
+AGREED = 0.7  # weight of the particles within half a diameter of one of them
 
 
 class Place(NamedTuple):
@@ -60,7 +61,8 @@ def search(
 ) -> Trace:
     """Run a filter on B images, on magnified windows of those in which the object is small.
 
-    Where it is small in none the trace is that of the filter alone, bit for bit.
+    Where it is small in none the trace is that of the filter alone, bit for bit; where it is in
+    some, the others are searched by other random draws.
 
     Args:
         method: A method whose particles are poses.
@@ -74,12 +76,13 @@ def search(
         searched.
     """
     run = method.filter if particle_filter is None else particle_filter
-    if run.zoom_diameter is None:
+    target: float | None = getattr(run, "zoom_diameter", None)
+    if target is None:
         encoded = method if encoding is None else with_encoding(method, encoding)
         trace: Trace = run(batch, encoded, generator)
         return trace
     encoding = method.encode(batch) if encoding is None else encoding
-    object_model, target = method.object_model, run.zoom_diameter
+    object_model = method.object_model
     steps = run.iterate(batch, encoding, method, generator)
     begun = list(islice(steps, STEPS))
     centers, weight = find_place(begun[-1].particles, object_model)
@@ -117,12 +120,12 @@ def choose_part(method: Any, image: Batch) -> Batch | None:
     pixels = image.intrinsics.new_tensor(centers)
     copies = Batch(*(x.expand(len(pixels), *x.shape[1:]) for x in image))
     parts = magnify(copies, pixels, pixels.new_full((len(pixels),), PART_ZOOM))
-    known = (parts.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
+    known = _has_depth(parts)
     if not known.any():
         return None
     parts = select(parts, known)
     encoding = method.encode(parts)
-    if not isinstance(encoding, HasObjectness):
+    if read_objectness(encoding) is None:
         return None
     surest = int(measure_worth(encoding).argmax())
     return Batch(*(x[surest : surest + 1] for x in parts))
@@ -158,11 +161,19 @@ def measure_zoom(
     zoom = (zoom_diameter * batch.rgb.shape[-1] / diameter).clamp_max(MOST_ZOOM)
     zoom = torch.where((z > 0) & (zoom >= LEAST_ZOOM), zoom, 1.0)
     pixels = project(centers[:, None], batch.intrinsics)[:, 0]
-    for i in (zoom > 1).nonzero()[:, 0].tolist():
-        part = _place_window(batch, pixels[i], zoom[i])
-        if float((batch.depth[i][part] > 0).float().mean()) < LEAST_DEPTH:
-            zoom[i] = 1.0
+    small = zoom > 1
+    if small.any():
+        view = magnify(select(batch, small), pixels[small], zoom[small])
+        zoom[small] = torch.where(_has_depth(view), zoom[small], 1.0)
     return zoom
+
+
+def _has_depth(view: Batch) -> Tensor:
+    """Return in which images there is depth to start from, (B,) bool: in some pixels, and in one of
+    the proposal network's cells.
+    """
+    known = (view.depth > 0).flatten(1).float().mean(1) >= LEAST_DEPTH
+    return known & measure_cells(view.depth, view.intrinsics).valid.flatten(1).any(1)
 
 
 def magnify(batch: Batch, pixels: Tensor, zoom: Tensor) -> Batch:
