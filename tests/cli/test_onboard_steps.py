@@ -39,9 +39,9 @@ def test_what_is_left_is_the_time_of_the_stages_that_are_not_done(tmp_path: Path
         left.append(work.rest(speed))
         work.stages.run(stage.name, work.settings_of(stage), lambda: None)
     found = dict(zip([stage.name for stage in STAGES], left, strict=True))
-    # 280 images of the calibration, 60 of the test, 8 of the training, and 25 s for all else
-    assert found["mesh"] == found["train"] == 280 + 60 + 8 + 25
-    assert found["export"] == found["calibrate"] == 280 + 60 + 25
+    # 400 images of the calibration, 60 of the test, 8 of the training, and 25 s for all else
+    assert found["mesh"] == found["train"] == 400 + 60 + 8 + 25
+    assert found["export"] == found["calibrate"] == 400 + 60 + 25
     assert found["test"] == 60 + 25
     assert found["report"] == 25
     assert work.rest(speed) == 0
