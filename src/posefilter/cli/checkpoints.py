@@ -176,15 +176,10 @@ def is_calibrated_filter(settings: dict[str, Any], calibrated: dict[str, Any]) -
     """
 
     def split(one: dict[str, Any]) -> tuple[dict[str, Any], int]:
-        own = dict(one["filter"]) if isinstance(one.get("filter"), dict) else {}
-        searches = own.pop("max_searches", None)
-        if own.get("zoom_diameter") is None:  # as recipes of earlier versions leave it out
-            own.pop("zoom_diameter", None)
-        return {**one, "filter": own or one.get("filter")}, _read_searches(searches)
+        own = one.get("filter")
+        own = {"zoom_diameter": None, **own} if isinstance(own, dict) else {}  # as earlier recipes
+        searches = own.pop("max_searches", MAX_SEARCHES)
+        return {**one, "filter": own}, searches if isinstance(searches, int) else MAX_SEARCHES
 
-    new, old = split(settings), split(calibrated)
-    return new[0] == old[0] and new[1] <= old[1]
-
-
-def _read_searches(value: Any) -> int:
-    return value if isinstance(value, int) else MAX_SEARCHES
+    (new, asked), (old, known) = split(settings), split(calibrated)
+    return new == old and asked <= known

@@ -25,6 +25,7 @@ from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
 from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.traces import map_traces
 from posefilter.protocols import HasObjectness
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -33,7 +34,7 @@ MARGIN = 1.0  # [nat] of the log-odds by which another answer must be better: th
 # often been right, and without a margin a tie would be decided by noise
 _WORTH = 0.1  # mean probability of a network's surest cells, below which there is no more to find
 _CELLS = 6  # of the network, that a small object covers
-_LEAST_DEPTH = 0.01  # share of the pixels whose depth is known
+LEAST_DEPTH = 0.01  # share of the pixels whose depth is known
 
 
 class Searcher(Protocol):
@@ -74,9 +75,7 @@ def read_objectness(encoding: Any) -> Tensor | None:
     """Return the objectness of each cell, (B, 1, h, w); None where an encoding has none."""
     try:
         return encoding.objectness if isinstance(encoding, HasObjectness) else None
-    except (
-        UserError
-    ):  # of a method without a proposal network: before Python 3.12 `isinstance` asks
+    except UserError:  # before Python 3.12 `isinstance` asks, and there is no proposal network
         return None
 
 
@@ -154,7 +153,7 @@ def _search(
     whole = first.encoding if known else method.encode(image)
     parts = _list_parts(method, image, blank(image, hidden))
     for part in islice(parts, method.filter.max_searches - 1):
-        if float((part.depth > 0).float().mean()) < _LEAST_DEPTH:
+        if float((part.depth > 0).float().mean()) < LEAST_DEPTH:
             continue
         encoding = whole if part is image else method.encode(part)
         if float(measure_worth(encoding)) < _WORTH:
@@ -182,21 +181,9 @@ def _list_parts(method: Searcher, image: Batch, rest: Batch) -> Iterator[Batch]:
 def _put(trace: Trace, row: int, found: Trace) -> Trace:
     """Return a trace with the row of one image replaced by another trace's only one."""
 
-    def put(old: Any, new: Any) -> Any:
-        if isinstance(old, Tensor):
-            if old.dim() == 0:  # of no image
-                return old
-            out = old.clone()
-            out[row] = new[0]
-            return out
-        if isinstance(old, tuple):
-            pairs = [put(*pair) for pair in zip(old, new, strict=True)]
-            return type(old)(*pairs) if hasattr(old, "_fields") else tuple(pairs)
-        return old
+    def put(old: Tensor, new: Tensor) -> Tensor:
+        out = old.clone()
+        out[row] = new[0]
+        return out
 
-    return trace._replace(
-        particles=put(trace.particles, found.particles),
-        outputs=put(trace.outputs, found.outputs),
-        belief=put(trace.belief, found.belief),
-        log_evidence=put(trace.log_evidence, found.log_evidence),
-    )
+    return map_traces(put, trace, found)

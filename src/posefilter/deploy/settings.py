@@ -4,6 +4,7 @@ from typing import Any
 
 import torch
 
+from posefilter.confidence.second_look import LEAST_DEPTH
 from posefilter.errors import UserError
 from posefilter.filters import estimate, initialize, propagate, refine, resample, reweight
 from posefilter.filters.agreement import Agreement
@@ -13,7 +14,7 @@ from posefilter.filters.texture import TextureRotations, list_rotations, read_pr
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace
 from posefilter.models.pose_pf import PosePF
-from posefilter.models.zoom import AGREED, HEAVIEST, LEAST_DEPTH, LEAST_ZOOM, MOST_ZOOM, STEPS
+from posefilter.models.zoom import AGREED, HEAVIEST, LEAST_ZOOM, MOST_ZOOM, STEPS
 from posefilter.nets.likelihood import PoseLikelihood
 from posefilter.types import ObjectModel
 

@@ -7,7 +7,6 @@ whole image, and once more about its answer where that is small. A window is an 
 camera: its poses are those of the whole image.
 """
 
-from collections.abc import Callable
 from copy import copy
 from itertools import islice
 from typing import Any, NamedTuple
@@ -17,9 +16,10 @@ import torch
 import torch.nn.functional as F
 from torch import Generator, Tensor
 
-from posefilter.confidence.second_look import measure_worth, read_objectness
+from posefilter.confidence.second_look import LEAST_DEPTH, measure_worth, read_objectness
 from posefilter.data.resize import resize_depth
 from posefilter.filters.loop import ParticleFilter
+from posefilter.filters.traces import map_traces
 from posefilter.geometry.camera import project, resize_intrinsics
 from posefilter.geometry.pose import origin_of
 from posefilter.nets.pose_votes import measure_cells
@@ -29,7 +29,6 @@ from posefilter.types import Batch, ObjectModel, Particles, Trace
 LEAST_ZOOM, MOST_ZOOM = 1.2, 4.0  # less gains nothing, more is blurred
 PART_ZOOM = 2.0  # of the parts in which a doubtful object is looked for
 STEPS = 3  # of the filter, after which particles that agree are near the object
-LEAST_DEPTH = 0.01  # share of a window's pixels whose depth is known
 HEAVIEST = 200  # particles that a place may be about
 AGREED = 0.7  # weight of the particles within half a diameter of one of them
 
@@ -231,7 +230,7 @@ def select(batch: Batch, rows: Tensor) -> Batch:
 
 def take(trace: Trace, rows: Tensor) -> Trace:
     """Return the trace of some images; rows (B,) bool."""
-    return _each(lambda x: x[rows], trace)
+    return map_traces(lambda x: x[rows], trace)
 
 
 def merge(first: Trace | None, second: Trace, is_second: Tensor) -> Trace:
@@ -245,21 +244,4 @@ def merge(first: Trace | None, second: Trace, is_second: Tensor) -> Trace:
     if first is None:
         return second
     order = torch.cat([(~is_second).nonzero()[:, 0], is_second.nonzero()[:, 0]]).argsort()
-    return _each(lambda a, b: torch.cat([a, b])[order], first, second)
-
-
-def _each(change: Callable[..., Tensor], *traces: Trace) -> Trace:
-    """Return a trace whose tensors are made of those of others; what belongs to no image stays."""
-
-    def make(*parts: Any) -> Any:
-        one = parts[0]
-        if isinstance(one, Tensor):
-            return one if one.dim() == 0 else change(*parts)
-        if isinstance(one, tuple):
-            made = [make(*same) for same in zip(*parts, strict=True)]
-            return type(one)(*made) if hasattr(one, "_fields") else tuple(made)
-        return one
-
-    bare = [trace._replace(encoding=None) for trace in traces]
-    out: Trace = make(*bare)
-    return out
+    return map_traces(lambda a, b: torch.cat([a, b])[order], first, second)
