@@ -5,7 +5,8 @@
 The share is that of the run. A line between weights before and after a training on keeps some of
 what either can do (WiSE-FT, Wortsman et al. 2022). What the file does not have, the surface term of
 files from before it, counts as the term that has not learned anything: its last layer is zero.
-OUT.ckpt is a checkpoint as the run's, for export.py.
+OUT.ckpt is a checkpoint for export.py, as the run's; with `--keep` its recipe and its object are
+those of the file. It has no calibration: other weights need another.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import posefilter
 from posefilter.cli.checkpoints import read_checkpoint
 from posefilter.cli.files import save_whole
 from posefilter.errors import UserError
+from posefilter.weights import find_weights
 
 _ZERO_AT_FIRST = "likelihood.surface.leave."
 
@@ -65,6 +67,9 @@ def main() -> int:
     parser.add_argument("after", type=Path, help="a checkpoint of the run that began with it")
     parser.add_argument("out", type=Path)
     parser.add_argument("--share", type=float, default=0.5, help="of the run")
+    parser.add_argument(
+        "--keep", action="store_true", help="the recipe and the object of the file, not of the run"
+    )
     options = parser.parse_args()
     if not 0 <= options.share <= 1:
         parser.error("--share is in [0, 1]")
@@ -72,6 +77,9 @@ def main() -> int:
         method = posefilter.load(options.before, device="cpu").methods[0]
         checkpoint = read_checkpoint(options.after)
         state = average(method.state_dict(), checkpoint["state_dict"], options.share)
+        if options.keep:
+            checkpoint = read_checkpoint(find_weights(options.before))
+            checkpoint.pop("calibration", None)
         save_whole({**checkpoint, "state_dict": state}, options.out)
     except (UserError, ValueError) as error:
         print(f"average_weights: {error}", file=sys.stderr)

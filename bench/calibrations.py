@@ -26,7 +26,7 @@ FIRST_SEED = 301  # trainings and tests have seeds below
 
 def render_commands(root: Path, each: int) -> list[list[str]]:
     """Return what to run to render the scenes, one command an object."""
-    sets = photographs.render_commands(root, each, "data", FIRST_SEED, "other")
+    sets = photographs.render_commands(root, each, "data", FIRST_SEED, "different")
     return [[*words, "progress=false"] for words in sets]
 
 

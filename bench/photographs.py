@@ -26,6 +26,7 @@ from photograph_runs import (
     CRACKER,
     DIM,
     FAR,
+    FIFTH,
     FOURTH,
     SPLIT,
     TARGETS,
@@ -73,9 +74,11 @@ def render_commands(
 
 
 def list_sets(root: Path) -> list[list[list[str]]]:
-    """Return the commands of each set but the first: that of the tests, and two to learn from."""
+    """Return the commands of each set but the first: that of the tests, and three to learn from."""
     third = render_commands(root, 400, THIRD, 101)
-    return [render_commands(root), third, render_commands(root, 400, FOURTH, 201, "other")]
+    fourth = render_commands(root, 400, FOURTH, 201, "different")
+    fifth = render_commands(root, 400, FIFTH, 501, "different")
+    return [render_commands(root), third, fourth, fifth]
 
 
 def train_command(run: Run, root: Path, more: Sequence[str] = ()) -> list[str]:

@@ -94,6 +94,8 @@ RANGES: dict[str, Range] = {
     "probability": SHARE,
     "augment.steps.strength": Range(0, 10),
     "zoom": Range(0, 1e6, above=True, many=True),
+    "object_size": Range(0, 10, above=True, many=True),  # [widths of the image]
+    "object_size_probability": SHARE,
     "augment.steps.size": Range(
         0, MOST_SIDE, above=True, many=True
     ),  # pixels of a crop, or a share

@@ -7,6 +7,10 @@ from types import ModuleType
 import pytest
 import torch
 
+from posefilter.cli.checkpoints import read_checkpoint
+from posefilter.models.quantization import unpack
+from posefilter.weights import find_weights
+
 
 @pytest.fixture
 def bench(load_script: Callable[[str], ModuleType]) -> ModuleType:
@@ -45,3 +49,23 @@ def test_a_file_that_is_no_checkpoint_is_one_line(
     (line,) = capfd.readouterr().err.splitlines()
     assert "run.ckpt: not readable as a checkpoint" in line
     assert not (tmp_path / "out.ckpt").exists()
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_recipe_and_object_are_the_runs_or_the_files(
+    bench: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: bool
+) -> None:
+    file = read_checkpoint(find_weights("003_cracker_box"))
+    state = {name: value + 1 for name, value in unpack(file["state_dict"]).items()}
+    run = {**file, "state_dict": state, "object_model": {**file["object_model"], "radius": 2.0}}
+    torch.save(run, tmp_path / "run.ckpt")
+    typed = ["003_cracker_box", str(tmp_path / "run.ckpt"), str(tmp_path / "out.ckpt")]
+    monkeypatch.setattr("sys.argv", ["average_weights", *typed, *["--keep"] * keep])
+    assert bench.main() == 0
+    out = read_checkpoint(tmp_path / "out.ckpt")
+    source = file if keep else run
+    assert out["object_model"]["radius"] == source["object_model"]["radius"]
+    assert ("calibration" in out) is not keep
+    for name, value in out["state_dict"].items():
+        if value.is_floating_point():
+            torch.testing.assert_close(value, state[name] - 0.5)

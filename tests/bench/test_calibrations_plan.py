@@ -5,6 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+from posefilter.cli.arguments import check_choices
+from posefilter.cli.command import compose_job
+from posefilter.paths import find_conf
+
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))  # scripts import their neighbors
 Load = Callable[[str], ModuleType]
 
@@ -17,12 +21,28 @@ def test_seeds_are_its_own_and_all_else_is_as_for_the_last_training(load_script:
     own = load_script("bench/calibrations.py").render_commands(Path("r"), 90)
     sets = load_script("bench/photographs.py").list_sets(Path("r"))
     seeds = [seeds_of(each) for each in (own, *sets)]
-    assert [len(each) for each in seeds] == [len(own)] * 4 == [14] * 4
-    assert len(set.union(*seeds)) == 4 * 14
+    assert [len(each) for each in seeds] == [len(own)] * 5 == [14] * 5
+    assert len(set.union(*seeds)) == 5 * 14
     for one in own:
         (same,) = (other for other in sets[-1] if one[2] in other)
         differ = {*one} - {*same}
         assert {word.split("=")[0] for word in differ} == {"seed", "progress", "frames", "out"}
+
+
+def test_what_is_typed_is_as_commands_take_it_now(load_script: Load) -> None:
+    calibrations = load_script("bench/calibrations.py")
+    photographs = load_script("bench/photographs.py")
+    root, conf = Path("r"), find_conf()
+    sets = [calibrations.render_commands(root, 90), *photographs.list_sets(root)]
+    trainings = [photographs.train_command(run, root) for run in photographs.plan()]
+    for words in [*(words for each in sets for words in each), *trainings]:
+        check_choices(words[1:], conf, words[0].removesuffix(".py"))
+    for each in sets:
+        texture = compose_job("generate", conf, each[0][1:], root).cfg.lookalike_texture
+        assert texture in ("different", "same")
+    for words in trainings[-1:]:
+        augment = compose_job("train", conf, words[1:], root).cfg.data.augment
+        assert augment.steps[1].object_size_probability == 0.4
 
 
 def test_each_file_is_calibrated_in_place_after_the_scenes_are_rendered(

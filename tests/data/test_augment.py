@@ -67,6 +67,7 @@ def apply(step: Augment, seed: int, x: Sample | None = None) -> Sample:
         PasteOccluder(1.0),
         RandomErasing(),
         RollAndZoom(zoom=(0.7, 2.2), pivot="object"),
+        RollAndZoom(pivot="object", object_size=(0.3, 0.5), object_size_probability=1.0),
         Compose([RollAndZoom(), RandomCrop((32, 48))]),
     ],
 )
@@ -101,6 +102,26 @@ def test_a_zoom_about_the_object_leaves_its_middle_where_it_is() -> None:
     assert shift("object") < 0.5 < 1.0 < shift("center")
     with pytest.raises(UserError, match="pivot=corner"):
         RollAndZoom(pivot="corner")
+
+
+def test_an_object_is_magnified_to_the_size_that_is_asked_for() -> None:
+    step = RollAndZoom(
+        0.0, 0.0, (0.7, 2.6), pivot="object", object_size=(0.3, 0.4), object_size_probability=1.0
+    )
+    x = sample()
+    small = apply(RollAndZoom(0.0, 0.0, (0.4, 0.4)), 0)
+    for start in (x, small, dataclasses.replace(x, visibility=float("nan"))):
+        sizes = [
+            np.sqrt(apply(step, seed, start).mask.sum()) / start.mask.shape[1] for seed in range(20)
+        ]
+        assert 0.29 < min(sizes) < max(sizes) < 0.41
+    # what is hidden counts: half of the object is as large as an object of half the area
+    half = [apply(step, 0, dataclasses.replace(x, visibility=share)) for share in (1.0, 0.5)]
+    assert half[1].mask.sum() == pytest.approx(half[0].mask.sum() / 2, rel=0.05)
+    empty = dataclasses.replace(x, mask=np.zeros_like(x.mask))
+    assert apply(step, 0, empty).rgb.shape == x.rgb.shape
+    with pytest.raises(UserError, match="object_size"):
+        RollAndZoom(object_size=(0.4, 0.3))
 
 
 def test_a_window_shifts_the_principal_point() -> None:

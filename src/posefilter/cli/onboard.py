@@ -140,7 +140,7 @@ class Onboarding:
             "filter.zoom_diameter=0.4",
             "filter.max_searches=4",
             "data=scenes",
-            "data/augment=camera",
+            "data/augment=camera_magnified",  # as the magnified windows are
             *(f"{key}='{value}'" for key, value in quoted.items()),
             f"data.generate.frames={self.frames}",
             f"data.generate.workers={self.cfg.workers}",

@@ -17,6 +17,8 @@ from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 
 Draw = Callable[[Generator], Sample]
+_LEAST_VISIBLE = 0.05  # below, a few pixels tell little of an object's size
+_MOST_ZOOM = 5.0  # beyond, a render is blur
 Augment = Callable[[Sample, Draw, Generator], Sample]
 
 
@@ -43,6 +45,10 @@ class RollAndZoom:
     `center` (the principal point) or `object` (the middle of its mask, so that it may
     be magnified and stay in the frame). A draw that would push most of the object out of the frame
     is given up.
+
+    object_size: with the probability `object_size_probability` the factor is chosen by the object's
+    size in the image instead, so that this is in the range: the square root of the area that it
+    would have unoccluded, in image widths. So a filter is trained that searches magnified windows.
     """
 
     roll: float = 0.15
@@ -50,10 +56,17 @@ class RollAndZoom:
     zoom: tuple[float, float] = (0.75, 1.3)
     keep: float = 0.7
     pivot: str = "center"
+    object_size: tuple[float, float] = (0.16, 0.32)
+    object_size_probability: float = 0.0
 
     def __post_init__(self) -> None:
         if self.pivot not in ("center", "object"):
             raise UserError(f"data.augment: pivot={self.pivot}: choose center or object")
+        if not 0 < self.object_size[0] <= self.object_size[1]:
+            raise UserError(
+                f"data.augment: object_size={list(self.object_size)}: expected two sizes above 0, "
+                "the smaller first"
+            )
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample as the turned and zoomed camera sees it."""
@@ -63,6 +76,9 @@ class RollAndZoom:
             else rng.normal() * self.roll
         )
         zoom = float(np.exp(rng.uniform(*np.log(self.zoom))))
+        # without this choice nothing is drawn for it: other trainings stay as they were
+        if self.object_size_probability and rng.random() < self.object_size_probability:
+            zoom = self._choose_by_size(sample, rng) or zoom
         c, s = np.cos(angle), np.sin(angle)
         K = sample.intrinsics.astype(np.float64)
         K_new = np.diag([zoom, zoom, 1.0]) @ K
@@ -87,6 +103,16 @@ class RollAndZoom:
             intrinsics=K_new.astype(np.float32),
             camera_from_object=pose.astype(np.float32),
         )
+
+    def _choose_by_size(self, sample: Sample, rng: Generator) -> float | None:
+        """Return the factor that gives the object a size in the range; None where none is seen."""
+        area = int(sample.mask.sum())
+        if not area:
+            return None
+        visible = sample.visibility if np.isfinite(sample.visibility) else 1.0
+        size = np.sqrt(area / max(visible, _LEAST_VISIBLE)) / sample.mask.shape[1]
+        wanted = np.exp(rng.uniform(*np.log(self.object_size)))
+        return float(np.clip(wanted / size, self.zoom[0], _MOST_ZOOM))
 
 
 @dataclasses.dataclass(frozen=True)
