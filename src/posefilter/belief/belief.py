@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,6 +35,7 @@ from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
 
 _MOST_SYMMETRIES = 1000
+_ROUNDING = 1e-9  # of weights' sum, which float64 keeps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,11 +65,14 @@ class Belief:
     symmetries: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
 
     def __post_init__(self) -> None:
-        """Check shapes.
+        """Bring arrays to float64 and weights to a sum of 1, and check all.
 
         Raises:
-            UserError: The arrays do not fit each other, or hold no poses and weights.
+            UserError: The arrays do not fit each other, or hold no poses and weights; or the center
+                or a size is none.
         """
+        for name in ("samples", "weights", "center", "symmetries"):
+            object.__setattr__(self, name, _as_numbers(name, getattr(self, name)))
         count = len(self.weights)
         if self.samples.shape != (count, 4, 4) or self.weights.shape != (count,) or not count:
             raise UserError(
@@ -77,6 +82,8 @@ class Belief:
         total = float(self.weights.sum())
         if not (np.isfinite(total) and abs(total - 1) < 1e-3 and (self.weights >= 0).all()):
             raise UserError(f"belief: the weights should be positive and sum to 1, not {total:.6g}")
+        if abs(total - 1) > _ROUNDING:  # as of single precision
+            object.__setattr__(self, "weights", self.weights / total)
         if not np.isfinite(self.samples).all() or not is_rigid(torch.from_numpy(self.samples)):
             raise UserError("belief: the samples should be rigid transforms")
         group = self.symmetries
@@ -86,6 +93,13 @@ class Belief:
             )
         if not np.isfinite(group).all() or not is_rigid(torch.from_numpy(group)):
             raise UserError("belief: the symmetries should be rigid transforms")
+        if self.center.shape != (3,) or not np.isfinite(self.center).all():
+            raise UserError(f"belief: the center should be three numbers, not {self.center}")
+        for name in ("radius", "diameter"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise UserError(
+                    f"belief: the {name} should be above 0, and is {getattr(self, name)}"
+                )
 
     def __repr__(self) -> str:
         about = f"{len(self.weights)} particles {self.uncertainty().describe()}"
@@ -318,6 +332,14 @@ class Belief:
 
     def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
         return self._space.mean(samples, weights)
+
+
+def _as_numbers(name: str, value: Any) -> np.ndarray:
+    """Return what a belief holds under a name as float64."""
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"belief: {name} should be numbers in an array ({error})") from error
 
 
 def _as_poses(poses: np.ndarray) -> np.ndarray:
