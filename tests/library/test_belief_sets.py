@@ -11,6 +11,7 @@ import torch
 from posefilter import Belief, UserError
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import exp_so3
+from posefilter.meshes.symmetries import symmetry_group
 
 CENTER = np.array([0.02, -0.01, 0.1])
 RADIUS, DIAMETER = 0.15, 0.28
@@ -214,3 +215,40 @@ def test_what_is_no_level_and_no_camera_is_refused() -> None:
         belief.marginal("x").quantile([0.1, 0.5])  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"intrinsics: have shape \(4, 4\); expected \(3, 3\)"):
         belief.project(np.eye(4))
+
+
+def any_turn(steps: int = 36) -> np.ndarray:
+    """Return a continuous symmetry about the object's z, cut into turns as meshes have it."""
+    return symmetry_group(continuous=[(np.array([0.0, 0, 1]), CENTER)], steps=steps)
+
+
+def test_modes_that_a_symmetry_makes_of_one_another_are_one_place_with_one_share() -> None:
+    tight = draw(90, 7, SCALE / 3)
+    far = tight[:10].copy()
+    far[:, 0, 3] += 0.2
+    turned = tight[:30] @ half_turn()[1]
+    both = belief_of(np.concatenate([tight, turned, far]), symmetries=half_turn())
+    assert [mode.equivalent for mode in both.modes] == [None, 0, None]
+    assert both.modes[0].mass == pytest.approx(90 / 130)
+    sure = both.uncertainty()
+    assert sure.mass == pytest.approx(120 / 130)
+    assert sure.describe().endswith("a pose that has 92 % of the belief")
+    # the particles of the equivalent mode count, too
+    wide = draw(60, 8) @ half_turn()[1]
+    mixed = belief_of(np.concatenate([tight, wide]), symmetries=half_turn())
+    alone = belief_of(tight, symmetries=half_turn()).uncertainty()
+    assert mixed.uncertainty().translation > 1.5 * alone.translation
+    # without the symmetry they are other poses
+    assert belief_of(both.samples).uncertainty().mass == pytest.approx(90 / 130)
+
+
+def test_a_turn_about_a_continuous_symmetry_is_no_uncertainty() -> None:
+    """36 turns of 10 degrees leave gaps of 5 degrees on either side."""
+    angles = np.random.default_rng(13).uniform(0, 2 * np.pi, 300)
+    turns = torch.from_numpy(np.outer(angles, [0.0, 0, 1]))
+    twists = torch.cat([torch.zeros(300, 3).double(), turns], dim=1)
+    samples = move_about(middle().expand(300, 4, 4), twists, torch.from_numpy(CENTER)).numpy()
+    sure = belief_of(samples, symmetries=any_turn()).uncertainty()
+    assert math.degrees(sure.rotation) < 0.61
+    assert sure.translation == pytest.approx(0, abs=1e-9)
+    assert sure.mass > 0.95

@@ -33,6 +33,7 @@ from posefilter.geometry.pose_density import (
 )
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify
 
 _MOST_SYMMETRIES = 1000
 _ROUNDING = 1e-9  # of weights' sum, which float64 keeps
@@ -242,17 +243,21 @@ class Belief:
         return Marginal(axis, column.numpy(), self.weights)
 
     def uncertainty(self, level: float = 0.95) -> Uncertainty:
-        """Return how far the heaviest mode's particles are from their mean, equivalent poses taken
-        for one; `describe()` of it says so in words.
+        """Return how far particles are from the mean of the heaviest mode, those of its own and of
+        equivalent modes; `describe()` of it says so in words.
+
+        Equivalent poses are one: of each particle the nearest to that mean counts, and a continuous
+        symmetry has no gaps between its turns.
 
         Raises:
             UserError: The level is not in [0, 1].
         """
         samples, weights = self._tensors
-        own, center = self._found.member == 0, torch.from_numpy(self.center)
+        heaviest, center = self._found.member == 0, torch.from_numpy(self.center)
+        pose = self._mean(samples[heaviest], weights[heaviest] / weights[heaviest].sum())
+        own = torch.isin(self._found.member, torch.tensor(self._list_alike()))
         poses, share = samples[own], weights[own] / weights[own].sum()
-        pose, mass = self._mean(poses, share), float(weights[own].sum())
-        group = torch.from_numpy(self.symmetries)
+        mass, group = float(weights[own].sum()), densify(torch.from_numpy(self.symmetries))
         return measure_uncertainty(poses, share, pose, mass, center, group, level)
 
     def project(
@@ -324,6 +329,14 @@ class Belief:
     def _is_equivalent(self, found: Modes, heavier: int, pose: Tensor) -> bool:
         copies = found.states[heavier] @ torch.from_numpy(self.symmetries)
         return bool(self._space.distance(copies, pose).min() < APART * self.diameter)
+
+    def _list_alike(self) -> list[int]:
+        """Return the numbers of the heaviest mode and of those that symmetries make of it."""
+        alike = [0]
+        for number, mode in enumerate(self.modes):
+            if mode.equivalent in alike:
+                alike.append(number)
+        return alike
 
     @property
     def _space(self) -> PoseSpace:

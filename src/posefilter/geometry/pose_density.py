@@ -30,6 +30,7 @@ from posefilter.geometry.pose_kernels import (
     whiten_kernels,
 )
 from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
+from posefilter.geometry.symmetries import gather_copies
 
 BACKGROUND = 0.01  # of the mass
 _SHARES = (0.1, 0.3, 1.0)  # of the poses that are neighbors
@@ -90,7 +91,7 @@ def fit_density(
     group = group.to(poses)
     chosen, log_weights = _thin(log_weights, max_kernels)
     poses = poses[chosen]
-    canonical = _gather_copies(poses, log_weights, center, radius, group)
+    canonical = gather_copies(poses, poses[log_weights.argmax()], center, radius, group)
     parts = split_poses(canonical, center)
     mean = (log_weights.exp()[:, None] * parts.center).sum(0)
     fixed = (group, center, mean, diameter)
@@ -217,19 +218,3 @@ def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)
-
-
-def _gather_copies(
-    poses: Tensor, log_weights: Tensor, center: Tensor, radius: float, group: Tensor
-) -> Tensor:
-    """Return of each pose the copy that lies nearest to the heaviest pose.  (N, 4, 4) -> same."""
-    if len(group) == 1:
-        return poses
-    copies = poses[:, None] @ group
-    twist = pair_twists(
-        split_poses(poses[log_weights.argmax()][None], center),
-        split_poses(copies.flatten(0, 1), center),
-    )[0]
-    unit = twist.new_tensor([1.0] * 3 + [radius] * 3)
-    nearest = (twist * unit).square().sum(-1).view(len(poses), -1).argmin(1)
-    return copies[torch.arange(len(poses), device=poses.device), nearest]
