@@ -155,7 +155,10 @@ class Result:
 
     @property
     def covariance(self) -> np.ndarray:
-        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`."""
+        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`.
+
+        That of the estimate's own error is `belief.covariance_about(pose)`.
+        """
         return self.belief.covariance
 
     @property

@@ -252,3 +252,44 @@ def test_a_turn_about_a_continuous_symmetry_is_no_uncertainty() -> None:
     assert math.degrees(sure.rotation) < 0.61
     assert sure.translation == pytest.approx(0, abs=1e-9)
     assert sure.mass > 0.95
+
+
+def test_the_covariance_about_a_pose_holds_its_offset_and_forgets_the_symmetry() -> None:
+    samples = draw(3000, 14)
+    offset = np.array([0.003, -0.001, 0.002, 0.0, 0.0, 0.0])
+    pose = middle().clone()
+    pose[:3, 3] -= torch.from_numpy(offset[:3])
+    flipped = np.random.default_rng(15).random(3000) < 0.5
+    mixed = samples.copy()
+    mixed[flipped] = mixed[flipped] @ half_turn()[1]
+    expected = np.diag(SCALE**2) + np.outer(offset, offset)
+    unit = np.outer(SCALE, SCALE)
+    for belief in (belief_of(samples), belief_of(mixed, symmetries=half_turn())):
+        found = belief.covariance_about(pose.numpy())
+        assert np.abs((found - expected) / unit).max() < 0.12
+        assert np.array_equal(found, belief.covariance_about(pose.numpy()[:3]))
+    about_mean = belief_of(samples).covariance_about(belief_of(samples).mean)
+    assert np.allclose(about_mean, belief_of(samples).covariance, atol=1e-15)
+    assert belief_of(mixed, symmetries=half_turn()).covariance[5, 5] > 1
+    with pytest.raises(UserError, match="poses: should be rigid"):
+        belief_of(samples).covariance_about(2 * np.eye(4))
+    with pytest.raises(UserError, match=r"pose: has shape \(2, 4, 4\)"):
+        belief_of(samples).covariance_about(samples[:2])
+
+
+def test_a_canonical_belief_is_the_same_belief_in_one_place() -> None:
+    samples = draw(200, 16)
+    turned = samples.copy()
+    turned[:90] = turned[:90] @ half_turn()[1]
+    belief = belief_of(turned, np.random.default_rng(17).random(200), symmetries=half_turn())
+    one = belief.canonicalize(middle().numpy())
+    assert np.allclose(one.samples, samples)
+    assert np.array_equal(one.weights, belief.weights)
+    assert np.allclose(one.log_density(draw(20, 18)), belief.log_density(draw(20, 18)), atol=1e-6)
+    assert one.marginal("rz").std == pytest.approx(SCALE[5], rel=0.2)
+    assert belief.marginal("rz").std > 1
+    plain = belief_of(turned)
+    assert np.array_equal(plain.canonicalize(middle().numpy()).samples, turned)
+    ring = belief_of(samples @ any_turn()[7], symmetries=any_turn())
+    about = ring.canonicalize(middle().numpy()).marginal("rz")
+    assert np.abs(about.values - about.mean).max() < math.radians(0.7)

@@ -1,6 +1,6 @@
 """A belief over one object's pose in one image: weighted poses, and what they amount to."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from posefilter.geometry.pose_density import (
 )
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.geometry.symmetries import densify
+from posefilter.geometry.symmetries import densify, gather_copies
 
 _MOST_SYMMETRIES = 1000
 _ROUNDING = 1e-9  # of weights' sum, which float64 keeps
@@ -120,11 +120,51 @@ class Belief:
 
         Rows and columns are [x, y, z, rx, ry, rz]: the translation of the object's center in the
         camera's axes [m], then the rotation vector about that center in the object's own axes
-        [rad].  Square roots of the diagonal are standard deviations.
+        [rad].  Square roots of the diagonal are standard deviations.  An estimate is not the mean:
+        for its error see `covariance_about`.
         """
         samples, weights = self._tensors
         mean = torch.from_numpy(self.mean)
         return covariance_about(mean, samples, weights, torch.from_numpy(self.center)).numpy()
+
+    def covariance_about(self, pose: np.ndarray) -> np.ndarray:
+        """Return the covariance (6, 6) of a pose's error, if the belief is right: the second moment
+        of the twists from this pose to the particles.
+
+        Unlike `covariance` it holds how far the pose is from the mean, and of each particle it
+        takes the equivalent pose that is nearest.  Order, axes and units are those of `covariance`.
+
+        Args:
+            pose: (4, 4) camera_from_object [m], such as `Result.pose`; or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        near = self.canonicalize(pose)
+        about, center = torch.from_numpy(_as_poses(pose)), torch.from_numpy(self.center)
+        return covariance_about(about, *near._tensors, center).numpy()
+
+    def canonicalize(self, pose: np.ndarray) -> "Belief":
+        """Return the same belief by other samples: of each particle the equivalent pose that is
+        nearest to a pose, a turn counting as the shift at the radius.
+
+        Of a symmetric object, particles at equivalent poses are then together, so that mean,
+        covariance and marginals say what they say of other objects.  A continuous symmetry has no
+        gaps between its turns.
+
+        Args:
+            pose: (4, 4) camera_from_object [m], or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        about = torch.from_numpy(_as_poses(pose))
+        if about.shape != (4, 4):
+            raise UserError(f"pose: has shape {tuple(about.shape)}; expected (4, 4)")
+        group = densify(torch.from_numpy(self.symmetries))
+        samples, center = self._tensors[0], torch.from_numpy(self.center)
+        near = gather_copies(samples, about, center, self.radius, group)
+        return replace(self, samples=near.numpy())
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
