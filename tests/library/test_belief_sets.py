@@ -293,3 +293,86 @@ def test_a_canonical_belief_is_the_same_belief_in_one_place() -> None:
     ring = belief_of(samples @ any_turn()[7], symmetries=any_turn())
     about = ring.canonicalize(middle().numpy()).marginal("rz")
     assert np.abs(about.values - about.mean).max() < math.radians(0.7)
+
+
+def test_a_belief_of_another_frame_is_the_same_belief_there() -> None:
+    belief = belief_of(draw(300, 19), symmetries=half_turn())
+    turn = exp_so3(torch.tensor([0.9, 0.2, -1.4]).double())
+    frame = make_pose(turn, torch.tensor([1.0, -2.0, 0.5]).double()).numpy()
+    there = belief.transform(frame[:3])
+    assert np.allclose(there.mean, frame @ belief.mean)
+    both = np.eye(6)
+    both[:3, :3] = frame[:3, :3]
+    assert np.allclose(there.covariance, both @ belief.covariance @ both.T, atol=1e-15)
+    asked = draw(20, 20)
+    assert np.allclose(there.log_density(frame @ asked), belief.log_density(asked), atol=1e-6)
+    assert there.differential_entropy == pytest.approx(belief.differential_entropy, abs=1e-6)
+    assert np.allclose(there.transform(np.linalg.inv(frame)).samples, belief.samples)
+    assert (there.object, len(there.symmetries)) == ("thing", 2)
+    with pytest.raises(UserError, match="rigid"):
+        belief.transform(np.diag([2.0, 2, 2, 1]))
+
+
+def test_draws_are_of_the_density_and_apart_where_samples_are_copies() -> None:
+    """Few samples, each many times, as resampling leaves them."""
+    few = draw(150, 21)
+    copies = np.random.default_rng(22).integers(0, 150, 400)
+    belief = belief_of(few[copies])
+    drawn = belief.draw(3000)
+    assert len(np.unique(drawn[:, 0, 3])) == 3000
+    assert np.array_equal(drawn, belief.draw(3000))
+    assert not np.allclose(drawn, belief.draw(3000, seed=1))
+    wider = belief_of(drawn).covariance.diagonal() / belief.covariance.diagonal()
+    assert (wider > 0.95).all()
+    assert (wider < 2.2).all()
+    assert np.allclose(belief_of(drawn).mean, belief.mean, atol=0.01)
+    # under another density p, draws of q tell its integral: the mean of p / q is 1
+    other = belief_of(draw(400, 27, 0.6 * SCALE))
+    ratio = np.exp(other.log_density(drawn) - belief.log_density(drawn))
+    assert ratio.mean() == pytest.approx(1, abs=5 * ratio.std() / np.sqrt(3000) + 0.02)
+    far = draw(100, 28)
+    far[:, 2, 3] += 0.5
+    heavy = belief_of(np.concatenate([few[:100], far]), np.repeat([0.75, 0.25], 100))
+    assert (heavy.draw(400)[:, 2, 3] < 1.2).sum() == pytest.approx(300, abs=1)
+    for wrong in (0, -1, 2.5, True):
+        with pytest.raises(UserError, match="whole number, 1 or more"):
+            belief.draw(wrong)  # type: ignore[arg-type]
+
+
+def test_two_views_are_fused_by_bayes_rule() -> None:
+    """One knows x, the other y; of Gaussians the product is known."""
+    first, second = SCALE.copy(), SCALE.copy()
+    first[1], second[0] = 0.02, 0.02
+    shift = np.array([0.002, 0.004, 0.004])
+    aside = draw(600, 24, second)
+    aside[:, :3, 3] += shift
+    one, two = belief_of(draw(600, 23, first)), belief_of(aside)
+    fused = one.fuse(two, count=1200)
+    a, b = 1 / first**2, 1 / second**2
+    place = (middle().numpy() @ np.append(CENTER, 1))[:3] + b[:3] / (a + b)[:3] * shift
+    std = 1 / np.sqrt(a + b)
+    for axis, at, wide in zip("xyz", place, std, strict=False):
+        found = fused.marginal(axis)
+        assert found.mean == pytest.approx(at, abs=0.4 * wide)
+        # both densities are wider than what their particles were drawn from
+        assert 0.9 * wide < found.std < 1.7 * wide
+    for number, axis in ((3, "rx"), (4, "ry"), (5, "rz")):
+        assert 0.9 * std[number] < fused.marginal(axis).std < 1.7 * std[number]
+    assert fused.differential_entropy < min(one.differential_entropy, two.differential_entropy) - 1
+    assert len(fused.weights) == 2400
+    again = two.fuse(one, count=1200)
+    assert np.allclose(again.mean, fused.mean, atol=0.01)
+
+
+def test_views_that_contradict_each_other_are_both_kept_and_symmetries_are_known() -> None:
+    tight = draw(200, 25, SCALE / 3)
+    far = np.repeat(move_far(np.eye(4))[None], 200, 0) @ tight
+    modes = belief_of(tight).fuse(belief_of(far)).modes
+    assert [mode.mass for mode in modes[:2]] == pytest.approx([0.5, 0.5], abs=0.2)
+    turned = tight @ half_turn()[1]
+    one, two = belief_of(tight, symmetries=half_turn()), belief_of(turned, symmetries=half_turn())
+    fused = one.fuse(two)
+    assert fused.differential_entropy < one.differential_entropy - 1
+    assert np.sqrt(fused.covariance.diagonal()[5]) < SCALE[5]
+    with pytest.raises(UserError, match="is another object than thing"):
+        one.fuse(dataclasses.replace(two, diameter=0.3))
