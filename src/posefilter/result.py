@@ -167,11 +167,13 @@ class Result:
         return self.belief.modes
 
     def conformal_set(self, level: float = 0.9) -> PoseSet:
-        """Return a set of poses that holds the truth with a guaranteed probability.
+        """Return a set of poses that holds the truth with a probability, whatever the belief is
+        worth.
 
         Of frames like the calibration's that show the object, at least `level` have the truth in
-        this set, whatever the belief is worth; see `posefilter.confidence.conformal`.  It is the
-        set of all poses where calibration frames are too few for the level.
+        this set: exactly so where groups are told apart by `surface`, and nearly where by the
+        probability; see `posefilter.confidence.conformal`.  It is the set of all poses where
+        calibration frames are too few for the level.
 
         Args:
             level: Least probability, in [0, 1].

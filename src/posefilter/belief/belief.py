@@ -230,8 +230,9 @@ class Belief:
 
     @cached_property
     def differential_entropy(self) -> float:
-        """The entropy of the density [nat], in the measure of `log_density`: minus the mean log
-        density of the particles, each without its own kernel.
+        """The entropy of what the particles are drawn from [nat], in the measure of `log_density`:
+        minus the mean log density of the particles, each without its own kernel.  The kernel
+        density itself is wider.
         """
         return -float(self._density.log_weights.exp() @ torch.from_numpy(self._held_out))
 
@@ -327,8 +328,8 @@ class Belief:
         then frame_from_object.
 
         Densities and turns stay what they are, since the measure does, and turns are about the
-        object's own axes; shifts are along the axes of the frame.  Camera_from_frame brings it back
-        to `project` it.
+        object's own axes; shifts are along the axes of the frame.  A set's threshold is the same
+        there, see `highest_density_region`.  Camera_from_frame brings it back to `project` it.
 
         Args:
             frame_from_camera: (4, 4) [m], or (3, 4).
