@@ -199,6 +199,8 @@ def test_a_tracks_verdict_goes_by_the_costs_and_the_tolerance_of_its_estimator()
         assert [one.verdict for one in results] == ["found", "unsure", "found", "unsure"]
         assert results[1].costs == careful
         assert [one.pose_tolerance for one in results] == [None, None, loose, strict]
+    assert results[0].decide(posefilter.Costs()) == "found"
+    assert results[0].decide(posefilter.Costs(), prior=1e-4) == "absent"
 
 
 def test_in_doubt_the_network_sees_the_whole_image() -> None:
