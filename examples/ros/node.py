@@ -55,7 +55,7 @@ def make_detection(result: Result, header: object) -> Detection3D:
     belief = result.belief
     x, y, z = result.pose[:3, 3].tolist()
     qx, qy, qz, qw = make_quaternion(result.pose)
-    covariance = to_ros_covariance(belief.covariance, belief.mean, belief.center)
+    covariance = to_ros_covariance(belief.covariance_about(result.pose), result.pose, belief.center)
     found = ObjectHypothesisWithPose()
     found.hypothesis.class_id = result.object
     found.hypothesis.score = math.nan if result.probability is None else result.probability

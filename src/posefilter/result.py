@@ -14,7 +14,7 @@ from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment, Calibration
 from posefilter.confidence.conformal import Conformal
 from posefilter.confidence.tolerance import RIGHT, PoseTolerance
-from posefilter.confidence.verdicts import Costs, Verdict, decide
+from posefilter.confidence.verdicts import Costs, Verdict, apply_prior, decide
 from posefilter.errors import UserError
 from posefilter.models.base import PoseEstimator
 from posefilter.plausibility import find_warnings
@@ -101,22 +101,26 @@ class Result:
         """
         return self.decide(self.costs, self.pose_tolerance)
 
-    def decide(self, costs: Costs, pose_tolerance: PoseTolerance | None = None) -> Verdict | None:
+    def decide(
+        self, costs: Costs, pose_tolerance: PoseTolerance | None = None, prior: float = 0.5
+    ) -> Verdict | None:
         """Return the verdict at other costs of errors; None where there is no probability.
 
         Args:
             costs: What errors cost.
             pose_tolerance: What a right pose is; None: an ADD below 0.1 diameters.
+            prior: Share of the images that show the object, in (0, 1); `presence` and `probability`
+                are of one half. See `posefilter.confidence.verdicts.apply_prior`.
 
         Raises:
-            UserError: As of `probability_within`.
+            UserError: As of `probability_within`; or the prior is not between 0 and 1.
         """
         if self.blank:
             return "unsure"
         if self.presence is None:
             return None
-        probability = self.probability_within(pose_tolerance or RIGHT)
-        verdict = decide(self.presence, probability, costs)
+        known = self.presence, self.probability_within(pose_tolerance or RIGHT)
+        verdict = decide(*(known if prior == 0.5 else apply_prior(*known, prior)), costs)
         return "unsure" if verdict == "found" and self.wrong_size else verdict
 
     def probability_within(self, pose_tolerance: PoseTolerance) -> float:
@@ -155,7 +159,10 @@ class Result:
 
     @property
     def covariance(self) -> np.ndarray:
-        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`."""
+        """The belief's covariance (6, 6) about its mean pose; see `Belief.covariance`.
+
+        That of the estimate's own error is `belief.covariance_about(pose)`.
+        """
         return self.belief.covariance
 
     @property
@@ -164,11 +171,13 @@ class Result:
         return self.belief.modes
 
     def conformal_set(self, level: float = 0.9) -> PoseSet:
-        """Return a set of poses that holds the truth with a guaranteed probability.
+        """Return a set of poses that holds the truth with a probability, whatever the belief is
+        worth.
 
         Of frames like the calibration's that show the object, at least `level` have the truth in
-        this set, whatever the belief is worth; see `posefilter.confidence.conformal`.  It is the
-        set of all poses where calibration frames are too few for the level.
+        this set: exactly so where groups are told apart by `surface`, and nearly where by the
+        probability; see `posefilter.confidence.conformal`.  It is the set of all poses where
+        calibration frames are too few for the level.
 
         Args:
             level: Least probability, in [0, 1].

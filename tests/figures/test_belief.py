@@ -254,6 +254,25 @@ def test_a_second_pose_is_reported_with_its_share() -> None:
     assert re.fullmatch(r"second pose 30 %: [\d.]+ mm and \d+° off", other)
 
 
+def test_an_equivalent_pose_is_no_second_one() -> None:
+    best = looking(0.3, 0.4)
+    center = model().center.double()
+    turn = exp_so3(torch.tensor([0.0, 0.0, math.pi]).double())
+    half = make_pose(turn, center - turn @ center)
+    noise = 0.002 * torch.randn(300, 6, generator=torch.Generator().manual_seed(3)).double()
+    poses = move_about(best.expand(300, 4, 4), noise, center)
+    poses[:120] = poses[:120] @ half
+    weights = torch.full((300,), 1 / 300).double()
+    plain = summarize_belief(poses, weights, best, model())
+    assert plain.second is not None
+    assert plain.share == pytest.approx(0.6)
+    group = torch.stack([torch.eye(4), half.float()])
+    found = summarize_belief(poses, weights, best, model()._replace(symmetries=group))
+    assert found.second is None
+    assert found.share == pytest.approx(1)
+    assert found.rotation < 0.01
+
+
 def test_a_single_pose_and_a_lost_estimate_are_reported() -> None:
     belief, _, b = two_modes(share=0.0)
     poses, weights, best = select_single(belief)

@@ -209,3 +209,22 @@ def test_pairs_of_twists_are_those_of_one_by_one() -> None:
     a, b = make_pose(R, t).double().split(count)
     pairs = pair_twists(split_poses(a, CENTER), split_poses(b, CENTER))
     assert torch.allclose(pairs, twist_between(a[:, None], b[None], CENTER), atol=2e-6)
+
+
+def test_copies_of_poses_make_no_density_narrower() -> None:
+    """As resampling makes them: a copy is no witness that poses are so near to each other."""
+    poses, g = draw(150, generator(30)), generator(31)
+    index = torch.randint(150, (400,), generator=g)
+    counts = torch.bincount(index, minlength=150).double()
+    kept = counts > 0
+    weighted = fit(poses[kept], weights=counts[kept] / 400)
+    copied = fit(poses[index])
+    fresh = draw(200, generator(32))
+    own = [float(one.log_weights.exp() @ log_density_held_out(one)) for one in (weighted, copied)]
+    assert own[1] == pytest.approx(own[0], abs=0.3)
+    at_fresh = [float(log_density(one, fresh).mean()) for one in (weighted, copied)]
+    # copies are still neighbors, so that fewer poses shape a kernel
+    assert at_fresh[1] == pytest.approx(at_fresh[0], abs=1.0)
+    assert own[1] == pytest.approx(at_fresh[1], abs=1.0)
+    alone = fit(poses[:1].expand(30, 4, 4))
+    assert bool(log_density_held_out(alone).isfinite().all())

@@ -12,7 +12,7 @@ from posefilter.confidence.fit import (
     fit_choice,
 )
 from posefilter.confidence.logistic import Logistic, fit_logistic
-from posefilter.confidence.verdicts import Costs, decide, score_verdicts
+from posefilter.confidence.verdicts import Costs, apply_prior, decide, score_verdicts
 from posefilter.errors import UserError
 from posefilter.metrics.confidence import calibration_error
 
@@ -147,6 +147,31 @@ def test_verdicts_lower_the_cost_that_is_paid() -> None:
     for other in (1.0, 0.0, -1.0):
         assert own < pay(torch.full((len(right),), other))
     assert own <= pay(score_verdicts(found, Costs(2, 2, 1))) + 0.01
+
+
+def test_a_prior_makes_probabilities_of_images_that_seldom_show_the_object() -> None:
+    made = fit_calibration(draw(6000, seed=8), "scenes")
+    frames = draw(60_000, seed=9)
+    kept = frames.present & (np.arange(60_000) % 9 == 0) | ~frames.present  # one of ten
+    frames = frames.select(np.flatnonzero(kept))
+    found = made.assess_features(torch.from_numpy(frames.values))
+    pairs = zip(found.presence.tolist(), found.probability.tolist(), strict=True)
+    adjusted = torch.tensor([apply_prior(q, p, float(frames.present.mean())) for q, p in pairs])
+    there, right = torch.from_numpy(frames.present), torch.from_numpy(frames.correct)
+    assert float(calibration_error(adjusted[:, 0], there)) < 0.015
+    assert float(calibration_error(adjusted[:, 1], right)) < 0.015
+    assert float(calibration_error(found.presence, there)) > 0.05
+
+
+def test_a_prior_of_one_half_changes_nothing_and_others_keep_the_order() -> None:
+    assert apply_prior(0.7, 0.4, 0.5) == pytest.approx((0.7, 0.4))
+    # odds of 4 times odds of 1 to 9
+    assert apply_prior(0.8, 0.6, 0.1) == pytest.approx((4 / 13, 4 / 13 * 0.75))
+    assert apply_prior(0.0, 0.0, 0.9) == (0, 0)
+    assert apply_prior(1.0, 0.5, 0.01) == (1, 0.5)
+    for wrong in (0, 1, -0.1, float("nan"), True, "1"):
+        with pytest.raises(UserError, match="prior="):
+            apply_prior(0.5, 0.5, wrong)  # type: ignore[arg-type]
 
 
 def test_costs_are_positive() -> None:

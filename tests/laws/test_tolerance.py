@@ -19,6 +19,7 @@ from posefilter.confidence.tolerance import (
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose
 from posefilter.geometry.rotation import exp_so3
+from posefilter.meshes.symmetries import rotation_about, symmetry_group
 from posefilter.metrics.confidence import calibration_error
 from posefilter.types import ObjectModel
 
@@ -167,3 +168,18 @@ def test_errors_are_of_the_center_and_up_to_symmetry() -> None:
     assert both.rotation.tolist() == pytest.approx([0.1, 0.1], abs=1e-6)
     assert float(both.add[1]) == pytest.approx(float(both.add[0]), abs=1e-6)
     assert bool((both.add_s <= both.add).all())
+
+
+def test_a_turn_about_a_continuous_symmetry_is_no_error() -> None:
+    """The object knows 36 turns; a pose between two of them is right all the same."""
+    axis, point = np.array([0.6, 0.0, 0.8]), np.array([0.5, 0.1, 0.0])
+    group = torch.from_numpy(symmetry_group(continuous=[(axis, point)], steps=36))
+    truth = make_pose(exp_so3(torch.tensor([0.3, -0.2, 0.5])), torch.tensor([0.1, 0.2, 0.9]))
+    truth = truth.double()[None]
+    between = torch.from_numpy(rotation_about(axis, math.radians(5), point))
+    errors = measure_pose_errors(truth @ between, truth, make_model(group.float()))
+    assert math.degrees(float(errors.rotation)) < 0.61
+    assert bool(PoseTolerance(rotation_deg=2).accepts(errors).all())
+    alone = measure_pose_errors(truth @ between, truth, make_model(group[:1].float()))
+    assert math.degrees(float(alone.rotation)) == pytest.approx(5, abs=1e-3)
+    assert float(errors.add) < 0.15 * float(alone.add)

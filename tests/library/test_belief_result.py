@@ -1,6 +1,7 @@
 """The moments and modes of a belief are those of the distribution that it was drawn from."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -196,3 +197,45 @@ def test_a_particle_without_weight_is_no_mode() -> None:
     assert sum(mode.mass for mode in belief.modes) == pytest.approx(1)
     assert all(mode.mass > 0 for mode in belief.modes)
     assert np.isfinite(belief.covariance).all()
+
+
+def test_a_belief_of_single_precision_is_one_of_double() -> None:
+    """A filter of one's own has float32, whose weights sum to 1 but for rounding."""
+    samples = spread_about(some_pose(), known_covariance(), 60)
+    weights = np.random.default_rng(6).random(60)
+    weights /= weights.sum()
+    double = Belief(samples, weights, CENTER, RADIUS, DIAMETER)
+    rounded = (1.0005 * weights).astype(np.float32)
+    single = Belief(samples.astype(np.float32), rounded, CENTER.astype(np.float32), 0.15, 0.28)
+    assert single.samples.dtype == single.weights.dtype == single.center.dtype == np.float64
+    assert single.weights.sum() == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(single.covariance, double.covariance, rtol=1e-3, atol=1e-9)
+    assert single.differential_entropy == pytest.approx(double.differential_entropy, abs=0.01)
+    # a weight above 1 would have no density without its own kernel
+    alone = Belief(samples[:2], np.array([1.0005, 0.0]), CENTER, RADIUS, DIAMETER)
+    assert alone.weights.tolist() == [1, 0]
+    assert np.isfinite(alone.differential_entropy)
+    lists = Belief(samples.tolist(), weights.tolist(), CENTER.tolist(), RADIUS, DIAMETER)  # type: ignore[arg-type]
+    assert np.array_equal(lists.weights, weights)  # which need no more than that
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"center": np.zeros(2)}, "the center should be three numbers"),
+        ({"center": np.array([0.0, np.nan, 0.0])}, "the center should be three numbers"),
+        ({"radius": 0.0}, "the radius should be above 0, and is 0.0"),
+        ({"diameter": np.nan}, "the diameter should be above 0, and is nan"),
+        ({"samples": [["a"]]}, "samples should be numbers in an array"),
+    ],
+)
+def test_a_belief_without_a_place_or_a_size_is_refused(changed: dict[str, Any], said: str) -> None:
+    good = {
+        "samples": np.eye(4)[None],
+        "weights": np.ones(1),
+        "center": CENTER,
+        "radius": RADIUS,
+        "diameter": DIAMETER,
+    }
+    with pytest.raises(UserError, match=f"^belief: {said}"):
+        Belief(**good | changed)  # type: ignore[arg-type]

@@ -11,6 +11,7 @@ import torch
 from posefilter import Belief, UserError
 from posefilter.geometry.pose import make_pose, move_about
 from posefilter.geometry.rotation import exp_so3
+from posefilter.meshes.symmetries import symmetry_group
 
 CENTER = np.array([0.02, -0.01, 0.1])
 RADIUS, DIAMETER = 0.15, 0.28
@@ -214,3 +215,164 @@ def test_what_is_no_level_and_no_camera_is_refused() -> None:
         belief.marginal("x").quantile([0.1, 0.5])  # type: ignore[arg-type]
     with pytest.raises(UserError, match=r"intrinsics: have shape \(4, 4\); expected \(3, 3\)"):
         belief.project(np.eye(4))
+
+
+def any_turn(steps: int = 36) -> np.ndarray:
+    """Return a continuous symmetry about the object's z, cut into turns as meshes have it."""
+    return symmetry_group(continuous=[(np.array([0.0, 0, 1]), CENTER)], steps=steps)
+
+
+def test_modes_that_a_symmetry_makes_of_one_another_are_one_place_with_one_share() -> None:
+    tight = draw(90, 7, SCALE / 3)
+    far = tight[:10].copy()
+    far[:, 0, 3] += 0.2
+    turned = tight[:30] @ half_turn()[1]
+    both = belief_of(np.concatenate([tight, turned, far]), symmetries=half_turn())
+    assert [mode.equivalent for mode in both.modes] == [None, 0, None]
+    assert both.modes[0].mass == pytest.approx(90 / 130)
+    sure = both.uncertainty()
+    assert sure.mass == pytest.approx(120 / 130)
+    assert sure.describe().endswith("a pose that has 92 % of the belief")
+    # the particles of the equivalent mode count, too
+    wide = draw(60, 8) @ half_turn()[1]
+    mixed = belief_of(np.concatenate([tight, wide]), symmetries=half_turn())
+    alone = belief_of(tight, symmetries=half_turn()).uncertainty()
+    assert mixed.uncertainty().translation > 1.5 * alone.translation
+    # without the symmetry they are other poses
+    assert belief_of(both.samples).uncertainty().mass == pytest.approx(90 / 130)
+
+
+def test_a_turn_about_a_continuous_symmetry_is_no_uncertainty() -> None:
+    """36 turns of 10 degrees leave gaps of 5 degrees on either side."""
+    angles = np.random.default_rng(13).uniform(0, 2 * np.pi, 300)
+    turns = torch.from_numpy(np.outer(angles, [0.0, 0, 1]))
+    twists = torch.cat([torch.zeros(300, 3).double(), turns], dim=1)
+    samples = move_about(middle().expand(300, 4, 4), twists, torch.from_numpy(CENTER)).numpy()
+    sure = belief_of(samples, symmetries=any_turn()).uncertainty()
+    assert math.degrees(sure.rotation) < 0.61
+    assert sure.translation == pytest.approx(0, abs=1e-9)
+    assert sure.mass > 0.95
+
+
+def test_the_covariance_about_a_pose_holds_its_offset_and_forgets_the_symmetry() -> None:
+    samples = draw(3000, 14)
+    offset = np.array([0.003, -0.001, 0.002, 0.0, 0.0, 0.0])
+    pose = middle().clone()
+    pose[:3, 3] -= torch.from_numpy(offset[:3])
+    flipped = np.random.default_rng(15).random(3000) < 0.5
+    mixed = samples.copy()
+    mixed[flipped] = mixed[flipped] @ half_turn()[1]
+    expected = np.diag(SCALE**2) + np.outer(offset, offset)
+    unit = np.outer(SCALE, SCALE)
+    for belief in (belief_of(samples), belief_of(mixed, symmetries=half_turn())):
+        found = belief.covariance_about(pose.numpy())
+        assert np.abs((found - expected) / unit).max() < 0.12
+        assert np.array_equal(found, belief.covariance_about(pose.numpy()[:3]))
+    about_mean = belief_of(samples).covariance_about(belief_of(samples).mean)
+    assert np.allclose(about_mean, belief_of(samples).covariance, atol=1e-15)
+    assert belief_of(mixed, symmetries=half_turn()).covariance[5, 5] > 1
+    with pytest.raises(UserError, match="poses: should be rigid"):
+        belief_of(samples).covariance_about(2 * np.eye(4))
+    with pytest.raises(UserError, match=r"pose: has shape \(2, 4, 4\)"):
+        belief_of(samples).covariance_about(samples[:2])
+
+
+def test_a_canonical_belief_is_the_same_belief_in_one_place() -> None:
+    samples = draw(200, 16)
+    turned = samples.copy()
+    turned[:90] = turned[:90] @ half_turn()[1]
+    belief = belief_of(turned, np.random.default_rng(17).random(200), symmetries=half_turn())
+    one = belief.canonicalize(middle().numpy())
+    assert np.allclose(one.samples, samples)
+    assert np.array_equal(one.weights, belief.weights)
+    assert np.allclose(one.log_density(draw(20, 18)), belief.log_density(draw(20, 18)), atol=1e-6)
+    assert one.marginal("rz").std == pytest.approx(SCALE[5], rel=0.2)
+    assert belief.marginal("rz").std > 1
+    plain = belief_of(turned)
+    assert np.array_equal(plain.canonicalize(middle().numpy()).samples, turned)
+    ring = belief_of(samples @ any_turn()[7], symmetries=any_turn())
+    about = ring.canonicalize(middle().numpy()).marginal("rz")
+    assert np.abs(about.values - about.mean).max() < math.radians(0.7)
+
+
+def test_a_belief_of_another_frame_is_the_same_belief_there() -> None:
+    belief = belief_of(draw(300, 19), symmetries=half_turn())
+    turn = exp_so3(torch.tensor([0.9, 0.2, -1.4]).double())
+    frame = make_pose(turn, torch.tensor([1.0, -2.0, 0.5]).double()).numpy()
+    there = belief.transform(frame[:3])
+    assert np.allclose(there.mean, frame @ belief.mean)
+    both = np.eye(6)
+    both[:3, :3] = frame[:3, :3]
+    assert np.allclose(there.covariance, both @ belief.covariance @ both.T, atol=1e-15)
+    asked = draw(20, 20)
+    assert np.allclose(there.log_density(frame @ asked), belief.log_density(asked), atol=1e-6)
+    assert there.differential_entropy == pytest.approx(belief.differential_entropy, abs=1e-6)
+    assert np.allclose(there.transform(np.linalg.inv(frame)).samples, belief.samples)
+    assert (there.object, len(there.symmetries)) == ("thing", 2)
+    with pytest.raises(UserError, match="rigid"):
+        belief.transform(np.diag([2.0, 2, 2, 1]))
+
+
+def test_draws_are_of_the_density_and_apart_where_samples_are_copies() -> None:
+    """Few samples, each many times, as resampling leaves them."""
+    few = draw(150, 21)
+    copies = np.random.default_rng(22).integers(0, 150, 400)
+    belief = belief_of(few[copies])
+    drawn = belief.draw(3000)
+    assert len(np.unique(drawn[:, 0, 3])) == 3000
+    assert np.array_equal(drawn, belief.draw(3000))
+    assert not np.allclose(drawn, belief.draw(3000, seed=1))
+    wider = belief_of(drawn).covariance.diagonal() / belief.covariance.diagonal()
+    assert (wider > 0.95).all()
+    assert (wider < 2.2).all()
+    assert np.allclose(belief_of(drawn).mean, belief.mean, atol=0.01)
+    # under another density p, draws of q tell its integral: the mean of p / q is 1
+    other = belief_of(draw(400, 27, 0.6 * SCALE))
+    ratio = np.exp(other.log_density(drawn) - belief.log_density(drawn))
+    assert ratio.mean() == pytest.approx(1, abs=5 * ratio.std() / np.sqrt(3000) + 0.02)
+    far = draw(100, 28)
+    far[:, 2, 3] += 0.5
+    heavy = belief_of(np.concatenate([few[:100], far]), np.repeat([0.75, 0.25], 100))
+    assert (heavy.draw(400)[:, 2, 3] < 1.2).sum() == pytest.approx(300, abs=1)
+    for wrong in (0, -1, 2.5, True):
+        with pytest.raises(UserError, match="whole number, 1 or more"):
+            belief.draw(wrong)  # type: ignore[arg-type]
+
+
+def test_two_views_are_fused_by_bayes_rule() -> None:
+    """One knows x, the other y; of Gaussians the product is known."""
+    first, second = SCALE.copy(), SCALE.copy()
+    first[1], second[0] = 0.02, 0.02
+    shift = np.array([0.002, 0.004, 0.004])
+    aside = draw(600, 24, second)
+    aside[:, :3, 3] += shift
+    one, two = belief_of(draw(600, 23, first)), belief_of(aside)
+    fused = one.fuse(two, count=1200)
+    a, b = 1 / first**2, 1 / second**2
+    place = (middle().numpy() @ np.append(CENTER, 1))[:3] + b[:3] / (a + b)[:3] * shift
+    std = 1 / np.sqrt(a + b)
+    for axis, at, wide in zip("xyz", place, std, strict=False):
+        found = fused.marginal(axis)
+        assert found.mean == pytest.approx(at, abs=0.4 * wide)
+        # both densities are wider than what their particles were drawn from
+        assert 0.9 * wide < found.std < 1.7 * wide
+    for number, axis in ((3, "rx"), (4, "ry"), (5, "rz")):
+        assert 0.9 * std[number] < fused.marginal(axis).std < 1.7 * std[number]
+    assert fused.differential_entropy < min(one.differential_entropy, two.differential_entropy) - 1
+    assert len(fused.weights) == 2400
+    again = two.fuse(one, count=1200)
+    assert np.allclose(again.mean, fused.mean, atol=0.01)
+
+
+def test_views_that_contradict_each_other_are_both_kept_and_symmetries_are_known() -> None:
+    tight = draw(200, 25, SCALE / 3)
+    far = np.repeat(move_far(np.eye(4))[None], 200, 0) @ tight
+    modes = belief_of(tight).fuse(belief_of(far)).modes
+    assert [mode.mass for mode in modes[:2]] == pytest.approx([0.5, 0.5], abs=0.2)
+    turned = tight @ half_turn()[1]
+    one, two = belief_of(tight, symmetries=half_turn()), belief_of(turned, symmetries=half_turn())
+    fused = one.fuse(two)
+    assert fused.differential_entropy < one.differential_entropy - 1
+    assert np.sqrt(fused.covariance.diagonal()[5]) < SCALE[5]
+    with pytest.raises(UserError, match="is another object than thing"):
+        one.fuse(dataclasses.replace(two, diameter=0.3))

@@ -10,8 +10,9 @@ from torch import Generator, Tensor
 from posefilter.geometry.camera import intrinsics
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.rotation import exp_so3, random_rotation
+from posefilter.geometry.symmetries import densify
 from posefilter.meshes.symmetries import rotation_about, symmetry_group
-from posefilter.metrics.bop import BopErrors, average_recall, densify, mspd, mssd
+from posefilter.metrics.bop import BopErrors, average_recall, mspd, mssd
 from posefilter.types import ObjectModel
 
 K = intrinsics(500.0, 510.0, 320.0, 240.0).double()

@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from tests.models.toy import square
 
+from posefilter.belief import Belief
 from posefilter.geometry.pose import make_pose
-from posefilter.geometry.pose_density import fit_density, log_density
+from posefilter.geometry.pose_density import fit_density, log_density, log_density_held_out
 from posefilter.metrics.credibility import (
     LEVELS,
     Credibility,
@@ -94,3 +96,20 @@ def test_scores_by_the_density_itself() -> None:
     assert all(x.dtype == torch.float64 and x.shape == (2,) for x in scores)
     none = score_truth(BeliefBatch(*(x[:0] for x in belief)), truth[:0], square())
     assert [x.shape for x in none] == [(0,)] * 3
+
+
+def test_the_share_that_is_counted_is_that_of_the_sets_themselves() -> None:
+    """Truths between any two particles: 0.65 of 300 weights is a little less than 0.65."""
+    generator = torch.Generator().manual_seed(3)
+    samples = torch.eye(4).repeat(300, 1, 1).double()
+    samples[:, :3, 3] = 0.01 * torch.randn(300, 3, generator=generator).double()
+    even = torch.full((300,), 1 / 300).double()
+    belief = Belief(samples.numpy(), even.numpy(), np.zeros(3), 0.1, 0.2)
+    density = fit_density(samples, even.log(), torch.zeros(3), 0.1, 0.2)
+    own, weights = log_density_held_out(density), density.log_weights.exp()
+    ordered = own.sort(descending=True).values
+    truths = (ordered[1:] + ordered[:-1]) / 2
+    rank = torch.stack([weights @ (own > one).double() for one in truths])
+    for level in LEVELS:
+        held = truths >= belief.credible_set(level).min_log_density
+        assert measure_coverage(rank, level) == float(held.double().mean())

@@ -11,13 +11,13 @@ from tests.models.toy import scenes, square
 from posefilter.errors import UserError
 from posefilter.geometry.pose import make_pose, transform
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify
 from posefilter.meshes.symmetries import symmetry_group
 from posefilter.metrics.bop import (
     MSPD_THRESHOLDS,
     MSSD_THRESHOLDS,
     BopErrors,
     average_recall,
-    densify,
 )
 from posefilter.metrics.bop_results import HEADER, PoseRow, read_poses_csv, write_poses_csv
 from posefilter.metrics.collect import BeliefQuality, PoseErrors

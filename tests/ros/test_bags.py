@@ -155,7 +155,11 @@ def test_detections_are_the_librarys_results(tmp_path: Path, capfd) -> None:
     quaternion = quat_xyzw_from_matrix(torch.from_numpy(result.pose[:3, :3])).numpy()
     assert abs(np.dot([turn.x, turn.y, turn.z, turn.w], quaternion)) == pytest.approx(1, abs=1e-9)
     own = result.belief
-    wanted = to_ros_covariance(own.covariance, own.mean, own.center)
+    # that of the pose beside it, which is not the particles' mean
+    wanted = to_ros_covariance(own.covariance_about(result.pose), result.pose, own.center)
+    assert np.trace(wanted[:3, :3]) > 1.01 * np.trace(
+        to_ros_covariance(own.covariance, own.mean, own.center)[:3, :3]
+    )
     np.testing.assert_allclose(pose.covariance.reshape(6, 6), wanted, rtol=1e-6, atol=1e-12)
     assert detection.id == detection.results[0].hypothesis.class_id == NAME
     assert np.isnan(detection.results[0].hypothesis.score)  # another filter than was calibrated

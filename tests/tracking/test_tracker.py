@@ -8,9 +8,10 @@ import torch
 from tests.tracking.toy import DEPTH, RGB, SPACE, K, make_toy, walk_pose
 
 import posefilter
-from posefilter.confidence.calibration import Calibration, Logistic
+from posefilter.confidence.calibration import Calibration, Logistic, tabulate_errors
 from posefilter.confidence.conformal import Conformal
 from posefilter.errors import UserError
+from posefilter.estimator import Estimator
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.refine import Compose
 from posefilter.filters.texture import TextureRotations
@@ -174,6 +175,32 @@ def test_a_track_has_no_conformal_sets() -> None:
         result = tracker.update(RGB, DEPTH, K)
         with pytest.raises(UserError, match=r"no conformal sets .* not of a track"):
             result.conformal_set(0.9)
+
+
+def test_a_tracks_verdict_goes_by_the_costs_and_the_tolerance_of_its_estimator() -> None:
+    toy, _ = make_toy()
+    toy.calibration = Calibration(
+        ("score",), (-5.0,), (2.0,), Logistic((3.0,), 0.0), Logistic((3.0,), 0.0),
+        {"right": 20, "wrong": 20, "absent": 20}, "toy", {},
+        errors=tabulate_errors(np.linspace(-1, 1, 40)[:, None], np.ones((40, 4))),
+    )  # fmt: skip
+    toy.truth = walk_pose(1)[0]
+    careful, loose = posefilter.Costs(false_alarm=1e9), posefilter.PoseTolerance(add_s=2.0)
+    strict = posefilter.PoseTolerance(add_s=0.5)  # which no frame of the calibration keeps
+    usual = Estimator([toy], "cpu")
+    others = (
+        Estimator([toy], "cpu", costs=careful),
+        Estimator([toy], "cpu", pose_tolerance=loose),
+        Estimator([toy], "cpu", pose_tolerance=strict),
+    )
+    tracker = posefilter.Tracker([usual, *others])
+    for _ in range(2):
+        results = tracker.update(RGB, DEPTH, K)
+        assert [one.verdict for one in results] == ["found", "unsure", "found", "unsure"]
+        assert results[1].costs == careful
+        assert [one.pose_tolerance for one in results] == [None, None, loose, strict]
+    assert results[0].decide(posefilter.Costs()) == "found"
+    assert results[0].decide(posefilter.Costs(), prior=1e-4) == "absent"
 
 
 def test_in_doubt_the_network_sees_the_whole_image() -> None:

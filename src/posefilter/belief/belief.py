@@ -1,8 +1,9 @@
 """A belief over one object's pose in one image: weighted poses, and what they amount to."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,10 +31,14 @@ from posefilter.geometry.pose_density import (
     log_density,
     log_density_held_out,
 )
+from posefilter.geometry.pose_sampling import draw_poses
 from posefilter.geometry.pose_statistics import covariance_about, twist_between
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify, gather_copies
 
 _MOST_SYMMETRIES = 1000
+_ROUNDING = 1e-9  # of weights' sum, which float64 keeps
+_SAME_OBJECT = 1e-5  # [m] by which single precision may change an object's sizes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,11 +68,14 @@ class Belief:
     symmetries: np.ndarray = field(default_factory=lambda: np.eye(4)[None])
 
     def __post_init__(self) -> None:
-        """Check shapes.
+        """Bring arrays to float64 and weights to a sum of 1, and check all.
 
         Raises:
-            UserError: The arrays do not fit each other, or hold no poses and weights.
+            UserError: The arrays do not fit each other, or hold no poses and weights; or the center
+                or a size is none.
         """
+        for name in ("samples", "weights", "center", "symmetries"):
+            object.__setattr__(self, name, _as_numbers(name, getattr(self, name)))
         count = len(self.weights)
         if self.samples.shape != (count, 4, 4) or self.weights.shape != (count,) or not count:
             raise UserError(
@@ -77,6 +85,8 @@ class Belief:
         total = float(self.weights.sum())
         if not (np.isfinite(total) and abs(total - 1) < 1e-3 and (self.weights >= 0).all()):
             raise UserError(f"belief: the weights should be positive and sum to 1, not {total:.6g}")
+        if abs(total - 1) > _ROUNDING:  # as of single precision
+            object.__setattr__(self, "weights", self.weights / total)
         if not np.isfinite(self.samples).all() or not is_rigid(torch.from_numpy(self.samples)):
             raise UserError("belief: the samples should be rigid transforms")
         group = self.symmetries
@@ -86,6 +96,13 @@ class Belief:
             )
         if not np.isfinite(group).all() or not is_rigid(torch.from_numpy(group)):
             raise UserError("belief: the symmetries should be rigid transforms")
+        if self.center.shape != (3,) or not np.isfinite(self.center).all():
+            raise UserError(f"belief: the center should be three numbers, not {self.center}")
+        for name in ("radius", "diameter"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise UserError(
+                    f"belief: the {name} should be above 0, and is {getattr(self, name)}"
+                )
 
     def __repr__(self) -> str:
         about = f"{len(self.weights)} particles {self.uncertainty().describe()}"
@@ -105,11 +122,49 @@ class Belief:
 
         Rows and columns are [x, y, z, rx, ry, rz]: the translation of the object's center in the
         camera's axes [m], then the rotation vector about that center in the object's own axes
-        [rad].  Square roots of the diagonal are standard deviations.
+        [rad].  Square roots of the diagonal are standard deviations.  An estimate is not the mean:
+        for its error see `covariance_about`.
         """
         samples, weights = self._tensors
         mean = torch.from_numpy(self.mean)
         return covariance_about(mean, samples, weights, torch.from_numpy(self.center)).numpy()
+
+    def covariance_about(self, pose: np.ndarray) -> np.ndarray:
+        """Return the covariance (6, 6) of a pose's error, if the belief is right: the second moment
+        of the twists from this pose to the particles.
+
+        Unlike `covariance` it holds how far the pose is from the mean, and of each particle it
+        takes the equivalent pose that is nearest.  Order, axes and units are those of `covariance`.
+
+        Args:
+            pose: (4, 4) camera_from_object [m], such as `Result.pose`; or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        near = self.canonicalize(pose)
+        about, center = torch.from_numpy(_as_pose(pose)), torch.from_numpy(self.center)
+        return covariance_about(about, *near._tensors, center).numpy()
+
+    def canonicalize(self, pose: np.ndarray) -> "Belief":
+        """Return the same belief by other samples: of each particle the equivalent pose that is
+        nearest to a pose, a turn counting as the shift at the radius.
+
+        Of a symmetric object, particles at equivalent poses are then together, so that mean,
+        covariance and marginals say what they say of other objects.  A continuous symmetry has no
+        gaps between its turns.
+
+        Args:
+            pose: (4, 4) camera_from_object [m], or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        about = torch.from_numpy(_as_pose(pose))
+        group = densify(torch.from_numpy(self.symmetries))
+        samples, center = self._tensors[0], torch.from_numpy(self.center)
+        near = gather_copies(samples, about, center, self.radius, group)
+        return replace(self, samples=near.numpy())
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
@@ -175,8 +230,9 @@ class Belief:
 
     @cached_property
     def differential_entropy(self) -> float:
-        """The entropy of the density [nat], in the measure of `log_density`: minus the mean log
-        density of the particles, each without its own kernel.
+        """The entropy of what the particles are drawn from [nat], in the measure of `log_density`:
+        minus the mean log density of the particles, each without its own kernel.  The kernel
+        density itself is wider.
         """
         return -float(self._density.log_weights.exp() @ torch.from_numpy(self._held_out))
 
@@ -228,17 +284,21 @@ class Belief:
         return Marginal(axis, column.numpy(), self.weights)
 
     def uncertainty(self, level: float = 0.95) -> Uncertainty:
-        """Return how far the heaviest mode's particles are from their mean, equivalent poses taken
-        for one; `describe()` of it says so in words.
+        """Return how far particles are from the mean of the heaviest mode, those of its own and of
+        equivalent modes; `describe()` of it says so in words.
+
+        Equivalent poses are one: of each particle the nearest to that mean counts, and a continuous
+        symmetry has no gaps between its turns.
 
         Raises:
             UserError: The level is not in [0, 1].
         """
         samples, weights = self._tensors
-        own, center = self._found.member == 0, torch.from_numpy(self.center)
+        heaviest, center = self._found.member == 0, torch.from_numpy(self.center)
+        pose = self._mean(samples[heaviest], weights[heaviest] / weights[heaviest].sum())
+        own = torch.isin(self._found.member, torch.tensor(self._list_alike()))
         poses, share = samples[own], weights[own] / weights[own].sum()
-        pose, mass = self._mean(poses, share), float(weights[own].sum())
-        group = torch.from_numpy(self.symmetries)
+        mass, group = float(weights[own].sum()), densify(torch.from_numpy(self.symmetries))
         return measure_uncertainty(poses, share, pose, mass, center, group, level)
 
     def project(
@@ -262,6 +322,81 @@ class Belief:
         if K.shape != (3, 3):
             raise UserError(f"intrinsics: have shape {tuple(K.shape)}; expected (3, 3)")
         return project_belief(*self._tensors, torch.from_numpy(at), K, level)
+
+    def transform(self, frame_from_camera: np.ndarray) -> "Belief":
+        """Return the belief in another frame, such as the world's or a robot's: its samples are
+        then frame_from_object.
+
+        Densities and turns stay what they are, since the measure does, and turns are about the
+        object's own axes; shifts are along the axes of the frame.  A set's threshold is the same
+        there, see `highest_density_region`.  Camera_from_frame brings it back to `project` it.
+
+        Args:
+            frame_from_camera: (4, 4) [m], or (3, 4).
+
+        Raises:
+            UserError: It is no rigid transform.
+        """
+        return replace(self, samples=_as_pose(frame_from_camera) @ self.samples)
+
+    def draw(self, count: int, seed: int = 0) -> np.ndarray:
+        """Draw poses from the density of `log_density`, none from its background of a hundredth.
+
+        They are apart where samples are copies of one another, as after resampling, and wider than
+        the samples by the width of the kernels.  Of a symmetric object, those near to the heaviest
+        sample stand for the equivalent ones.
+
+        Args:
+            count: Number of poses; each sample has its share of them but for one.
+            seed: The same seed gives the same poses.
+
+        Returns:
+            (count, 4, 4) camera_from_object [m], float64.
+
+        Raises:
+            UserError: The count is no whole number, 1 or more.
+        """
+        if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
+            raise UserError(f"belief: draws {count} poses; expected a whole number, 1 or more")
+        generator = torch.Generator().manual_seed(seed)
+        return draw_poses(self._density, int(count), generator).numpy()
+
+    def fuse(self, other: "Belief", count: int = 500, seed: int = 0) -> "Belief":
+        """Return the belief after two views of one object that rests: the product of both.
+
+        By Bayes' rule with a flat prior, if the views err independently.  Views of one filter from
+        like directions do not, and its beliefs are too sure: the result is surer than it should be.
+        Of views that contradict each other both are kept, as modes.  The densities' kernels make
+        standard deviations of Gaussians a tenth to a half too large.
+
+        By importance sampling: poses x are drawn from both densities, and have the weights
+        p(x) q(x) / (p(x) + q(x)).
+
+        Args:
+            other: Of the same object in the same frame; see `transform`.
+            count: Number of poses drawn from each.
+            seed: Of the draws.
+
+        Returns:
+            A belief with twice as many samples, of uneven weights; equivalent poses of a symmetric
+            object are in one place.
+
+        Raises:
+            UserError: It is another object's, or the count is no whole number, 1 or more.
+        """
+        own, theirs = (
+            np.concatenate([one.center, [one.radius, one.diameter], one.symmetries.ravel()])
+            for one in (self, other)
+        )
+        if len(own) != len(theirs) or not np.allclose(own, theirs, atol=_SAME_OBJECT):
+            raise UserError(f"belief: {other.object} is another object than {self.object}")
+        drawn = [self.draw(count, seed), other.draw(count, seed + 1)]
+        samples = np.concatenate(drawn)
+        p, q = self.log_density(samples), other.log_density(samples)
+        log_weights = torch.from_numpy(p + q - np.logaddexp(p, q))
+        weights = log_weights.softmax(0).numpy()
+        fused = replace(self, samples=samples, weights=weights)
+        return fused.canonicalize(samples[weights.argmax()])
 
     def save(self, path: str | Path) -> None:
         """Write the belief as an .npz file; `Belief.load` reads it. The ending is added if missing.
@@ -311,6 +446,14 @@ class Belief:
         copies = found.states[heavier] @ torch.from_numpy(self.symmetries)
         return bool(self._space.distance(copies, pose).min() < APART * self.diameter)
 
+    def _list_alike(self) -> list[int]:
+        """Return the numbers of the heaviest mode and of those that symmetries make of it."""
+        alike = [0]
+        for number, mode in enumerate(self.modes):
+            if mode.equivalent in alike:
+                alike.append(number)
+        return alike
+
     @property
     def _space(self) -> PoseSpace:
         x, y, z = self.center.tolist()
@@ -318,6 +461,22 @@ class Belief:
 
     def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
         return self._space.mean(samples, weights)
+
+
+def _as_numbers(name: str, value: Any) -> np.ndarray:
+    """Return what a belief holds under a name as float64."""
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"belief: {name} should be numbers in an array ({error})") from error
+
+
+def _as_pose(pose: np.ndarray) -> np.ndarray:
+    """Return a pose (4, 4) or (3, 4) as float64 (4, 4)."""
+    one = _as_poses(pose)
+    if one.shape != (4, 4):
+        raise UserError(f"pose: has shape {one.shape}; expected (4, 4) or (3, 4)")
+    return one
 
 
 def _as_poses(poses: np.ndarray) -> np.ndarray:

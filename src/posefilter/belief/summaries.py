@@ -80,13 +80,13 @@ class Marginal:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far the particles of a mode are from it.
+    """How far the particles of a mode, and of those that are equivalent to it, are from it.
 
     Attributes:
-        level: Share of the mode's weight that is meant, such as 0.95.
+        level: Share of their weight that is meant, such as 0.95.
         translation: Distance of the object's center that this share does not exceed [m].
         rotation: Angle that this share does not exceed [rad], the least of what symmetries allow.
-        mass: The mode's share of the belief.
+        mass: Their share of the belief.
     """
 
     level: float

@@ -16,8 +16,9 @@ from posefilter.data.frames import FrameRecord, NotShown, Sample
 from posefilter.data.module import PoseDataModule
 from posefilter.data.readers.base import BaseReader
 from posefilter.errors import UserError
+from posefilter.geometry.symmetries import densify
 from posefilter.meshes.mesh import Mesh, hull_vertices
-from posefilter.metrics.bop import REFERENCE_WIDTH, densify, mspd, mssd
+from posefilter.metrics.bop import REFERENCE_WIDTH, mspd, mssd
 from posefilter.metrics.bop_recall import TargetErrors, compute_average_recall
 from posefilter.metrics.bop_results import PoseRow, to_mesh
 from posefilter.metrics.bop_targets import Target, read_targets

@@ -15,6 +15,7 @@ from torch import Tensor
 from posefilter.errors import UserError
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
+from posefilter.geometry.symmetries import densify
 from posefilter.types import ObjectModel
 
 
@@ -95,7 +96,7 @@ def read_pose_tolerance(given: Mapping[str, Any] | None) -> PoseTolerance | None
 
 
 def measure_pose_errors(poses: Tensor, truth: Tensor, object_model: ObjectModel) -> PoseErrors:
-    """Return how far estimates are off.
+    """Return how far estimates are off, up to symmetries; a continuous one has no gaps.
 
     Args:
         poses: (B, 4, 4) camera_from_object [m].
@@ -105,7 +106,7 @@ def measure_pose_errors(poses: Tensor, truth: Tensor, object_model: ObjectModel)
     from posefilter.metrics.errors import add, add_s  # trees of scipy, prediction needs none
 
     truth, points = truth.to(poses), object_model.points.to(poses)
-    equal = truth[:, None] @ object_model.symmetries.to(truth)
+    equal = truth[:, None] @ densify(object_model.symmetries.double()).to(truth)
     distances = add(poses[:, None], equal, points)
     least, which = distances.min(1)
     near = equal[torch.arange(len(equal)), which]

@@ -3,6 +3,8 @@
 References:
     Chow: On optimum recognition error and reject tradeoff. IEEE Transactions on Information Theory
         16 (1970).
+    Saerens, Latinne, Decaestecker: Adjusting the outputs of a classifier to new a priori
+        probabilities. Neural Computation 14 (2002).
 """
 
 import math
@@ -63,6 +65,29 @@ def decide(presence: float, probability: float, costs: Costs | None = None) -> V
         "found": (1 - probability) * costs.false_alarm,
     }
     return min(expected, key=lambda verdict: expected[verdict])
+
+
+def apply_prior(presence: float, probability: float, prior: float) -> tuple[float, float]:
+    """Return presence and probability for images that show the object more or less often than not.
+
+    A calibration counts frames with the object and without as if there were as many of each. By
+    Bayes' rule another prior multiplies the odds of the presence by its own odds (Saerens, Latinne
+    and Decaestecker 2002); whether the pose is right, given that the object is there, stays.
+
+    Args:
+        presence: Probability that the object is there, as calibrated.
+        probability: Probability that it is there and the pose right; at most `presence`.
+        prior: Share of the images that show the object, in (0, 1).
+
+    Raises:
+        UserError: The prior is not between 0 and 1.
+    """
+    number = isinstance(prior, int | float) and not isinstance(prior, bool)
+    if not (number and 0 < prior < 1):
+        raise UserError(f"prior={prior}: must lie between 0 and 1, ends excluded")
+    there, absent = prior * presence, (1 - prior) * (1 - presence)
+    adjusted = there / (there + absent)
+    return adjusted, probability * adjusted / presence if presence else 0.0
 
 
 def score_verdicts(found: Assessment, costs: Costs | None = None) -> Tensor:

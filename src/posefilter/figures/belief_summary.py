@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from posefilter.figures.layout import format_length
-from posefilter.figures.view_data import Hypothesis, find_hypotheses
+from posefilter.figures.view_data import Hypothesis, bring_together, find_hypotheses
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
 from posefilter.geometry.spaces import PoseSpace
@@ -39,7 +39,7 @@ class BeliefSummary(NamedTuple):
 def summarize_belief(
     poses: Tensor, weights: Tensor, best: Tensor, object_model: ObjectModel
 ) -> BeliefSummary:
-    """Return how sure a belief is.
+    """Return how sure a belief is; poses that a symmetry makes of one another are one.
 
     Args:
         poses: Particles (N, 4, 4), camera_from_object [m], float64.
@@ -48,6 +48,7 @@ def summarize_belief(
         object_model: The object.
     """
     center = object_model.center.detach().cpu().double()
+    poses = bring_together(poses, best, object_model)
     found = find_hypotheses(poses, weights.log(), best, object_model)
     space = PoseSpace((*center.tolist(),), object_model.radius)
     members = found.own if bool(found.own.any()) else torch.ones_like(found.own)

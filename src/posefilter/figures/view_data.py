@@ -17,6 +17,7 @@ from posefilter.filters.modes import APART, find_pose_modes
 from posefilter.geometry.camera import back_project, pixel_grid, project
 from posefilter.geometry.pose import origin_of
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.geometry.symmetries import densify, gather_copies
 from posefilter.meshes.mesh import Mesh, creased_normals
 from posefilter.protocols import Space
 from posefilter.types import Batch, ObjectModel, Trace
@@ -164,8 +165,10 @@ def find_hypotheses(
 
     The estimate stands for the mode of the particle nearest to it, and has that one's weight; where
     no particle is within a tenth of the diameter (a refinement led away from them all) it has none.
+    Poses that a symmetry makes of one another are one.
     (N, 4, 4), (N,), (4, 4).
     """
+    poses = bring_together(poses, best, object_model)
     space = PoseSpace((*object_model.center.tolist(),), object_model.radius)
     modes = find_pose_modes(poses, log_weights, space, object_model.diameter)
     distance, nearest = space.distance(poses, best).min(0)
@@ -177,6 +180,15 @@ def find_hypotheses(
     left_out = float(sum(modes.weights[i] for i in rest if i not in shown))
     members = torch.zeros(len(poses), dtype=torch.bool) if own is None else modes.member == own
     return Hypotheses(estimate, others, left_out, members)
+
+
+def bring_together(poses: Tensor, best: Tensor, object_model: ObjectModel) -> Tensor:
+    """Return of each pose the equivalent one that is nearest to the estimate.
+
+    (N, 4, 4), (4, 4) -> (N, 4, 4).
+    """
+    center, group = (x.detach().to(poses) for x in (object_model.center, object_model.symmetries))
+    return gather_copies(poses, best, center, object_model.radius, densify(group))
 
 
 def make_mesh(shape: Shape, name: str) -> Mesh:

@@ -22,9 +22,9 @@ class ImportanceSampling:
     """Draw the particles anew from a density about the old ones, and weight them by the posterior.
 
     The filter's own weights come of a search that reads one image many times. Here the old
-    particles only say where to look: q is their kernel density, widened and with a background that
-    reaches everywhere. With T temperature, l the log-likelihood and a flat prior, new particles
-    x ~ q have the weights
+    particles only say where to look: q is their kernel density, widened. Particles are drawn from
+    its kernels, and none from its background, which only bounds the weights of what lies far out.
+    With T temperature, l the log-likelihood and a flat prior, new particles x ~ q have the weights
 
         w = exp(l(x) / T) / q(x)
 

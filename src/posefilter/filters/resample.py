@@ -1,7 +1,9 @@
 """Resampling schemes: drawing ancestors from weighted particles.
 
-Each scheme keeps weighted means, exactly or in expectation (tests/laws). For a comparison see Douc,
-Cappe and Moulines (2005), and Chopin and Papaspiliopoulos (2020, chapter 9).
+Each scheme keeps weighted means, exactly or in expectation (tests/laws), but for `Soft` and
+`AuxiliaryResampling`: these divide the children's weights by their sum, which is a bias of the
+order of 1 / N. For a comparison see Douc, Cappe and Moulines (2005), and Chopin and
+Papaspiliopoulos (2020, chapter 9).
 """
 
 import math

@@ -82,9 +82,9 @@ class EnsembleTransform(SampledTransport):
     """The ensemble transform: each child is the mean of its row of the plan (Reich 2013).
 
     With the entropic plan it is differentiable: the optimal-transport resampling of Corenflos et
-    al. (2021), the choice `filter/resample=optimal_transport`. The weighted mean is exact
-    (on poses, that of the space). The covariance shrinks with epsilon, so the filter lags behind a
-    moving target.
+    al. (2021), the choice `filter/resample=optimal_transport`. The weighted mean of pixels and of
+    positions is exact, and that of rotations nearly so, since a chordal mean of chordal means is
+    not that of all. The covariance shrinks with epsilon, so the filter lags behind a moving target.
     """
 
     def __call__(

@@ -30,6 +30,7 @@ from posefilter.geometry.pose_kernels import (
     whiten_kernels,
 )
 from posefilter.geometry.pose_twists import TwistParts, pair_twists, split_poses
+from posefilter.geometry.symmetries import gather_copies
 
 BACKGROUND = 0.01  # of the mass
 _SHARES = (0.1, 0.3, 1.0)  # of the poses that are neighbors
@@ -51,6 +52,7 @@ class PoseDensity(NamedTuple):
     log_weights: Tensor  # (N,), normalized
     whiten: Tensor  # (N, 6, 6) maps a twist of a kernel to a standard normal vector
     log_scale: Tensor  # (N,) log of the kernels' normalization
+    twin: Tensor  # (N,) int64, equal where poses are copies of one another
     symmetries: Tensor  # (S, 4, 4) object_from_object
     center: Tensor  # (3,) of the object, in its frame [m]
     mean: Tensor  # (3,) position of the background [m]
@@ -90,10 +92,11 @@ def fit_density(
     group = group.to(poses)
     chosen, log_weights = _thin(log_weights, max_kernels)
     poses = poses[chosen]
-    canonical = _gather_copies(poses, log_weights, center, radius, group)
+    twin = poses.flatten(1).unique(dim=0, return_inverse=True)[1]
+    canonical = gather_copies(poses, poses[log_weights.argmax()], center, radius, group)
     parts = split_poses(canonical, center)
     mean = (log_weights.exp()[:, None] * parts.center).sum(0)
-    fixed = (group, center, mean, diameter)
+    fixed = (twin, group, center, mean, diameter)
     unit = poses.new_tensor([1.0] * 3 + [radius] * 3)
     count = len(poses)
     judged = log_weights.topk(min(count, _JUDGED)).indices
@@ -137,7 +140,8 @@ def log_density_held_out(density: PoseDensity) -> Tensor:
     """Return the log density at the kernels' own poses, each without its own kernel.
 
     A kernel is highest at its own pose, so that with it a pose of the fit would seem likelier than
-    a new one of the same distribution.
+    a new one of the same distribution.  The kernels of its copies are left out, too, which
+    resampling makes: they tell no more of the distribution.
 
     -> (N,) float64.
     """
@@ -164,7 +168,7 @@ def _mix(density: PoseDensity, log_kernel: Tensor, center: Tensor, own: Tensor |
         density: The kernels.
         log_kernel: (N, M) log densities of the kernels there.
         center: (M, S, 3) positions there, of each copy that symmetries make.
-        own: (M,) the kernel of each pose, which is left out; None: none is.
+        own: (M,) the kernel of each pose, which is left out with its copies; None: none is.
 
     Returns:
         (M,).
@@ -172,8 +176,10 @@ def _mix(density: PoseDensity, log_kernel: Tensor, center: Tensor, own: Tensor |
     joint = density.log_weights[:, None] + log_kernel
     if own is None:
         return _with_background(density, joint.logsumexp(0), center - density.mean)
-    joint[own, torch.arange(len(own), device=own.device)] = -torch.inf
-    others = (-density.log_weights[own].exp()).log1p().clamp_min(_LOG_NONE)
+    joint = joint.masked_fill(density.twin[:, None] == density.twin[own], -torch.inf)
+    weights = density.log_weights.exp()
+    mass = torch.zeros_like(weights).index_add(0, density.twin, weights)[density.twin[own]]
+    others = (-mass.clamp_max(1)).log1p().clamp_min(_LOG_NONE)
     return _with_background(density, joint.logsumexp(0) - others, center - density.mean)
 
 
@@ -217,19 +223,3 @@ def _thin(log_weights: Tensor, max_kernels: int) -> tuple[Tensor, Tensor]:
     stands_for = (log_weights[rest].logsumexp(0) - log_weights[few].logsumexp(0)).nan_to_num(0.0)
     shares = torch.cat([log_weights[heavy], log_weights[few] + stands_for])
     return torch.cat([heavy, few]), shares.log_softmax(0)
-
-
-def _gather_copies(
-    poses: Tensor, log_weights: Tensor, center: Tensor, radius: float, group: Tensor
-) -> Tensor:
-    """Return of each pose the copy that lies nearest to the heaviest pose.  (N, 4, 4) -> same."""
-    if len(group) == 1:
-        return poses
-    copies = poses[:, None] @ group
-    twist = pair_twists(
-        split_poses(poses[log_weights.argmax()][None], center),
-        split_poses(copies.flatten(0, 1), center),
-    )[0]
-    unit = twist.new_tensor([1.0] * 3 + [radius] * 3)
-    nearest = (twist * unit).square().sum(-1).view(len(poses), -1).argmin(1)
-    return copies[torch.arange(len(poses), device=poses.device), nearest]

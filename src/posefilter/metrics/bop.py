@@ -4,7 +4,6 @@ Challenge 2020 on 6D Object Localization").
 The third error of the challenge is in `vsd.py`, their average recall in `bop_recall.py`.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,8 +12,8 @@ from torch import Tensor
 from torchmetrics.utilities.data import dim_zero_cat
 
 from posefilter.geometry.camera import project
-from posefilter.geometry.pose import rotation_of, transform, translation_of
-from posefilter.geometry.rotation import exp_so3, log_so3
+from posefilter.geometry.pose import transform
+from posefilter.geometry.symmetries import densify
 from posefilter.metrics.collect import Rows
 from posefilter.types import ObjectModel
 
@@ -22,9 +21,6 @@ from posefilter.types import ObjectModel
 MSSD_THRESHOLDS = tuple(0.05 * i for i in range(1, 11))
 MSPD_THRESHOLDS = tuple(5.0 * i for i in range(1, 11))
 REFERENCE_WIDTH = 640
-# [rad] a group whose least turn is smaller stands for a continuous symmetry
-_CONTINUOUS = math.radians(15.0)
-_STEP = math.radians(1.2)  # the challenge cuts a continuous symmetry into 315 turns
 
 
 def mssd(poses: Tensor, truth: Tensor, symmetries: Tensor, points: Tensor) -> Tensor:
@@ -82,37 +78,6 @@ def _least_of_greatest(
         same = view(transform(true @ symmetries, points), row)
         out[row] = (same - guess).norm(dim=-1).amax(-1).amin(0)
     return out.view(lead)
-
-
-def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
-    """Fill in the turns between those that stand for a continuous symmetry.
-
-    An object knows a continuous symmetry by few turns, which would count a pose between two of
-    them as an error.
-
-    Args:
-        symmetries: (S, 4, 4) object_from_object.
-        step: The largest angle between neighbors [rad].
-
-    Returns:
-        (S', 4, 4); as given where no turn is smaller than 15 degrees.
-    """
-    turns = log_so3(rotation_of(symmetries))
-    angles = turns.norm(dim=-1)
-    least = angles.masked_fill(angles < 1e-4, torch.inf).argmin()
-    if not 1e-4 < float(angles[least]) < _CONTINUOUS:
-        return symmetries
-    count = math.ceil(float(angles[least]) / step)
-    # the axis is where the turn leaves points as they are: (I - R) c = t, least squares
-    R, t = rotation_of(symmetries[least]), translation_of(symmetries[least])
-    point = torch.linalg.pinv(torch.eye(3).to(R) - R, rtol=1e-4) @ t
-    parts = []
-    for k in range(count):
-        part = torch.eye(4).to(symmetries)
-        part[:3, :3] = exp_so3(turns[least] * (k / count))
-        part[:3, 3] = point - part[:3, :3] @ point
-        parts.append(symmetries @ part)
-    return torch.cat(parts)
 
 
 def average_recall(errors: Tensor, thresholds: Sequence[float], unit: Tensor) -> float:

@@ -63,7 +63,9 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
 
 def _make_detection(result: Result, header: Any) -> Any:
     belief, object_model = result.belief, result.object_model
-    covariance = to_ros_covariance(belief.covariance, belief.mean, belief.center)
+    # a consumer takes it for that of the pose beside it
+    own = belief.covariance_about(result.pose)
+    covariance = to_ros_covariance(own, result.pose, belief.center)
     middle = result.pose.copy()
     points = object_model.points.detach().cpu().double().numpy()
     low, high = points.min(0), points.max(0)

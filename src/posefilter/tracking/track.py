@@ -11,6 +11,8 @@ from torch import Tensor
 
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Assessment
+from posefilter.confidence.tolerance import PoseTolerance
+from posefilter.confidence.verdicts import Costs
 from posefilter.data.resize import network_size
 from posefilter.filters.icp import PointToPlaneIcp
 from posefilter.filters.loop import ParticleFilter, inherit, make_particles
@@ -113,6 +115,8 @@ class Track:
             sooner: objects that are tracked together take turns.
         multi_object: Whether other objects are tracked, too: while it is lost, only every
             `probe_every`-th frame is then probed for it.
+        costs: What errors cost, which the results' verdicts go by; None: the default.
+        pose_tolerance: What a right pose is, likewise; None: an ADD below 0.1 diameters.
 
     Raises:
         UserError: The method cannot be tracked with.
@@ -126,12 +130,15 @@ class Track:
         seed: int = 0,
         phase: int = 0,
         multi_object: bool = False,
+        costs: Costs | None = None,
+        pose_tolerance: PoseTolerance | None = None,
     ) -> None:
         check_method(method)
         assert isinstance(method.space, PoseSpace)
         self.method, self.space = method, method.space
         self.size, self.settings, self.seed, self.phase = size, settings, seed, phase
         self.multi_object = multi_object
+        self.costs, self.pose_tolerance = costs, pose_tolerance
         self.reset()
 
     def reset(self) -> None:
@@ -178,7 +185,8 @@ class Track:
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
         self.frames += 1
-        result = make_result(self._describe(sight, frame.blank), 0)
+        run = self._describe(sight, frame.blank)
+        result = make_result(run, 0, self.costs, self.pose_tolerance)
         # the guarantee of conformal sets is of the filter that was calibrated, no track's
         content = {**vars(result), "seconds": time.perf_counter() - start, "conformal": None}
         return TrackResult(**content, status=status, objectness=sight.objectness)

@@ -32,6 +32,7 @@ class Tracker:
 
     Args:
         estimator: What `posefilter.load` returns, for one object or several; or a list of these.
+            Verdicts go by its costs and its pose tolerance.
         settings: Of the tracker; None: the defaults.
         seed: Decides every random draw: the same frames and seed give the same answers.
         threads: Cores to track on. Several objects are then tracked side by side, by this process
@@ -57,8 +58,8 @@ class Tracker:
             isinstance(one, Estimator) for one in estimators
         ):
             raise UserError("a tracker needs what posefilter.load returns, or a list of such")
-        methods = [method for one in estimators for method in one.methods]
-        if not methods:
+        pairs = [(one, method) for one in estimators for method in one.methods]
+        if not pairs:
             raise UserError("a tracker needs an estimator of one object at least")
         seed = check_seed(seed)
         if not isinstance(settings, TrackerSettings | None):
@@ -71,9 +72,11 @@ class Tracker:
                 self.settings,
                 seed,
                 phase,
-                multi_object=len(methods) > 1,
+                multi_object=len(pairs) > 1,
+                costs=one.costs,
+                pose_tolerance=one.pose_tolerance,
             )
-            for phase, method in enumerate(methods)
+            for phase, (one, method) in enumerate(pairs)
         )
         self._others = _open_processes(self.tracks, threads)
         self._size: tuple[int, ...] | None = None

@@ -1,0 +1,71 @@
+"""Equivalent poses: what the symmetries of an object make of a pose."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from posefilter.geometry.pose import rotation_of, translation_of
+from posefilter.geometry.pose_twists import pair_twists, split_poses
+from posefilter.geometry.rotation import exp_so3, log_so3
+
+# [rad] a group whose least turn is smaller stands for a continuous symmetry
+_CONTINUOUS = math.radians(15.0)
+_STEP = math.radians(1.2)  # the challenge cuts a continuous symmetry into 315 turns
+
+
+def densify(symmetries: Tensor, step: float = _STEP) -> Tensor:
+    """Fill in the turns between those that stand for a continuous symmetry.
+
+    An object knows a continuous symmetry by few turns, which would count a pose between two of
+    them as an error.
+
+    Args:
+        symmetries: (S, 4, 4) object_from_object.
+        step: The largest angle between neighbors [rad].
+
+    Returns:
+        (S', 4, 4); as given where no turn is smaller than 15 degrees.
+    """
+    turns = log_so3(rotation_of(symmetries))
+    angles = turns.norm(dim=-1)
+    least = angles.masked_fill(angles < 1e-4, torch.inf).argmin()
+    if not 1e-4 < float(angles[least]) < _CONTINUOUS:
+        return symmetries
+    count = math.ceil(float(angles[least]) / step)
+    # the axis is where the turn leaves points as they are: (I - R) c = t, least squares
+    R, t = rotation_of(symmetries[least]), translation_of(symmetries[least])
+    point = torch.linalg.pinv(torch.eye(3).to(R) - R, rtol=1e-4) @ t
+    parts = []
+    for k in range(count):
+        part = torch.eye(4).to(symmetries)
+        part[:3, :3] = exp_so3(turns[least] * (k / count))
+        part[:3, 3] = point - part[:3, :3] @ point
+        parts.append(symmetries @ part)
+    return torch.cat(parts)
+
+
+def gather_copies(
+    poses: Tensor, about: Tensor, center: Tensor, radius: float, group: Tensor
+) -> Tensor:
+    """Return of each pose the equivalent one that lies nearest to a pose.
+
+    Args:
+        poses: (N, 4, 4) camera_from_object [m].
+        about: (4, 4) likewise.
+        center: (3,) the object's center in its frame [m].
+        radius: Distance at which a turn counts as the shift that it causes [m].
+        group: (S, 4, 4) object_from_object, the identity first.
+
+    Returns:
+        (N, 4, 4) [m].
+    """
+    if len(group) == 1:
+        return poses
+    copies = poses[:, None] @ group
+    twist = pair_twists(
+        split_poses(about[None], center), split_poses(copies.flatten(0, 1), center)
+    )[0]
+    unit = twist.new_tensor([1.0] * 3 + [radius] * 3)
+    nearest = (twist * unit).square().sum(-1).view(len(poses), -1).argmin(1)
+    return copies[torch.arange(len(poses), device=poses.device), nearest]
