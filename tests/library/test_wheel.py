@@ -78,3 +78,10 @@ def test_embree_is_needed_where_it_has_a_package(system: str, machine: str, need
     (own,) = [one for one in project["dependencies"] if one.startswith("embreex")]
     marker = requirements.Requirement(own).marker
     assert marker.evaluate({"sys_platform": system, "platform_machine": machine}) == needed
+
+
+def test_the_container_has_the_torch_that_the_wheel_takes() -> None:
+    """Another one would be replaced by that of PyPI, with CUDA."""
+    project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+    (torch,) = [one for one in project["dependencies"] if one.startswith("torch>")]
+    assert f"pip install --no-cache-dir '{torch}' --index-url" in (HOME / "Dockerfile").read_text()
