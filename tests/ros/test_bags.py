@@ -418,3 +418,29 @@ def test_a_bag_can_be_played_by_humble(tmp_path: Path) -> None:
     metadata = (tmp_path / "out" / "metadata.yaml").read_text()
     assert "version: 8\n" in metadata
     assert "offered_qos_profiles: ''" in metadata
+
+
+def test_a_topic_of_several_connections_is_copied(tmp_path: Path) -> None:
+    """As of a merged bag, or a recorder that keeps one for each publisher."""
+    message = open_types().serialize_cdr(make_image(np.zeros((2, 2, 3), np.uint8), "rgb8"), IMAGE)
+    with Writer(tmp_path / "in", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        first = writer.add_connection("/rgb", IMAGE, typestore=open_types())
+        writer.write(first, 1, message)
+    second = first._replace(id=first.id + 1)
+    with BagWriter(tmp_path / "out", "/found") as out:
+        out.add_connections([first, second])
+        out.copy(iter([(first, 1, message), (second, 2, message)]))
+    assert [one[:2] for one in read_bag(tmp_path / "out")] == [("/rgb", 1), ("/rgb", 2)]
+
+
+def test_a_topic_that_is_there_is_refused_before_the_work(
+    tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_scene(tmp_path / "in")
+    monkeypatch.delattr(posefilter.Estimator, "predict_batch")
+    typed = [
+        *(str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW),
+        *("copy_messages=true", "detections=/rgb"),
+    ]
+    assert run_command("convert_bag", HOME, typed) == 2
+    assert "the bag has this topic already" in capfd.readouterr().err

@@ -39,6 +39,8 @@ def convert_bag(job: Job) -> None:
         find = choose_finder(estimator, cfg.track, cfg.seed)
         images, blank, found = 0, 0, Counter(dict.fromkeys(estimator.objects, 0))
         with BagWriter(out, str(cfg.detections)) as writer:
+            if cfg.copy_messages:
+                writer.add_connections(reader.reader.connections)  # first: it may be refused
             for frame in reader.frames():
                 try:
                     message = make_detections(find(frame), frame.header)
@@ -56,7 +58,7 @@ def convert_bag(job: Job) -> None:
                     f"after a first camera_info"
                 )
             if cfg.copy_messages:
-                writer.copy(reader.reader.connections, reader.messages())
+                writer.copy(reader.messages())
     if reader.distorted:
         say(
             cfg.console,

@@ -230,23 +230,33 @@ class BagWriter:
         """Write a Detection3DArray at a time [ns]."""
         self.writer.write(self.detections, time, open_types().serialize_cdr(message, DETECTIONS))
 
-    def copy(self, connections: Sequence[Any], messages: Iterator[tuple[Any, int, bytes]]) -> None:
-        """Write the messages of another bag, as they are.
+    def add_connections(self, connections: Sequence[Any]) -> None:
+        """Add the topics of another bag, whose messages `copy` is to write.
+
+        A topic may have several connections, as some recorders and merged bags have.
 
         Raises:
-            UserError: It has messages on the topic of the detections.
+            UserError: One is the topic of the detections.
         """
+        added: list[tuple[Any, Any]] = []
         for one in connections:
             if one.topic == self.topic:
                 raise UserError(
                     f"detections={self.topic}: the bag has this topic already; name another"
                 )
-            self.copies[one.id] = self.writer.add_connection(
+            kind = (one.topic, one.msgtype, one.ext)
+            same = next((copy for other, copy in added if other == kind), None)
+            self.copies[one.id] = same or self.writer.add_connection(
                 one.topic,
                 one.msgtype,
                 msgdef=one.msgdef.data,
                 rihs01=one.digest or "RIHS01_",
+                serialization_format=one.ext.serialization_format,
                 offered_qos_profiles=one.ext.offered_qos_profiles,
             )
+            added.append((kind, self.copies[one.id]))
+
+    def copy(self, messages: Iterator[tuple[Any, int, bytes]]) -> None:
+        """Write the messages of another bag, as they are, whose topics were added."""
         for connection, time, raw in messages:
             self.writer.write(self.copies[connection.id], time, raw)
