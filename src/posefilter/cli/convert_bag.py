@@ -14,6 +14,7 @@ from posefilter.cli.machine import settle
 from posefilter.cli.predict import read_costs
 from posefilter.errors import UserError
 from posefilter.estimator import Estimator
+from posefilter.progress import bars
 from posefilter.result import Result
 from posefilter.ros.bags import BagFrame, BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections
@@ -38,7 +39,9 @@ def convert_bag(job: Job) -> None:
         estimator = Estimator(methods, costs=read_costs(cfg))
         find = choose_finder(estimator, cfg.track, cfg.seed)
         images, blank, found = 0, 0, Counter(dict.fromkeys(estimator.objects, 0))
-        with BagWriter(out, str(cfg.detections)) as writer:
+        watch = bars(shown=cfg.console != JSON, transient=True)
+        with BagWriter(out, str(cfg.detections)) as writer, watch as bar:
+            task = bar.add_task("images", total=reader.images)
             if cfg.copy_messages:
                 writer.add_connections(reader.reader.connections)  # first: it may be refused
             for frame in reader.frames():
@@ -51,6 +54,7 @@ def convert_bag(job: Job) -> None:
                 writer.write(message, frame.time)
                 found.update(one.id for one in message.detections)
                 images += 1
+                bar.update(task, completed=images + reader.unpaired + reader.early)
             if not images:
                 raise UserError(
                     f"bag={cfg.bag}: no color image has depth within "

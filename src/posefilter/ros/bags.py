@@ -98,6 +98,13 @@ class BagReader:
             if kinds[topic] not in fits:
                 raise UserError(f"{key}={topic}: has type {kinds[topic]}, not {' or '.join(fits)}")
 
+    @property
+    def images(self) -> int:
+        """How many color images the bag has."""
+        return sum(
+            one.msgcount for one in self.reader.connections if one.topic == self.topics.color
+        )
+
     def messages(self) -> Iterator[tuple[Any, int, bytes]]:
         """Yield each message as it is stored: its connection, when it was recorded, its bytes.
 
