@@ -1,5 +1,8 @@
-# docker build -t posefilter . ; docker run --rm -v "$PWD":/work posefilter predict checkpoint=003_cracker_box rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy
-# For a GPU: --build-arg TORCH=https://download.pytorch.org/whl/cu128, and docker run --gpus all.
+# docker build -t posefilter .
+# docker run --rm --user "$(id -u):$(id -g)" -v "$PWD":/work posefilter predict checkpoint=003_cracker_box rgb=a.png depth=a_depth.png intrinsics=fx,fy,cx,cy depth_scale=1000
+# Without --user what is written belongs to root.
+# For a GPU: docker build --build-arg TORCH=https://pypi.org/simple, whose torch has CUDA, and docker run --gpus all.
+# To train there, also --shm-size=2g: the loader's processes hand images on in /dev/shm, for which Docker has 64 MB.
 FROM python:3.11-slim AS wheel
 WORKDIR /source
 COPY pyproject.toml setup.py MANIFEST.in README.md LICENSE ./
@@ -10,7 +13,9 @@ RUN pip wheel . --no-deps --wheel-dir /wheel
 
 FROM python:3.11-slim
 ARG TORCH=https://download.pytorch.org/whl/cpu
+# as in pyproject.toml: a newer one would be replaced by that of PyPI, with gigabytes of CUDA
+RUN pip install --no-cache-dir 'torch>=2.6,<2.14' --index-url "$TORCH"
 COPY --from=wheel /wheel /wheel
-RUN pip install --no-cache-dir torch --index-url "$TORCH" && pip install --no-cache-dir /wheel/*.whl && rm -r /wheel
+RUN pip install --no-cache-dir /wheel/*.whl && rm -r /wheel
 WORKDIR /work
 ENTRYPOINT ["posefilter"]

@@ -385,12 +385,18 @@ def read_arguments():
     if len(sys.argv) != 6:
         sys.exit("usage: poses.py FOLDER RGB DEPTH fx,fy,cx,cy DEPTH_UNITS_A_METER")
     folder, rgb, depth, intrinsics, scale = sys.argv[1:]
-    fx, fy, cx, cy = map(float, intrinsics.split(","))
+    if not (Path(folder) / "filter.json").is_file():
+        sys.exit(f"{folder}: no folder that export.py format=onnx wrote")
+    try:
+        fx, fy, cx, cy = map(float, intrinsics.split(","))
+        units = float(scale)
+    except ValueError:
+        sys.exit(f"{intrinsics} {scale}: expected fx,fy,cx,cy [px] and the units in a meter")
     color, z = cv2.imread(rgb), cv2.imread(depth, cv2.IMREAD_UNCHANGED)
     for name, image in ((rgb, color), (depth, z)):
         if image is None:
             sys.exit(f"{name}: no image that OpenCV reads")
-    color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / float(scale)
+    color, z = cv2.cvtColor(color, cv2.COLOR_BGR2RGB), z / units
     return folder, color, z, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 

@@ -18,6 +18,12 @@ from posefilter.geometry.camera import resize_intrinsics
 from posefilter.limits import MOST_SIDE
 from posefilter.types import Batch
 
+_INSTEAD = {  # of shapes of intrinsics that users have
+    (3, 4): "of a projection matrix P of rectified images give P[:, :3]",
+    (9,): "give it as K.reshape(3, 3)",
+    (12,): "of a projection matrix P of rectified images give P.reshape(3, 4)[:, :3]",
+    (4,): "of fx, fy, cx, cy give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+}
 _BEYOND = 100.0  # [m] no depth camera measures
 _FEWEST = 0.02  # share of the pixels with depth
 _NEAREST, _FARTHEST = 0.05, 30.0  # [m] between which the median depth of an image lies
@@ -228,9 +234,10 @@ def check_intrinsics(K: np.ndarray, count: int, size: tuple[int, int] | None = N
         UserError: They are none.
     """
     if K.shape not in ((3, 3), (count, 3, 3)) or K.dtype.kind not in "fiu":
+        instead = f": {_INSTEAD[K.shape]}" if K.shape in _INSTEAD else ""
         raise UserError(
             f"intrinsics: has shape {K.shape} and type {K.dtype}; "
-            "expected a camera matrix (3, 3) [px]"
+            f"expected a camera matrix (3, 3) [px]{instead}"
         )
     K = np.array(np.broadcast_to(K, (count, 3, 3)), dtype=np.float64)
     if not np.isfinite(K).all():

@@ -2,6 +2,8 @@
 half-pixel canaries.
 """
 
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -258,3 +260,19 @@ def test_both_renderers_agree_on_color_and_index() -> None:
     assert np.median(np.abs(a.albedo - b.albedo)[same]) < 0.01
     assert np.percentile(np.abs(a.normal - b.normal)[same], 99) < 0.01
     assert np.percentile(np.abs(a.depth - b.depth)[same], 99) < TOLERANCE
+
+
+def test_without_embree_rendering_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on ARM, where it has no package."""
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    with pytest.raises(UserError, match="rendering: the package embreex is missing"):
+        EmbreeRenderer().depth([Instance(quad(0.1), np.eye(4))], K, H, W)
+
+
+def test_what_renders_nothing_needs_no_embree() -> None:
+    code = (
+        "import sys; sys.modules['embreex'] = None; "
+        "import posefilter.api, posefilter.cli.convert_bag, posefilter.cli.predict, "
+        "posefilter.cli.track"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

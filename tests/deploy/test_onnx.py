@@ -376,6 +376,26 @@ def test_the_examples_import_neither_torch_nor_us(name: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        (["nothing", "a.png", "b.png", "1,1,1,1", "1"], "nothing: no folder that export.py"),
+        (["{folder}", "a.png", "b.png", "1,1,1", "1"], "1,1,1 1: expected fx,fy,cx,cy"),
+        (["{folder}", "a.png", "b.png", "1,1,1,1", "mm"], "1,1,1,1 mm: expected"),
+        (["{folder}", "a.png", "b.png", "1,1,1,1", "1"], "a.png: no image that OpenCV reads"),
+    ],
+)
+def test_the_examples_mistakes_are_one_line(
+    typed: list[str], told: str, poses: ModuleType, tmp_path: Path, monkeypatch
+) -> None:
+    (tmp_path / "filter.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    given = [one.format(folder=tmp_path) for one in typed]
+    monkeypatch.setattr("sys.argv", ["poses.py", *given])
+    with pytest.raises(SystemExit, match=told):
+        poses.read_arguments()
+
+
+@pytest.mark.parametrize(
     ("before", "width"), [((480, 640), 320), ((481, 643), 200), ((60, 80), 160), ((48, 64), 64)]
 )
 def test_images_are_resized_as_before_prediction(before: tuple[int, int], width: int) -> None:

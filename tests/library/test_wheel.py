@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib.metadata import version
 from pathlib import Path
@@ -65,3 +66,22 @@ def test_the_examples_wheel_has_its_choices(tmp_path: Path) -> None:
     choices = {str(f.relative_to(package)) for f in package.rglob("conf/**/*.yaml")}
     assert len(choices) >= 4
     assert choices <= names
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "needed"),
+    [("linux", "x86_64", True), ("linux", "aarch64", False), ("darwin", "arm64", True)],
+)
+def test_embree_is_needed_where_it_has_a_package(system: str, machine: str, needed: bool) -> None:
+    requirements = pytest.importorskip("packaging.requirements")
+    project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+    (own,) = [one for one in project["dependencies"] if one.startswith("embreex")]
+    marker = requirements.Requirement(own).marker
+    assert marker.evaluate({"sys_platform": system, "platform_machine": machine}) == needed
+
+
+def test_the_container_has_the_torch_that_the_wheel_takes() -> None:
+    """Another one would be replaced by that of PyPI, with CUDA."""
+    project = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+    (torch,) = [one for one in project["dependencies"] if one.startswith("torch>")]
+    assert f"pip install --no-cache-dir '{torch}' --index-url" in (HOME / "Dockerfile").read_text()

@@ -7,7 +7,7 @@ import signal
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from posefilter.cli import run_command
 from posefilter.errors import UserError
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.rotation import log_so3, quat_xyzw_from_matrix, random_rotation
+from posefilter.progress import bars
 from posefilter.ros.bags import BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections, to_ros_covariance
 from posefilter.ros.messages import (
@@ -100,9 +101,12 @@ def write_bag(path: Path, messages: list[tuple[str, str, int, Any]]) -> Path:
     return file
 
 
-def write_scene(path: Path, depth_after: tuple[int, ...] = (5, 3)) -> Path:
+def write_scene(
+    path: Path, depth_after: tuple[int, ...] = (5, 3), depth_share: float = 1.0
+) -> Path:
     """Write a bag of one scene, once every 100 ms; the depth of each comes so many ms later."""
     rgb, depth, K = read_scene()
+    depth = (depth * depth_share).astype(np.uint16)
     messages = [("/info", CAMERA_INFO, 0, make_info(K))]
     for number, after in enumerate(depth_after):
         time = 100 * (number + 1)
@@ -219,6 +223,59 @@ def test_images_are_read_in_every_layout() -> None:
     np.testing.assert_array_equal(decode_intrinsics(make_info(K)), K)
 
 
+def make_png(width: int, height: int) -> bytes:
+    """Return a PNG of one color whose header names another size."""
+    data = bytearray(cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes())
+    data[16:24] = struct.pack(">II", width, height)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    return bytes(data)
+
+
+def make_compressed(form: str, data: bytes) -> Any:
+    fields = {"header": make_header(0), "format": form, "data": np.frombuffer(data, np.uint8)}
+    return make_message(COMPRESSED, **fields)
+
+
+def test_compressed_depth_is_read() -> None:
+    """As compressed_depth_image_transport writes it: a header of 12 bytes, and a PNG."""
+    millimeters = np.uint16([[500, 0, 1250], [65535, 2, 9000]])
+    wanted = np.float32([[0.5, 0, 1.25], [0, 0.002, 9]])
+    png = cv2.imencode(".png", millimeters)[1].tobytes()
+    plain, header = make_image(millimeters, "16UC1"), struct.pack("<iff", 0, 0, 0)
+    for message in (
+        plain,
+        make_compressed("16UC1; compressedDepth png", header + png),
+        make_compressed("16UC1; compressedDepth", header + png),
+        make_compressed("16UC1; png compressed ", png),
+    ):
+        np.testing.assert_allclose(decode_depth(message, "/d"), wanted, rtol=1e-6)
+    a, b = 100 * 101.0, 1 - 100 * 101 / 10  # its defaults: quantization 100, at most 10 m
+    kept = np.where(wanted > 1, a / np.maximum(wanted, 1) + b, 0).round().astype(np.uint16)
+    data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", kept)[1].tobytes()
+    found = decode_depth(make_compressed("32FC1; compressedDepth png", data), "/d")
+    np.testing.assert_allclose(found, np.where(wanted > 1, wanted, 0), rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("form", "data", "told"),
+    [
+        ("16UC1; compressedDepth rvl", bytes(40), "format '16UC1; compressedDepth rvl' is not"),
+        ("jpeg", cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes(), "format 'jpeg'"),
+        ("16UC1; png compressed ", make_png(2, 2), r"uint8 \(2, 2, 3\), not 16 bits"),
+        ("16UC1; compressedDepth png", bytes(12) + make_png(2, 2)[:-20], "the PNG has no end"),
+        ("16UC1; compressedDepth png", b"", "is not known"),
+    ],
+)
+def test_compressed_depth_that_cannot_be_read_is_named(form: str, data: bytes, told: str) -> None:
+    with pytest.raises(UserError, match=f"^depth=/d: .*{told}"):
+        decode_depth(make_compressed(form, data), "/d")
+
+
+def test_a_camera_that_is_not_calibrated_is_named() -> None:
+    with pytest.raises(UserError, match="camera_info=/info: the camera is not calibrated"):
+        decode_intrinsics(make_info(np.zeros((3, 3))), "/info")
+
+
 @pytest.mark.parametrize(
     "broken",
     [
@@ -230,14 +287,6 @@ def test_a_damaged_image_is_named(broken: dict[str, Any]) -> None:
     message = dataclasses.replace(make_image(np.zeros((4, 4, 3), np.uint8), "rgb8"), **broken)
     with pytest.raises(UserError, match="color=/rgb"):
         decode_color(message, "/rgb")
-
-
-def make_png(width: int, height: int) -> bytes:
-    """Return a PNG of one color whose header names another size."""
-    data = bytearray(cv2.imencode(".png", np.zeros((2, 2, 3), np.uint8))[1].tobytes())
-    data[16:24] = struct.pack(">II", width, height)
-    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
-    return bytes(data)
 
 
 @pytest.mark.parametrize(
@@ -307,6 +356,7 @@ def test_each_image_has_the_depth_nearest_in_time(tmp_path: Path) -> None:
 
 def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
     bag = write_scene(tmp_path / "in", (50,))
+    near = write_scene(tmp_path / "near", (5,), depth_share=0.01)
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(bag.read_bytes()[: bag.stat().st_size // 2])
     (tmp_path / "there.mcap").write_text("mine")
@@ -318,6 +368,8 @@ def test_mistakes_are_one_line(tmp_path: Path, capfd) -> None:
         ([str(tmp_path / "no.mcap")], [], "no such file"),
         ([str(bag), str(tmp_path / "there.mcap")], [], "already exists"),
         ([str(bag)], ["track=maybe"], "choose true or false"),
+        ([str(bag)], ["detections=my topic"], "is no name of a topic"),
+        ([str(near)], [], "image of 0.100 s: depth: the median would be 0.01"),
     ]
     for places, settings, said in cases:
         places = places if len(places) == 2 else [*places, str(tmp_path / "new.mcap")]
@@ -352,3 +404,65 @@ def test_a_camera_of_another_image_is_named_and_early_images_are_counted(tmp_pat
         pytest.raises(UserError, match=rf"/info: is of images of {2 * width}x{2 * height} pixels"),
     ):
         list(reader.frames())
+
+
+def test_an_image_without_depth_has_no_object(tmp_path: Path, capfd) -> None:
+    """A camera that starts sends some: they end no conversion."""
+    bag, out = write_scene(tmp_path / "in", depth_share=0), tmp_path / "found.mcap"
+    typed = [str(bag), str(out), f"checkpoint={NAME}", *TYPED, *FEW]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert "warning: in 2 of 2 images no pixel has depth" in capfd.readouterr().out
+    found = [open_types().deserialize_cdr(raw, DETECTIONS) for _, _, raw in read_bag(out)]
+    assert [len(one.detections) for one in found] == [0, 0]
+
+
+def test_a_bag_can_be_played_by_humble(tmp_path: Path) -> None:
+    """From version 9 on quality of service is a list in the metadata, which Humble cannot read."""
+    with BagWriter(tmp_path / "out", "/found") as writer:
+        writer.write(make_detections([], make_header(5)), 5)
+    metadata = (tmp_path / "out" / "metadata.yaml").read_text()
+    assert "version: 8\n" in metadata
+    assert "offered_qos_profiles: ''" in metadata
+
+
+def test_a_topic_of_several_connections_is_copied(tmp_path: Path) -> None:
+    """As of a merged bag, or a recorder that keeps one for each publisher."""
+    message = open_types().serialize_cdr(make_image(np.zeros((2, 2, 3), np.uint8), "rgb8"), IMAGE)
+    with Writer(tmp_path / "in", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        first = writer.add_connection("/rgb", IMAGE, typestore=open_types())
+        writer.write(first, 1, message)
+    second = first._replace(id=first.id + 1)
+    with BagWriter(tmp_path / "out", "/found") as out:
+        out.add_connections([first, second])
+        out.copy(iter([(first, 1, message), (second, 2, message)]))
+    assert [one[:2] for one in read_bag(tmp_path / "out")] == [("/rgb", 1), ("/rgb", 2)]
+
+
+def test_a_topic_that_is_there_is_refused_before_the_work(
+    tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = write_scene(tmp_path / "in")
+    monkeypatch.delattr(posefilter.Estimator, "predict_batch")
+    typed = [
+        *(str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW),
+        *("copy_messages=true", "detections=/rgb"),
+    ]
+    assert run_command("convert_bag", HOME, typed) == 2
+    assert "the bag has this topic already" in capfd.readouterr().err
+
+
+def test_progress_counts_every_color_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those without depth, so that the bar comes to its end."""
+    seen: list[Any] = []
+
+    @contextmanager
+    def watch(**_: Any) -> Iterator[Any]:
+        with bars(shown=False) as bar:
+            yield bar
+            seen.extend(bar.tasks)
+
+    monkeypatch.setattr("posefilter.cli.convert_bag.bars", watch)
+    bag = write_scene(tmp_path / "in", (5, 3))
+    typed = [str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW]
+    assert run_command("convert_bag", HOME, typed) == 0
+    assert [(one.completed, one.total) for one in seen] == [(2, 2)]

@@ -31,6 +31,7 @@ from posefilter.figures.track_recording import Seen, TrackRecorder
 from posefilter.figures.video import VideoWriter
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import write_poses_csv
+from posefilter.progress import bars
 from posefilter.tracking.motion import ConstantVelocity
 from posefilter.tracking.records import (
     compute_figures,
@@ -140,7 +141,9 @@ def follow(
         say(cfg.console, "warning", sentence, video=video.name, object=name)
     numbers = number_objects(estimator.objects) | video.ids
     doubted: set[str] = set()  # objects whose size was said to be wrong, and why frames are blank
-    with closing(tracker), writer, recorder:
+    watch = bars(shown=cfg.console != JSON, transient=True)
+    with closing(tracker), writer, recorder, watch as bar:
+        task = bar.add_task(video.name, total=len(video))
         for frame in read_frames(video, tracker, cfg):
             results = tracker.update_all(frame.rgb, frame.depth, frame.intrinsics)
             writer.add(draw_frame(frame, results, shapes))
@@ -157,6 +160,7 @@ def follow(
                     say(cfg.console, "warning", said, **told, warnings=list(result.warnings))
                 rows.append(make_row(video.name, frame.name, ids, result, truth))
             log.add(rows)
+            bar.advance(task)
 
 
 def read_frames(video: Video, tracker: Tracker, cfg: DictConfig) -> Iterator[VideoFrame]:

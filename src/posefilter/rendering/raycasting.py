@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from embreex import rtcore_scene
-from embreex.mesh_construction import TriangleMesh
 
+from posefilter.errors import UserError
 from posefilter.meshes.mesh import Mesh, hull_vertices
 from posefilter.rendering.surfaces import NEAR, Instance, Lights, Surfaces, covered_pixels, unit
 
@@ -44,6 +43,21 @@ class Hits(NamedTuple):
         return Hits(*(x[mask] for x in self))
 
 
+def _build_scene(corners: np.ndarray) -> Any:
+    """Return an Embree scene of triangles (F, 3, 3) float32."""
+    try:  # here: what renders nothing, such as prediction, runs without it
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+    except ImportError as error:
+        raise UserError(
+            "rendering: the package embreex is missing; on Linux there is one for x86-64 alone "
+            "(predict, track and convert_bag need none, but for meshes=)"
+        ) from error
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, corners)
+    return scene
+
+
 @dataclass(eq=False)
 class RayCaster:
     """Meshes built for Embree; must not be shared between processes.
@@ -56,12 +70,15 @@ class RayCaster:
     _meshes: dict[int, CastMesh] = field(default_factory=dict)
 
     def prepare(self, mesh: Mesh) -> CastMesh:
-        """Return a mesh with its Embree scene, built on first use."""
+        """Return a mesh with its Embree scene, built on first use.
+
+        Raises:
+            UserError: Embree is missing.
+        """
         key = id(mesh)
         if key not in self._meshes:
             corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
-            scene = rtcore_scene.EmbreeScene()
-            TriangleMesh(scene, corners)
+            scene = _build_scene(corners)
             uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
             colors = None if mesh.corner_colors is None else mesh.corner_colors.astype(np.float32)
             hull = hull_vertices(mesh.vertices[np.unique(mesh.faces)])

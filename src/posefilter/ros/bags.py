@@ -1,5 +1,6 @@
 """Frames out of a ROS 2 bag, and detections into another."""
 
+import re
 import shutil
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,7 @@ from posefilter.ros.messages import (
     stamp_of,
 )
 
+_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")  # of a topic, with its namespace
 _WAITING = 30  # messages of a topic that wait for one of another
 
 
@@ -86,7 +88,7 @@ class BagReader:
 
     def _check_topics(self) -> None:
         kinds = {one.topic: one.msgtype for one in self.reader.connections}
-        allowed = ((IMAGE, COMPRESSED), (IMAGE,), (CAMERA_INFO,))
+        allowed = ((IMAGE, COMPRESSED), (IMAGE, COMPRESSED), (CAMERA_INFO,))
         for key, topic, fits in zip(Topics._fields, self.topics, allowed, strict=True):
             if topic not in kinds:
                 some = ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items())[:12])
@@ -95,6 +97,13 @@ class BagReader:
                 )
             if kinds[topic] not in fits:
                 raise UserError(f"{key}={topic}: has type {kinds[topic]}, not {' or '.join(fits)}")
+
+    @property
+    def images(self) -> int:
+        """How many color images the bag has."""
+        return sum(
+            one.msgcount for one in self.reader.connections if one.topic == self.topics.color
+        )
 
     def messages(self) -> Iterator[tuple[Any, int, bytes]]:
         """Yield each message as it is stored: its connection, when it was recorded, its bytes.
@@ -173,7 +182,8 @@ class BagReader:
                 f"pixels, but those of {self.topics.color} have {rgb.shape[1]}x{rgb.shape[0]}; "
                 "name the camera's own topic"
             )
-        return BagFrame(rgb, z, decode_intrinsics(camera), color[2].header, color[1])
+        K = decode_intrinsics(camera, self.topics.camera_info)
+        return BagFrame(rgb, z, K, color[2].header, color[1])
 
 
 class BagWriter:
@@ -184,7 +194,8 @@ class BagWriter:
         topic: Where detections go.
 
     Raises:
-        UserError: The path already exists, or another process is about to write it.
+        UserError: The path already exists, or another process is about to write it, or the topic's
+            name is none.
     """
 
     def __init__(self, path: Path, topic: str) -> None:
@@ -192,12 +203,15 @@ class BagWriter:
 
         if path.exists():
             raise UserError(f"out={path}: already exists; choose another")
+        if not _NAME.fullmatch(topic):
+            raise UserError(f"detections={topic}: is no name of a topic, such as /detections")
         self.path, self.topic = path, topic
         self.parts = path.with_name(f".{path.name}.part")
         hold(self.parts)
         name = path.stem if path.suffix == ".mcap" else path.name
         shutil.rmtree(self.parts / name, ignore_errors=True)  # of a process that was killed
-        self.writer = Writer(self.parts / name, version=9, storage_plugin=StoragePlugin.MCAP)
+        # version 9, of Jazzy, has metadata that Humble cannot read; all read 8
+        self.writer = Writer(self.parts / name, version=8, storage_plugin=StoragePlugin.MCAP)
         self.copies: dict[int, Any] = {}
 
     def __enter__(self) -> "BagWriter":
@@ -223,23 +237,33 @@ class BagWriter:
         """Write a Detection3DArray at a time [ns]."""
         self.writer.write(self.detections, time, open_types().serialize_cdr(message, DETECTIONS))
 
-    def copy(self, connections: Sequence[Any], messages: Iterator[tuple[Any, int, bytes]]) -> None:
-        """Write the messages of another bag, as they are.
+    def add_connections(self, connections: Sequence[Any]) -> None:
+        """Add the topics of another bag, whose messages `copy` is to write.
+
+        A topic may have several connections, as some recorders and merged bags have.
 
         Raises:
-            UserError: It has messages on the topic of the detections.
+            UserError: One is the topic of the detections.
         """
+        added: list[tuple[Any, Any]] = []
         for one in connections:
             if one.topic == self.topic:
                 raise UserError(
                     f"detections={self.topic}: the bag has this topic already; name another"
                 )
-            self.copies[one.id] = self.writer.add_connection(
+            kind = (one.topic, one.msgtype, one.ext)
+            same = next((copy for other, copy in added if other == kind), None)
+            self.copies[one.id] = same or self.writer.add_connection(
                 one.topic,
                 one.msgtype,
                 msgdef=one.msgdef.data,
                 rihs01=one.digest or "RIHS01_",
+                serialization_format=one.ext.serialization_format,
                 offered_qos_profiles=one.ext.offered_qos_profiles,
             )
+            added.append((kind, self.copies[one.id]))
+
+    def copy(self, messages: Iterator[tuple[Any, int, bytes]]) -> None:
+        """Write the messages of another bag, as they are, whose topics were added."""
         for connection, time, raw in messages:
             self.writer.write(self.copies[connection.id], time, raw)

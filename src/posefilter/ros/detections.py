@@ -46,6 +46,19 @@ def make_quaternion(pose: np.ndarray) -> list[float]:
     return [float(value) for value in quat_xyzw_from_matrix(R)]
 
 
+def measure_box(result: Result) -> tuple[np.ndarray, list[float]]:
+    """Return the box of an object's surface points along the axes of its own frame.
+
+    Returns:
+        Its pose (4, 4) in the camera's frame, at the box's center, and its size along x, y, z [m].
+    """
+    points = result.object_model.points.detach().cpu().double().numpy()
+    low, high = points.min(0), points.max(0)
+    center = result.pose.copy()
+    center[:3, 3] += result.pose[:3, :3] @ ((low + high) / 2)
+    return center, (high - low).tolist()
+
+
 def make_detections(results: Sequence[Result], header: Any) -> Any:
     """Return a Detection3DArray with a detection for each object but those that are absent, or
     whose track is lost.
@@ -62,15 +75,11 @@ def make_detections(results: Sequence[Result], header: Any) -> Any:
 
 
 def _make_detection(result: Result, header: Any) -> Any:
-    belief, object_model = result.belief, result.object_model
+    belief = result.belief
     # a consumer takes it for that of the pose beside it
     own = belief.covariance_about(result.pose)
     covariance = to_ros_covariance(own, result.pose, belief.center)
-    middle = result.pose.copy()
-    points = object_model.points.detach().cpu().double().numpy()
-    low, high = points.min(0), points.max(0)
-    middle[:3, 3] += result.pose[:3, :3] @ ((low + high) / 2)
-    size = dict(zip("xyz", (high - low).tolist(), strict=True))
+    center, (x, y, z) = measure_box(result)
     score = math.nan if result.probability is None else result.probability
     hypothesis = make_message(
         "vision_msgs/msg/ObjectHypothesis", class_id=result.object, score=score
@@ -82,8 +91,8 @@ def _make_detection(result: Result, header: Any) -> Any:
     )
     box = make_message(
         "vision_msgs/msg/BoundingBox3D",
-        center=_make_pose(middle),
-        size=make_message("geometry_msgs/msg/Vector3", **size),
+        center=_make_pose(center),
+        size=make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
     )
     whole = make_message(
         "vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose

@@ -3,6 +3,7 @@
 A bag's own definitions of its messages are not used: code would be made of them.
 """
 
+import struct
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,8 @@ _TO_RGB = {
     "bgra8": cv2.COLOR_BGRA2RGB,
     "mono8": cv2.COLOR_GRAY2RGB,
 }
+_SATURATED = 65535  # what cameras write into 16 bits beyond their range
+_PNG = b"\x89PNG\r\n\x1a\n"
 _DEPTHS: dict[str, tuple[str, float]] = {
     "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3), "32FC1": ("f4", 1.0)
 }  # fmt: skip
@@ -80,22 +83,55 @@ def decode_color(message: Any, topic: str) -> np.ndarray:
 
 
 def decode_depth(message: Any, topic: str) -> np.ndarray:
-    """Return the depth of an Image.  -> (H, W) float32 [m], 0 where unknown.
+    """Return the depth of an Image or a CompressedImage.  -> (H, W) float32 [m], 0 where unknown.
 
     Raises:
         UserError: It is damaged, or of an encoding that is not known.
     """
-    encoding = str(getattr(message, "encoding", "compressed"))
-    if encoding not in _DEPTHS:
-        raise UserError(
-            f"depth={topic}: encoding {encoding} is not known; there are 16UC1 (millimeters) and "
-            f"32FC1 (meters)"
-        )
-    kind, scale = _DEPTHS[encoding]
-    order = ">" if message.is_bigendian else "<"
-    rows = _read_rows(message, topic, "depth", np.dtype(order + kind), 1)[..., 0]
-    depth = rows.astype(np.float32) * np.float32(scale)
+    if hasattr(message, "format"):
+        depth = _decode_compressed_depth(message, topic)
+    else:
+        encoding = str(message.encoding)
+        if encoding not in _DEPTHS:
+            raise UserError(
+                f"depth={topic}: encoding {encoding} is not known; there are 16UC1 (millimeters) "
+                f"and 32FC1 (meters)"
+            )
+        kind, scale = _DEPTHS[encoding]
+        order = ">" if message.is_bigendian else "<"
+        rows = _read_rows(message, topic, "depth", np.dtype(order + kind), 1)[..., 0]
+        depth = _drop_saturated(rows).astype(np.float32) * np.float32(scale)
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
+
+
+def _drop_saturated(rows: np.ndarray) -> np.ndarray:
+    return rows if rows.dtype.kind == "f" else np.where(rows == _SATURATED, 0, rows)
+
+
+def _decode_compressed_depth(message: Any, topic: str) -> np.ndarray:
+    """Return depth (H, W) [m] of the transports `compressedDepth` and `compressed`, both as PNG.
+
+    `compressedDepth` puts 12 bytes before the PNG: a number of the format, and a and b by which it
+    keeps depth in meters as whole numbers, a / depth + b.
+    """
+    encoding, data = str(message.format).split(";")[0].strip(), bytes(message.data)
+    start = 0 if data.startswith(_PNG) else 12
+    if encoding not in _DEPTHS or data[start : start + len(_PNG)] != _PNG:
+        raise UserError(
+            f"depth={topic}: format '{message.format}' is not known; there are 16UC1 "
+            f"(millimeters) and 32FC1 (meters) as PNG, of compressedDepth"
+        )
+    picture = decode_image(data[start:], Path(f"depth={topic}"))
+    if picture.ndim != 2 or picture.dtype != np.uint16 or (encoding == "32FC1" and not start):
+        raise UserError(
+            f"depth={topic}: holds {picture.dtype} {picture.shape}, not 16 bits of one channel"
+        )
+    kept = _drop_saturated(picture).astype(np.float32)
+    if encoding != "32FC1":
+        return kept * np.float32(_DEPTHS[encoding][1])
+    _, a, b = struct.unpack_from("<iff", data)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(kept > 0, np.float32(a) / (kept - np.float32(b)), 0)
 
 
 def _read_rows(message: Any, topic: str, key: str, kind: np.dtype, channels: int) -> np.ndarray:
@@ -113,12 +149,18 @@ def _read_rows(message: Any, topic: str, key: str, kind: np.dtype, channels: int
     return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)
 
 
-def decode_intrinsics(message: Any) -> np.ndarray:
+def decode_intrinsics(message: Any, topic: str = "camera_info") -> np.ndarray:
     """Return the camera matrix (3, 3) [px] of a CameraInfo: of the rectified image where it has
     one.
+
+    Raises:
+        UserError: The camera is not calibrated.
     """
     P = np.asarray(message.p, dtype=np.float64).reshape(3, 4)[:, :3]
-    return P if P[0, 0] > 0 else np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+    K = np.asarray(message.k, dtype=np.float64).reshape(3, 3)
+    if not P[0, 0] > 0 and not K[0, 0] > 0:  # so a driver says it
+        raise UserError(f"camera_info={topic}: the camera is not calibrated (K and P are 0)")
+    return P if P[0, 0] > 0 else K
 
 
 def is_distorted(message: Any) -> bool:

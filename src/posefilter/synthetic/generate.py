@@ -332,8 +332,17 @@ def _open_dataset(out: Path, job: Job, frames: int) -> None:
         )
     out.mkdir(parents=True, exist_ok=True)
     packages = ("posefilter", "numpy", "embreex", "opencv-python-headless")
-    versions = {name: importlib.metadata.version(name) for name in packages}
+    versions = {name: _find_version(name) for name in packages}
     fat.write_json(path, {"settings": settings, "frames": frames, "versions": versions})
+
+
+def _find_version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except (
+        importlib.metadata.PackageNotFoundError
+    ):  # OpenCV has several names; Embree may be missing
+        return None
 
 
 def _list_differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
