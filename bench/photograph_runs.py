@@ -224,8 +224,7 @@ def plan() -> list[Run]:
     sized = f"{short.replace('=camera', '=camera_magnified')} model.likelihood_batch_size=16"
     sized += f" {_STEPS}.1.object_size_probability=0.4 trainer.val_check_interval=1500"
     fifth = [("banana", "011_banana"), ("hammer", "048_hammer"), ("gelatin", gelatin), ("mug", mug)]
-    fifth += [("tuna", "007_tuna_fish_can"), ("mustard", mustard), ("sugar", sugar)]
-    fifth += [("drill", drill)]
+    fifth += [("mustard", mustard), ("tuna", "007_tuna_fish_can")]
     judged += [
         Run(
             f"{name}_x",
