@@ -17,7 +17,7 @@ generate.py with moving= and fully_occluded_frames=: there the losses are in the
 operation's work out to, and by two processes that have an object each: in turn, by the clock, on an
 idle machine if the figures are to mean anything. Of the processor's time it is the first process'
 share. Objects that a scene lacks are taken where it has too few, and are searched for in every
-frame. Writes the tables of docs/results/tracking.md.
+frame. Writes the tables of docs/results/tracking.md; rows of what did not run stay.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from marked import put_table, read_rows
 
 import posefilter
 from posefilter.data.readers.registry import open_meshes, open_reader
@@ -43,7 +44,6 @@ from posefilter.weights import list_shipped
 
 HOME = Path(__file__).parents[1]
 PAGE = HOME / "docs" / "results" / "tracking.md"
-MARK, END = "<!-- table: {} -->", "<!-- end -->"
 AWAY = range(7, 13)  # frames that are replaced
 SINGLE_SEEDS = 4
 HEAD = (
@@ -359,7 +359,7 @@ def run_together(options: argparse.Namespace, names: Sequence[str]) -> None:
                 for line in measure_together(chosen, scene, frames, options.rounds):
                     lines.append(line)
                     print(line, flush=True)
-    write_table("together", TOGETHER, lines)
+    write_table("together", TOGETHER, lines, 5)
 
 
 def run_sequences(folders: Sequence[str], meshes: str, seeds: int) -> None:
@@ -372,16 +372,14 @@ def run_sequences(folders: Sequence[str], meshes: str, seeds: int) -> None:
             frames = list(SceneVideo(reader, group, [name]))
             lines.append(measure_sequence(estimator, Path(folder).name, frames, seeds))
             print(lines[-1], flush=True)
-    write_table("sequences", SEQUENCES, lines)
+    write_table("sequences", SEQUENCES, lines, 2)
 
 
-def write_table(name: str, head: Sequence[str], lines: Sequence[str]) -> None:
-    """Put a table into the page, between its marks."""
-    text = PAGE.read_text()
-    before, rest = text.split(MARK.format(name), 1)
-    rows = [f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head))]
-    table = "\n".join([MARK.format(name), *rows, *lines, END])
-    PAGE.write_text(before + table + rest.split(END, 1)[1])
+def write_table(name: str, head: Sequence[str], lines: Sequence[str], keys: int) -> None:
+    """Put lines into a table of the page, in place of those of the same first `keys` cells."""
+    page = PAGE.read_text()
+    rows = {tuple(line.split(" | ")[:keys]): line for line in (*read_rows(page, name), *lines)}
+    PAGE.write_text(put_table(page, name, head, rows.values()))
 
 
 def main() -> None:
@@ -435,8 +433,8 @@ def main() -> None:
                 losses.append(measure_losses(estimator, group, frames, other, options.seeds))
                 print(losses[-1], flush=True)
     if rows:
-        write_table("tracks", HEAD, rows)
-    write_table("losses", LOSSES, losses)
+        write_table("tracks", HEAD, rows, 3)
+    write_table("losses", LOSSES, losses, 2)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-from posefilter.cli.arguments import check_choices
+from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
 from posefilter.paths import find_conf
 

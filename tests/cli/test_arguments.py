@@ -8,7 +8,6 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from posefilter.cli import run_command
 from posefilter.cli.arguments import (
     bracketed,
-    check_choices,
     defer_settings,
     maximized,
     name_places,
@@ -17,6 +16,7 @@ from posefilter.cli.arguments import (
     told_apart,
     with_home,
 )
+from posefilter.cli.choices import check_choices
 from posefilter.cli.job import Job
 from posefilter.errors import UserError
 

@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 from tests.conf.conftest import compose_once
 
 from posefilter.cli import run_command
-from posefilter.cli.arguments import check_choices, list_choices
 from posefilter.cli.checkpoints import build_method, recipe
+from posefilter.cli.choices import check_choices, list_choices
 from posefilter.cli.command import compose_config, compose_job
 from posefilter.cli.comparing import leaves
 from posefilter.cli.explain import explain

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from posefilter.cli import run_command
-from posefilter.cli.arguments import check_choices
+from posefilter.cli.choices import check_choices
 from posefilter.cli.renamed import rename, rename_missing, update, upgrade
 from posefilter.errors import UserError
 

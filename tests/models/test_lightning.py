@@ -5,7 +5,7 @@ from lightning import LightningModule
 
 import posefilter
 from posefilter import models
-from posefilter.cli.arguments import list_choices
+from posefilter.cli.choices import list_choices
 from posefilter.paths import find_conf
 
 

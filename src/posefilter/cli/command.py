@@ -19,7 +19,6 @@ from posefilter.cli.ablation_configs import register_ablations
 from posefilter.cli.arguments import (
     MULTIRUN,
     bracketed,
-    check_choices,
     defer_settings,
     maximized,
     name_places,
@@ -27,11 +26,11 @@ from posefilter.cli.arguments import (
     quoted,
     spelled,
     told_apart,
-    typed_plugins,
     with_home,
     without_deletion,
     without_trace,
 )
+from posefilter.cli.choices import check_choices, typed_plugins
 from posefilter.cli.components import loosen
 from posefilter.cli.console import logging_for
 from posefilter.cli.explain import explain, explain_hydra, is_launchers

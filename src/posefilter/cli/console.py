@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from posefilter.cli.arguments import config_folders, typed_plugins
+from posefilter.cli.choices import config_folders, typed_plugins
 from posefilter.cli.ranks import is_follower
 
 JSON = "json"

@@ -16,7 +16,7 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from posefilter.cli.arguments import config_folders
+from posefilter.cli.choices import config_folders
 from posefilter.cli.instantiate import hint
 from posefilter.cli.plain import to_plain
 from posefilter.cli.renamed import rename_argument, rename_missing

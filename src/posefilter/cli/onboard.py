@@ -15,10 +15,10 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from posefilter.callbacks.time_budget import TimeBudget
-from posefilter.cli.arguments import check_choices
 from posefilter.cli.build import build_data
 from posefilter.cli.calibrate import learn
 from posefilter.cli.checkpoints import method_of, read_checkpoint
+from posefilter.cli.choices import check_choices
 from posefilter.cli.command import compose_job
 from posefilter.cli.console import JSON, ended, say, typed, typed_prediction
 from posefilter.cli.export import strip, write_weights

@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from posefilter.cli.arguments import check_names
+from posefilter.cli.choices import check_names
 from posefilter.cli.console import JSON, say, settle_logging
 from posefilter.cli.explain import first_line
 from posefilter.cli.fit import check_fit

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import yaml
 from hydra.core.config_store import ConfigStore
 
-from posefilter.cli.arguments import choice_folders, list_choices
+from posefilter.cli.choices import choice_folders, list_choices
 from posefilter.cli.console import is_installed
 from posefilter.cli.main import COMMANDS
 

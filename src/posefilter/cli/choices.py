@@ -1,0 +1,134 @@
+"""Choices of groups, and the folders that they come from: what of them is typed is checked before
+Hydra stumbles over it; torch is not needed for it.
+"""
+
+import re
+from collections.abc import Sequence
+from itertools import pairwise, product
+from pathlib import Path
+
+from posefilter.cli.instantiate import hint
+from posefilter.cli.renamed import rename
+from posefilter.cli.trust import find_folders, named, trusted
+from posefilter.errors import UserError
+
+SEVERAL = ("logger",)  # groups of which several choices can be made at once
+
+
+def check_choices(arguments: list[str], conf: Path, command: str | None = None) -> None:
+    """Raise UserError where a group is given a value instead of the name of one of its files, where
+    a choice is typed as a setting, and for names that have changed: Hydra stumbles over them.
+    """
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        group = key.replace(".", "/") if re.fullmatch(r"\w+", value) else key
+        own = re.fullmatch(r"[\w/]+", group) is not None and (conf / group).is_dir()
+        if own and group != key:
+            choice = f"{group}={value}"
+            raise UserError(f"{argument}: names a choice; type {rename(choice, command) or choice}")
+        if own and _is_several(group, value):
+            check_several(group, value, [conf, *choice_folders(arguments)])
+        elif own and value.startswith(("[", "{")):
+            options = list_choices(conf / group)
+            there = f"there are {', '.join(options)}" if options else f"see conf/{group}"
+            raise UserError(f"{group}={value}: takes the name of a choice, not a value; {there}")
+        if key == "preset" and value != "null":
+            check_preset(value, [conf, *choice_folders(arguments)])
+        now = (
+            None
+            if own and (conf / group / f"{value}.yaml").is_file()
+            else rename(argument, command)
+        )
+        if now is not None:
+            raise UserError(f"{argument}: is now {now}")
+    check_variants(arguments, conf)
+    check_names([conf, *find_folders(named()), *config_folders(arguments)])
+
+
+def check_names(folders: Sequence[Path]) -> None:
+    """Raise UserError where a file of a later folder has the name of one of an earlier folder,
+    which Hydra would read instead.
+    """
+    first = dict[Path, Path]()
+    for folder in folders:
+        for file in sorted(folder.rglob("*.yaml")):
+            other = first.setdefault(file.relative_to(folder), file)
+            if other is not file and other.read_bytes() != file.read_bytes():
+                raise UserError(
+                    f"{file}: has the name of {other}, which would be read in its place; give it "
+                    "another name"
+                )
+
+
+def check_several(group: str, value: str, folders: Sequence[Path]) -> None:
+    """Raise UserError where a list of choices has one that no folder has."""
+    known = sorted({name for folder in folders for name in list_choices(folder / group)})
+    for name in (part.strip(" '\"") for part in value.strip("[]").split(",")):
+        if name not in known:
+            raise UserError(
+                f"{group}={value}: there is no choice '{name}'{hint(name, known).rstrip('?')}; "
+                f"there are {', '.join(known)}"
+            )
+
+
+def _is_several(group: str, value: str) -> bool:
+    return group in SEVERAL and value[0] == "[" and value != "[]"
+
+
+def check_variants(arguments: Sequence[str], conf: Path) -> None:
+    """Raise UserError where a method is asked for a variant that it has not: Hydra would leave the
+    method without any preset.
+    """
+    typed = dict(a.split("=", 1) for a in arguments if "=" in a)
+    for model, variant in product(*(typed.get(k, "").split(",") for k in ("model", "variant"))):
+        known = list_choices(conf / "preset" / model) if re.fullmatch(r"\w+", model) else []
+        real = re.fullmatch(r"\w+", variant) and (conf / "variant" / f"{variant}.yaml").is_file()
+        if known and real and variant not in known and "preset" not in typed:
+            raise UserError(
+                f"variant={variant}: model={model} has no such variant; choose "
+                f"variant={' or '.join(known)}"
+            )
+
+
+def check_preset(name: str, folders: Sequence[Path]) -> None:
+    """Raise UserError where no folder has a preset: a method need not have one, so that Hydra would
+    not complain.
+    """
+    if any((folder / "preset" / f"{name}.yaml").is_file() for folder in folders):
+        return
+    known = [
+        f"{folder.name}/{choice}"
+        for top in folders
+        for folder in sorted((top / "preset").glob("[!_]*"))
+        if folder.is_dir() and folder.name != "size"
+        for choice in list_choices(folder)
+    ]
+    raise UserError(
+        f"preset={name}: there is no such choice{hint(name, known).rstrip('?')}; there are "
+        f"{', '.join(known)}"
+    )
+
+
+def config_folders(arguments: Sequence[str]) -> list[Path]:
+    """Return the folder of settings that was typed by --config-dir (or -cd): of several, Hydra
+    takes the last.
+    """
+    words = [part for a in arguments for part in a.split("=", 1)]
+    return [Path(b) for a, b in pairwise(words) if a in ("--config-dir", "-cd")][-1:]
+
+
+def choice_folders(arguments: Sequence[str]) -> list[Path]:
+    """Return the folders that add to the choices: of plug-ins, and typed ones."""
+    return [*find_folders(trusted()), *config_folders(arguments)]
+
+
+def typed_plugins(arguments: Sequence[str]) -> list[str]:
+    """Return the packages that were typed by `plugins=[...]`."""
+    typed = [a.partition("=")[2] for a in arguments if re.match(r"\+{0,2}plugins=", a)]
+    words = re.split(r"[\[\],\s'\"]+", typed[-1]) if typed else []
+    return [word for word in words if re.fullmatch(r"[A-Za-z_][\w.]*", word) and word != "null"]
+
+
+def list_choices(group: Path) -> list[str]:
+    """Return the choices of a group of conf/; files that begin with `_` are bases of others."""
+    return sorted(f.stem for f in group.glob("*.yaml") if not f.stem.startswith("_"))
