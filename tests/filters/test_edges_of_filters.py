@@ -115,6 +115,16 @@ def test_soft_weights_are_by_hand() -> None:
         assert Soft(alpha).alpha == alpha
 
 
+def test_soft_resampling_of_particles_without_weight_has_equal_weights() -> None:
+    log_w = torch.full((1, 100), -torch.inf)
+    log_w[0, 10] = 0.0
+    particles = make_particles(torch.zeros(1, 100, 2), 0)._replace(log_weights=log_w)
+    for seed in range(5):
+        new = Soft(0.0)(particles, 2, PIXELS, Generator().manual_seed(seed))
+        assert not (new.ancestors == 10).any()
+        assert new.log_weights.exp().tolist() == [[0.5, 0.5]]
+
+
 class Hill:
     """Scores a pose by how far along x it is; what it was asked is kept."""
 

@@ -123,7 +123,10 @@ class Soft:
         ancestors = self.scheme(
             particles._replace(log_weights=log_q), count, space, generator
         ).ancestors
-        return Resampled(ancestors, torch.log_softmax((log_w - log_q).gather(1, ancestors), dim=1))
+        ratio = (log_w - log_q).gather(1, ancestors)
+        # where the weights of all that were drawn are 0, they are equal
+        ratio = ratio.clamp_min(0.5 * torch.finfo(ratio.dtype).min)
+        return Resampled(ancestors, torch.log_softmax(ratio, dim=1))
 
 
 class NoResampling:
