@@ -221,21 +221,13 @@ def plan() -> list[Run]:
         words = f"{last.words} trainer.val_check_interval=1200"
         judged.append(last._replace(words=words, scenes=FOURTH))
     # of the fifth set, many images magnified as windows are; validated at the end alone
-    sized = f"{short.replace('=camera', '=camera_magnified')} model.likelihood_batch_size=16"
-    sized += f" {_STEPS}.1.object_size_probability=0.4 trainer.val_check_interval=1500"
     fifth = [("banana", "011_banana"), ("hammer", "048_hammer"), ("gelatin", gelatin), ("mug", mug)]
     fifth += [("mustard", mustard), ("tuna", "007_tuna_fish_can")]
-    judged += [
-        Run(
-            f"{name}_x",
-            target,
-            "pose_pf",
-            1500,
-            f"{sized} {_after(f'weights/{target}.ckpt')}",
-            FIFTH,
-        )
-        for name, target in fifth
-    ]
+    sized = f"{_STEPS}.1.object_size_probability=0.4 trainer.val_check_interval=1500"
+    for name, target in fifth:
+        last = shipped(f"{name}_x", target, 1500)
+        words = f"{last.words.replace('=camera ', '=camera_magnified ')} {sized}"
+        judged.append(last._replace(words=words, scenes=FIFTH))
     return [*map(_without_surface, earlier), *judged]
 
 

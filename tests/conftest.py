@@ -5,13 +5,17 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import omegaconf._utils
 import pytest
 import torch
 import yaml
+
+from posefilter.progress import bars
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +49,25 @@ def parse_settings_by_libyaml() -> Iterator[None]:
                 loader = omegaconf._utils.get_yaml_loader()
             patch.setattr(omegaconf._utils, "get_yaml_loader", lambda: loader)
         yield
+
+
+@pytest.fixture
+def bar_tasks(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], list[Any]]:
+    """Given where a command has `bars`: the tasks that it shows, filled in when it ends."""
+
+    def keep(name: str) -> list[Any]:
+        seen: list[Any] = []
+
+        @contextmanager
+        def watch(**_: Any) -> Iterator[Any]:
+            with bars(shown=False) as bar:
+                yield bar
+                seen.extend(bar.tasks)
+
+        monkeypatch.setattr(name, watch)
+        return seen
+
+    return keep
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.errors import MissingConfigException
@@ -351,3 +352,13 @@ def test_a_preset_that_is_not_there_is_refused_though_a_method_need_not_have_one
     own.write_text("# @package _global_\n{}\n")
     check_choices(["preset=patch_pf/wrking", "--config-dir", str(tmp_path)], CONF)
     check_choices(["preset=null"], CONF)
+
+
+def test_magnified_images_are_those_of_camera_but_for_their_size() -> None:
+    plain, magnified = (
+        yaml.safe_load((CONF / "data" / "augment" / f"{name}.yaml").read_text())["steps"]
+        for name in ("camera", "camera_magnified")
+    )
+    own = {key: magnified[1].pop(key) for key in ("object_size", "object_size_probability")}
+    assert own == {"object_size": [0.16, 0.32], "object_size_probability": 0.6}
+    assert magnified == plain

@@ -6,8 +6,8 @@ import os
 import signal
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from posefilter.cli import run_command
 from posefilter.errors import UserError
 from posefilter.geometry.pose import move_about
 from posefilter.geometry.rotation import log_so3, quat_xyzw_from_matrix, random_rotation
-from posefilter.progress import bars
 from posefilter.ros.bags import BagReader, BagWriter, Topics
 from posefilter.ros.detections import make_detections, to_ros_covariance
 from posefilter.ros.messages import (
@@ -451,17 +450,11 @@ def test_a_topic_that_is_there_is_refused_before_the_work(
     assert "the bag has this topic already" in capfd.readouterr().err
 
 
-def test_progress_counts_every_color_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_counts_every_color_image(
+    tmp_path: Path, bar_tasks: Callable[[str], list[Any]]
+) -> None:
     """Also those without depth, so that the bar comes to its end."""
-    seen: list[Any] = []
-
-    @contextmanager
-    def watch(**_: Any) -> Iterator[Any]:
-        with bars(shown=False) as bar:
-            yield bar
-            seen.extend(bar.tasks)
-
-    monkeypatch.setattr("posefilter.cli.convert_bag.bars", watch)
+    seen = bar_tasks("posefilter.cli.convert_bag.bars")
     bag = write_scene(tmp_path / "in", (5, 3))
     typed = [str(bag), str(tmp_path / "out.mcap"), f"checkpoint={NAME}", *TYPED, *FEW]
     assert run_command("convert_bag", HOME, typed) == 0

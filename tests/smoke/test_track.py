@@ -8,8 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,7 +24,6 @@ from posefilter.cli.track_log import to_pose_row
 from posefilter.data.sequences import VideoFrame
 from posefilter.locks import LOCK, hold
 from posefilter.metrics.bop_results import read_poses_csv
-from posefilter.progress import bars
 from posefilter.tracking.records import TrackRow
 from posefilter.tracking.settings import TrackerSettings
 
@@ -247,17 +245,9 @@ def test_a_broken_frame_can_be_left_out(
 
 
 def test_progress_counts_the_frames(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, bar_tasks: Callable[[str], list[Any]]
 ) -> None:
-    seen: list[Any] = []
-
-    @contextmanager
-    def watch(**_: Any) -> Iterator[Any]:
-        with bars(shown=False) as bar:
-            yield bar
-            seen.extend(bar.tasks)
-
-    monkeypatch.setattr("posefilter.cli.track.bars", watch)
+    seen = bar_tasks("posefilter.cli.track.bars")
     typed = [*COMMON, f"frames={folder}", CAMERA, "save_video=none", f"out={tmp_path / 'out'}"]
     assert run_command("track", HOME, typed) == 0
     assert [(one.completed, one.total) for one in seen] == [(4, 4)]

@@ -17,9 +17,10 @@ from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 
 Draw = Callable[[Generator], Sample]
+Augment = Callable[[Sample, Draw, Generator], Sample]
+
 _LEAST_VISIBLE = 0.05  # below, a few pixels tell little of an object's size
 _MOST_ZOOM = 5.0  # beyond, a render is blur
-Augment = Callable[[Sample, Draw, Generator], Sample]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from posefilter.figures.layout import format_length
-from posefilter.figures.view_data import Hypothesis, bring_together, find_hypotheses
+from posefilter.figures.view_data import Hypothesis, find_hypotheses
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.geometry.rotation import angle_between
 from posefilter.geometry.spaces import PoseSpace
@@ -48,12 +48,11 @@ def summarize_belief(
         object_model: The object.
     """
     center = object_model.center.detach().cpu().double()
-    poses = bring_together(poses, best, object_model)
     found = find_hypotheses(poses, weights.log(), best, object_model)
     space = PoseSpace((*center.tolist(),), object_model.radius)
     members = found.own if bool(found.own.any()) else torch.ones_like(found.own)
     own = torch.where(members, weights, 0.0)
-    translation, rotation = spread(poses[None], (own / own.sum()).log()[None], space)
+    translation, rotation = spread(found.poses[None], (own / own.sum()).log()[None], space)
     second = found.others[0] if found.others else None
     away = turned = 0.0
     if second is not None:

@@ -82,7 +82,7 @@ def collect_view_data(
     points, colors = color_points(batch.rgb[image], batch.depth[image], batch.intrinsics[image])
     belief = trace.belief
     poses, best = (x[image].detach().cpu().double() for x in (belief.poses, belief.best))
-    estimate, others, left_out, _ = find_hypotheses(
+    estimate, others, left_out, *_ = find_hypotheses(
         poses, belief.log_weights[image].detach().cpu(), best, object_model
     )
     unit = 1000.0 if isinstance(space, PoseSpace) else 1.0
@@ -156,6 +156,7 @@ class Hypotheses(NamedTuple):
     others: tuple[Hypothesis, ...]  # the other modes, the heaviest first
     left_out: float  # share of the weight in modes too light to be shown
     own: Tensor  # (N,) bool, which particles belong to the estimate's mode
+    poses: Tensor  # (N, 4, 4) of each particle the equivalent pose that is nearest to the estimate
 
 
 def find_hypotheses(
@@ -168,7 +169,8 @@ def find_hypotheses(
     Poses that a symmetry makes of one another are one.
     (N, 4, 4), (N,), (4, 4).
     """
-    poses = bring_together(poses, best, object_model)
+    center, group = (x.detach().to(poses) for x in (object_model.center, object_model.symmetries))
+    poses = gather_copies(poses, best, center, object_model.radius, densify(group))
     space = PoseSpace((*object_model.center.tolist(),), object_model.radius)
     modes = find_pose_modes(poses, log_weights, space, object_model.diameter)
     distance, nearest = space.distance(poses, best).min(0)
@@ -179,16 +181,7 @@ def find_hypotheses(
     estimate = Hypothesis(best.numpy(), 0.0 if own is None else float(modes.weights[own]))
     left_out = float(sum(modes.weights[i] for i in rest if i not in shown))
     members = torch.zeros(len(poses), dtype=torch.bool) if own is None else modes.member == own
-    return Hypotheses(estimate, others, left_out, members)
-
-
-def bring_together(poses: Tensor, best: Tensor, object_model: ObjectModel) -> Tensor:
-    """Return of each pose the equivalent one that is nearest to the estimate.
-
-    (N, 4, 4), (4, 4) -> (N, 4, 4).
-    """
-    center, group = (x.detach().to(poses) for x in (object_model.center, object_model.symmetries))
-    return gather_copies(poses, best, center, object_model.radius, densify(group))
+    return Hypotheses(estimate, others, left_out, members, poses)
 
 
 def make_mesh(shape: Shape, name: str) -> Mesh:
