@@ -3,6 +3,7 @@ changed.
 
     python bench/altered_photographs.py --frames DIR --meshes DIR [--images 24] [--out ROWS.json]
         A.ckpt [B.ckpt ...] [--only CHANGE ...]
+    python bench/altered_photographs.py ... --sensors        # the depth as other sensors give it
     python bench/altered_photographs.py --table ROWS.json    # only writes rows into photographs.md
 
 A folder of few photographs shows an object in few poses, in one place and one light. Each change is
@@ -15,12 +16,13 @@ number of the image alone: all checkpoints of an object see the same images.
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from depth_sensors import SENSORS
 from held_out import PAGE, choose_points, name_weights
 from marked import format_row, put_table, read_rows
 from numpy.random import Generator
@@ -88,7 +90,7 @@ def alter(
     for k in range(images):
         view, scraps = views[k % len(views)]
         rng = np.random.default_rng([k, 7])
-        out.append(CHANGES[change](view, draw_from(scraps), rng))
+        out.append((CHANGES | SENSORS)[change](view, draw_from(scraps), rng))
     return out
 
 
@@ -125,10 +127,10 @@ def make_line(row: dict[str, Any]) -> str:
     return format_row([*first, *areas, *shares, str(row["found_wrong"])])
 
 
-def make_wide_line(rows: Sequence[dict[str, Any]]) -> str:
-    """Return a row of the page's table: one file's figures for every change."""
+def make_wide_line(rows: Sequence[dict[str, Any]], changes: Iterable[str]) -> str:
+    """Return a row of a table of the page: one file's figures for every change."""
     cells = [rows[0]["object"], rows[0]["weights"]]
-    for change in CHANGES:
+    for change in changes:
         own = [row for row in rows if row["change"] == change]
         cells.append(" / ".join(f"{own[-1][key]:.1f}" for key in _AREAS) if own else "–")
     found = sum(row["found_wrong"] for row in rows), sum(row["images"] for row in rows)
@@ -136,14 +138,20 @@ def make_wide_line(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write_table(rows: Sequence[dict[str, Any]], page: Path = PAGE) -> None:
-    """Put rows into the page's table: those of the same object and weights are replaced."""
-    text, files = page.read_text(), dict[tuple[str, str], list[dict[str, Any]]]()
-    for row in rows:
-        files.setdefault((row["object"], row["weights"]), []).append(row)
-    lines = [*read_rows(text, "altered"), *map(make_wide_line, files.values())]
-    kept = {tuple(line.split(" | ")[:2]): line for line in lines}
-    head = ("object", "weights", *CHANGES, "found and wrong")
-    page.write_text(put_table(text, "altered", head, (kept[key] for key in sorted(kept))))
+    """Put rows into the page's tables: those of the same object and weights are replaced."""
+    text = page.read_text()
+    for title, changes in (("altered", list(CHANGES)), ("sensors", list(SENSORS))):
+        files = dict[tuple[str, str], list[dict[str, Any]]]()
+        for row in rows:
+            if row["change"] in changes:
+                files.setdefault((row["object"], row["weights"]), []).append(row)
+        if not files:
+            continue
+        lines = [*read_rows(text, title), *(make_wide_line(f, changes) for f in files.values())]
+        kept = {tuple(line.split(" | ")[:2]): line for line in lines}
+        head = ("object", "weights", *changes, "found and wrong")
+        text = put_table(text, title, head, (kept[key] for key in sorted(kept)))
+    page.write_text(text)
 
 
 def main() -> int:
@@ -155,7 +163,8 @@ def main() -> int:
     parser.add_argument("--frames", help="a folder of YCB-Video")
     parser.add_argument("--meshes", help="its meshes")
     parser.add_argument("--images", type=int, default=24, help="of each kind of change")
-    parser.add_argument("--only", nargs="+", default=list(CHANGES), choices=list(CHANGES))
+    parser.add_argument("--sensors", action="store_true", help="changes of the depth alone")
+    parser.add_argument("--only", nargs="+", choices=[*CHANGES, *SENSORS])
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
     parser.add_argument("--table", type=Path, help="a file of rows to write into the page")
     options = parser.parse_args()
@@ -182,7 +191,7 @@ def main() -> int:
             print(f"{options.frames}: no photograph shows {name}", file=sys.stderr)
             continue
         weights = name_weights(checkpoint)
-        for change in options.only:
+        for change in options.only or (SENSORS if options.sensors else CHANGES):
             samples = alter(views, change, len(views) if change == "none" else options.images)
             tested = test(estimator, samples, points[name])
             rows.append({"object": name, "weights": weights, "change": change, **tested})

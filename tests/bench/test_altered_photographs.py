@@ -63,9 +63,51 @@ def test_a_change_keeps_the_pose_true(altered: ModuleType, change: str) -> None:
         assert (first.depth[hidden] < 1.0).all()
 
 
+def measure(sample: Sample) -> tuple[float, float, float]:
+    """Return the share of pixels without depth, the median depth of the square, and its noise."""
+    square = sample.depth[sample.mask & (sample.depth > 0) & (sample.depth < 1.5)]
+    return float((sample.depth == 0).mean()), float(np.median(square)), float(square.std())
+
+
+def test_other_sensors_change_what_they_say_of_the_depth_alone(altered: ModuleType) -> None:
+    view = make_sample(90)
+    for change in altered.SENSORS:
+        one, *others = altered.alter([(view, [])], change, 8)
+        again = altered.alter([(view, [])], change, 1)[0]
+        assert np.array_equal(one.depth, again.depth)
+        assert any(not np.array_equal(one.depth, other.depth) for other in others)
+        assert one.rgb is view.rgb
+        assert one.mask is view.mask
+        assert one.depth.dtype == np.float32
+        lost, median, noise = measure(one)
+        if change.startswith("by 6"):
+            moved = np.argwhere(one.depth == 1.0).mean(0) - np.argwhere(view.mask).mean(0)
+            assert np.hypot(*moved) == pytest.approx(6, abs=1)
+        elif change in ("off by 1 %", "by 2 %"):
+            share = 0.01 if "1" in change else 0.02
+            assert abs(median - 1) == pytest.approx(share, rel=1e-3)
+        elif change == "half lost":
+            assert lost == pytest.approx(0.5, abs=0.01)
+        elif change == "of 10 mm":
+            assert 0.005 < noise < 0.02
+        elif change == "stereo":
+            assert lost == pytest.approx(0.2, abs=0.01)
+            near = (one.depth > 0) & (one.depth < 1.5)
+            assert near[~view.mask].sum() > 200  # the square has grown
+
+
+def test_unknown_depth_stays_unknown(altered: ModuleType) -> None:
+    view = make_sample(90)
+    view.depth[:40] = 0
+    for change in ("off by 1 %", "waves of 4 mm", "half lost"):
+        (one,) = altered.alter([(view, [])], change, 1)
+        assert not one.depth[:40].any()
+
+
 def test_a_file_has_one_row_and_others_stay(altered: ModuleType, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text("x\n<!-- table: altered -->\n<!-- end -->\ny\n")
+    marks = "<!-- table: {} -->\n<!-- end -->\n"
+    page.write_text(f"x\n{marks.format('altered')}y\n{marks.format('sensors')}")
 
     def row(name: str, change: str, area: float) -> dict[str, object]:
         return {
@@ -81,7 +123,9 @@ def test_a_file_has_one_row_and_others_stay(altered: ModuleType, tmp_path: Path)
     altered.write_table([row("b", "none", 50.0), row("b", "all", 40.0)], page)
     altered.write_table([row("a", "none", 60.0)], page)
     altered.write_table([row("b", "none", 70.0)], page)
+    altered.write_table([row("a", "half lost", 30.0)], page)
     lines = [line for line in page.read_text().splitlines() if line.startswith(("| a", "| b"))]
+    assert lines.pop() == "| a | w | – | – | – | – | 30.0 / 31.0 | – | – | – | 1 of 4 |"
     assert lines[0].startswith("| a | w | 60.0 / 61.0 | – |")
     assert lines[1].startswith("| b | w | 70.0 / 71.0 | – |")
     assert lines[1].endswith("| 1 of 4 |")
