@@ -14,6 +14,8 @@ from numpy.random import Generator
 from posefilter.data.augmentation import Augment, Compose, Draw
 from posefilter.data.frames import Sample
 
+_FAR = 1000.0  # [m] beyond all that is measured
+
 
 @dataclasses.dataclass(frozen=True)
 class Shift:
@@ -82,9 +84,10 @@ class GrowForeground:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with the least depth of each square of pixels."""
-        far = np.where(sample.depth > 0, sample.depth, np.float32(np.inf))
+        far = np.where(sample.depth > 0, sample.depth, np.float32(_FAR))
         near = cv2.erode(far, np.ones((2 * self.pixels + 1,) * 2, np.uint8))
-        return dataclasses.replace(sample, depth=np.where(np.isfinite(near), near, np.float32(0)))
+        # OpenCV's border is farther still
+        return dataclasses.replace(sample, depth=np.where(near < _FAR, near, np.float32(0)))
 
 
 @dataclasses.dataclass(frozen=True)
