@@ -5,7 +5,7 @@
 The scenes are those that bench/held_out.py tests on. Each image is asked as it is, and with depths
 1.25 and 0.8 times as large: of those whose pose is right as they are, how many are said to be of a
 wrong size, and of the wrong answers that calibration alone would declare found, how many are
-noticed. Writes the table of docs/belief.md.
+noticed. Writes the table of docs/results/confidence.md.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from posefilter.data.frames import Sample
 from posefilter.memory import keep_freed_memory
 from posefilter.weights import list_shipped
 
-PAGE = Path(__file__).parents[1] / "docs" / "belief.md"
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "confidence.md"
 FACTORS = (1.0, 1.25, 0.8)
 HEAD = ("object", "images right", "size, median", "flagged")
 HEAD += tuple(

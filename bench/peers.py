@@ -12,8 +12,8 @@ Each PATH is the interpreter of a virtual environment that has the peer alone: p
 3.12, `particles` a NumPy before 2, and opencv-contrib takes the place of OpenCV. A peer whose
 option is left out is left out, and said to be. PROGRAM is what worker_visp.cpp compiles to.
 `cases` reads the images once, into --out; `tune` tries every setting on validation renders;
-`images` goes on where it was stopped; `times` does the same with one image of each object. Tables
-go to docs/results/peers.md.
+`images` goes on where it was stopped; `times` does the same with one image of each object, and only
+prints its tables. The others go to docs/results/peers.md.
 """
 
 import argparse
@@ -139,6 +139,8 @@ def run_images(options: argparse.Namespace) -> None:
             rows = peer_images.measure(ways, cases, file, title, until)
             lines = peer_images.make_lines(rows, title)
             print(title, *lines, sep="\n", flush=True)
+            if timing:
+                continue
             if not tuning:
                 put(f"{options.what} {title}", peer_images.HEAD, lines)
                 continue

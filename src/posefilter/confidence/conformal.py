@@ -12,8 +12,9 @@ A belief that is likely to be wrong gives the truth a far higher score than one 
 right, so that one limit for all would cover too much of the sure ones and too little of the others.
 The probability of a calibration frame is that of a regression that has not seen it, as new frames
 are not seen either (cross-conformal prediction, Vovk 2015).  It is still not of quite the same
-regression, so that the guarantee holds nearly, not exactly: see docs/belief.md for what was
-measured.  Calibrations of before have two groups, by the feature `surface` at a fixed limit.
+regression, so that the guarantee holds nearly, not exactly: see docs/results/confidence.md for
+what was measured.  Calibrations of before have two groups, by the feature `surface` at a fixed
+limit.
 
 References:
     Vovk, Gammerman, Shafer: Algorithmic Learning in a Random World. Springer (2005).
