@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 from depth_sensors import SENSORS
-from held_out import PAGE, choose_points, name_weights
+from held_out import choose_points, name_weights
 from marked import format_row, put_table, read_rows
 from numpy.random import Generator
 
@@ -37,6 +37,7 @@ from posefilter.memory import keep_freed_memory
 from posefilter.metrics.errors import add, add_s, add_up_to_symmetry
 from posefilter.metrics.scores import auc
 
+PAGE = Path(__file__).parents[1] / "docs" / "results" / "photographs.md"
 VIEWS = 4  # photographs of a sequence that are altered
 SCRAPS = 6  # photographs of other sequences that occluders are cut from
 HEAD = ("object", "weights", "change", "images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")

@@ -2,8 +2,7 @@
 
     python bench/held_out.py --root DIR --meshes DIR [--part test] [--images 48] \
         [--out ROWS.json] A.ckpt [B.ckpt ...]
-    python bench/held_out.py --table ROWS.json [--titles third third-parts]   # only writes rows
-                                                               # into tables of photographs.md
+    python bench/held_out.py --table ROWS.json   # only puts rows into docs/results/held_out.csv
 
 The scenes are those that training with data.split={train: 0.8, val: 0.05, test: 0.15} and seed 0
 holds out; with --part train, those that it learns from, without augmentation: the difference is
@@ -17,6 +16,7 @@ object are judged by those of the one that carries the most.
 """
 
 import argparse
+import csv
 import json
 import sys
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from marked import format_row, put_table, read_rows
+from marked import format_row
 
 import posefilter
 from posefilter.data.frames import FrameRecord, NotShown, Sample
@@ -36,15 +36,18 @@ from posefilter.metrics.errors import add, add_s
 from posefilter.metrics.scores import auc
 
 HOME = Path(__file__).parents[1]
-PAGE = HOME / "docs" / "results" / "photographs.md"
+ROWS = HOME / "docs" / "results" / "held_out.csv"
 SPLIT = {"train": 0.8, "val": 0.05, "test": 0.15}
 LEAST = 0.3  # visible share
-HEAD = ("object", "weights", "images", "scenes", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %")
-HEAD += ("ADD-S < 0.1 d %", "median mm")
+# by whose definition it is; rows of the file that are "in the frame" count no truncation
+VISIBILITY = "BOP"
+KEYS = ("visibility", "object", "weights", "scenes of", "images")
+HEAD = (*KEYS, "scenes", "ADD AUC", "ADD AUC from", "ADD AUC to", "ADD-S AUC", "ADD-S AUC from")
+HEAD += ("ADD-S AUC to", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm")
 SMALL = 1500  # pixels of the object, of an image of 320 x 240
-KINDS = ("whole", "cut", "small")  # the last: whole and of fewer pixels than SMALL
-PARTS = ("object", "weights", "scenes of", "images", "in frame: images", "ADD AUC", "ADD-S AUC")
-PARTS += ("truncated: images", "ADD AUC", "ADD-S AUC", "small: images", "ADD AUC", "ADD-S AUC")
+# the last: whole and of fewer pixels than SMALL
+KINDS = {"whole": "in frame", "cut": "truncated", "small": "small"}
+HEAD += tuple(f"{k}: {what}" for k in KINDS.values() for what in ("images", "ADD AUC", "ADD-S AUC"))
 
 
 def read_frames(
@@ -145,7 +148,7 @@ def test(
 
 
 def make_line(row: dict[str, Any]) -> str:
-    """Return a row of the table."""
+    """Return a row for people: object, weights, images, scenes, areas, recalls, median."""
     areas = [
         f"{row[name + '_auc']:.1f} ({row[name + '_interval'][0]:.0f} to "
         f"{row[name + '_interval'][1]:.0f})"
@@ -158,7 +161,7 @@ def make_line(row: dict[str, Any]) -> str:
 
 
 def make_part_line(row: dict[str, Any]) -> str:
-    """Return a row of the table of whole, cut and small objects."""
+    """Return a row for people: object, weights, part, and the figures of each kind of image."""
     cells = [row["object"], f"`{row['weights']}`", row["part"], str(row["images"])]
     for kind in KINDS:
         count, *areas = row["kinds"][kind]
@@ -166,27 +169,32 @@ def make_part_line(row: dict[str, Any]) -> str:
     return format_row(cells)
 
 
-def _put(text: str, title: str, heads: Sequence[str], lines: Sequence[str]) -> str:
-    """Put rows into a table: those of the same first cells are replaced, others stay."""
-    keys = 3 if "scenes of" in heads else 2
-    all_lines = [*read_rows(text, title), *lines]
-    rows = {tuple(line.split(" | ")[:keys]): line for line in all_lines}
-    return put_table(text, title, heads, (rows[key] for key in sorted(rows)))
+def make_cells(row: dict[str, Any]) -> list[str]:
+    """Return a row of the file."""
+    cells = [VISIBILITY, row["object"], row["weights"], row["part"], row["images"], row["scenes"]]
+    for name in ("add", "add_s"):
+        cells.append(f"{row[name + '_auc']:.1f}")
+        cells += [f"{end:.0f}" for end in row[name + "_interval"]]
+    cells += [f"{100 * row[name]:.0f}" for name in ("add_recall", "add_s_recall")]
+    cells.append(f"{row['median_mm']:.1f}")
+    for kind in KINDS:
+        count, *areas = row["kinds"][kind]
+        cells += [count, *("" if area is None else f"{area:.1f}" for area in areas)]
+    return [str(cell) for cell in cells]
 
 
-def write_tables(
-    rows: Sequence[dict[str, Any]],
-    page: Path = PAGE,
-    titles: tuple[str, str] = ("held-out", "parts"),
-) -> None:
-    """Put rows into the page's two tables of these titles."""
-    held_out = [make_line(row) for row in rows if row["part"] == "test"]
-    text = _put(page.read_text(), titles[0], HEAD, held_out)
-    page.write_text(_put(text, titles[1], PARTS, [make_part_line(row) for row in rows]))
+def write_rows(rows: Sequence[dict[str, Any]], path: Path = ROWS) -> None:
+    """Put rows into the file: those of the same first cells are replaced, others stay."""
+    with path.open(newline="") as file:
+        old = list(csv.reader(file))[1:]
+    kept = {tuple(cells[: len(KEYS)]): cells for cells in [*old, *map(make_cells, rows)]}
+    with path.open("w", newline="") as file:
+        lines = [HEAD, *(kept[key] for key in sorted(kept))]
+        csv.writer(file, lineterminator="\n").writerows(lines)
 
 
 def main() -> int:
-    """Test the checkpoints, or write the table."""
+    """Test the checkpoints, or write their rows down."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -196,11 +204,10 @@ def main() -> int:
     parser.add_argument("--images", type=int, default=48)
     parser.add_argument("--part", default="test", choices=list(SPLIT))
     parser.add_argument("--out", type=Path, help="a file that the rows are added to")
-    parser.add_argument("--table", type=Path, help="a file of rows to write into the page")
-    parser.add_argument("--titles", nargs=2, default=["held-out", "parts"], help="of its tables")
+    parser.add_argument("--table", type=Path, help=f"a file of rows to put into {ROWS.name}")
     options = parser.parse_args()
     if options.table:
-        write_tables(json.loads(options.table.read_text()), titles=tuple(options.titles))
+        write_rows(json.loads(options.table.read_text()))
         return 0
     if not (options.root and options.meshes and options.checkpoints):
         parser.error("--root, --meshes and a checkpoint are needed")

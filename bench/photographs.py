@@ -2,7 +2,7 @@
 tested on photographs.
 
     python bench/photographs.py --meshes DIR --frames DIR [--list] [--only NAME] [KEY=VALUE ...]
-    python bench/photographs.py --table                      # only rewrites the page's tables
+    python bench/photographs.py --table          # only writes docs/results/photograph_runs.csv
 
 DIR of --meshes holds YCB's <class>/google_16k, DIR of --frames YCB-Video. One set of scenes is
 rendered for all objects: each of fourteen is the target of some, and stands in the clutter of
@@ -12,6 +12,7 @@ every training.
 """
 
 import argparse
+import csv
 import json
 import shlex
 import subprocess
@@ -20,7 +21,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from marked import format_row, put_table, read_rows
 from photograph_runs import (
     CLUTTER,
     CRACKER,
@@ -37,13 +37,14 @@ from photograph_runs import (
 )
 
 HOME = Path(__file__).parents[1]
-PAGE = HOME / "docs" / "results" / "photographs.md"
-HEAD = ["run", "object", "method", "augment", "warm start", "steps", "CPU min", "images", "ADD AUC"]
-HEAD += ["ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm", "outscored %"]
+RUNS = HOME / "docs" / "results" / "photograph_runs.csv"
+HEAD = ["tested on", "run", "object", "method", "augment", "warm start", "steps", "CPU min"]
+HEAD += ["images", "ADD AUC", "ADD-S AUC", "ADD < 0.1 d %", "ADD-S < 0.1 d %", "median mm"]
+HEAD += ["outscored %"]
 FEW = 10  # images, at least: with fewer, "photographs" are YCB-Video's own renders
-# title, folder of the evaluation, whether of few images
-TABLES = (("renders", "renders", False), ("photographs", "photographs", False))
-TABLES += (("ycb_video renders", "photographs", True),)
+# name, folder of the evaluation, whether of few images
+TESTS = (("renders", "renders", False), ("photographs", "photographs", False))
+TESTS += (("ycb_video renders", "photographs", True),)
 
 
 def render_commands(
@@ -136,7 +137,9 @@ def link_meshes(root: Path, meshes: Path, names: Sequence[str] = (*TARGETS, *CLU
 
 
 def row(run: Run, root: Path, where: str) -> list[str] | None:
-    """Return a run's row of the table of renders or photographs, or None where there is none."""
+    """Return a run's row of renders or photographs without its first cell, or None where there is
+    none.
+    """
     own = _read(root / "runs" / run.name / "metrics.json")
     tested = _read(root / "evals" / run.name / where / "metrics.json")
     if own is None or not tested or not tested["instances"]:
@@ -144,11 +147,11 @@ def row(run: Run, root: Path, where: str) -> list[str] | None:
     words = dict(word.split("=", 1) for word in run.words.split())
     start = _tell_start(words.get("warm_start", ""))
     step = own["training"]["cpu_seconds_per_step"]  # unknown where the test was made by itself
-    cost = "–" if step is None else f"{own['training']['steps'] * step / 60:.1f}"
+    cost = "" if step is None else f"{own['training']['steps'] * step / 60:.1f}"
     first = [
-        f"`{run.name}`",
+        run.name,
         run.object,
-        f"`{run.model}`",
+        run.model,
         _tell_augment(run),
         start,
         str(run.steps),
@@ -174,7 +177,7 @@ def _tell_start(checkpoint: str) -> str:
         return "none"
     if checkpoint == CRACKER:
         return "cracker box"
-    return "shipped" if checkpoint.startswith("weights/") else f"`{checkpoint.split('/')[2]}`"
+    return "shipped" if checkpoint.startswith("weights/") else checkpoint.split("/")[2]
 
 
 def _read(path: Path) -> dict[str, Any] | None:
@@ -184,27 +187,29 @@ def _read(path: Path) -> dict[str, Any] | None:
 def _figures(metrics: dict[str, Any]) -> list[str]:
     add, add_s, belief = metrics["add"], metrics["add_s"], metrics.get("belief") or {}
     outscored = belief.get("truth_outscored_by_wrong")
-    wrong = "–" if outscored is None else f"{100 * outscored:.0f}"
+    wrong = "" if outscored is None else f"{100 * outscored:.0f}"
     figures = (add["auc"], add_s["auc"], add["recall_01d"], add_s["recall_01d"], add["median_mm"])
     return [str(metrics["instances"]), *(f"{figure:.1f}" for figure in figures), wrong]
 
 
-def write_tables(root: Path, page: Path = PAGE) -> None:
-    """Put the runs that are there into the page's tables; rows of others stay as they are.
+def write_runs(root: Path, path: Path = RUNS) -> None:
+    """Put the runs that are there into the file of runs; rows of others stay as they are.
 
     What YCB-Video has of an object that is in neither sequence, two or three rendered frames, is no
-    photograph: it has a table of its own.
+    photograph: it counts as a test of its own.
     """
-    text = page.read_text()
-    for title, where, few in TABLES:
-        rows = {line.split("`")[1]: line for line in read_rows(text, title)}
+    with path.open(newline="") as file:
+        rows = {tuple(row[:2]): row for row in list(csv.reader(file))[1:]}
+    for title, where, few in TESTS:
         for run in plan():
             cells = row(run, root, where)
             if cells is not None and (int(cells[7]) < FEW) == few:
-                rows[run.name] = format_row(cells)
-        planned = (rows[run.name] for run in plan() if run.name in rows)
-        text = put_table(text, title, HEAD, planned)
-    page.write_text(text)
+                rows[title, run.name] = [title, *cells]
+    keys = ((title, run.name) for title, _, _ in TESTS for run in plan())
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(
+            [HEAD, *(rows[k] for k in keys if k in rows)]
+        )
 
 
 def main() -> int:
@@ -217,11 +222,11 @@ def main() -> int:
     parser.add_argument("--frames", help="a folder of YCB-Video")
     parser.add_argument("--only", action="append", choices=[run.name for run in plan()])
     parser.add_argument("--list", action="store_true", help="print the commands, run nothing")
-    parser.add_argument("--table", action="store_true", help="only rewrite the tables")
+    parser.add_argument("--table", action="store_true", help="only write the file of runs")
     parser.add_argument("--root", type=Path, default=Path("outputs/photographs"))
     options = parser.parse_args()
     if options.table:
-        write_tables(options.root)
+        write_runs(options.root)
         return 0
     if not options.meshes or not options.frames:
         parser.error("--meshes and --frames are needed")
@@ -244,7 +249,7 @@ def main() -> int:
             worst, subprocess.run([sys.executable, *words], cwd=HOME, check=False).returncode
         )
     if not options.list:
-        write_tables(options.root)
+        write_runs(options.root)
     return worst
 
 

@@ -1,5 +1,6 @@
-"""The bench of held-out renders: kinds of objects, and rows that stay in the page."""
+"""The bench of held-out renders: kinds of objects, and rows that stay in their file."""
 
+import csv
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -44,19 +45,28 @@ def _row(name: str, weights: str, part: str, area: float) -> dict[str, object]:
     return first | areas | shares | {"kinds": kinds}
 
 
-def test_rows_of_other_weights_stay_in_the_page(held_out: ModuleType, tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    marks = [f"<!-- table: {title} -->" for title in ("held-out", "parts")]
-    page.write_text("".join(f"text\n\n{mark}\n<!-- end -->\n\n" for mark in marks))
-    held_out.write_tables(
-        [_row("mug", "old", "test", 10.0), _row("bowl", "old", "test", 20.0)], page
-    )
-    held_out.write_tables(
-        [_row("mug", "old", "test", 30.0), _row("mug", "old", "train", 40.0)], page
-    )
-    first, second = page.read_text().split(marks[1])
-    assert first.count("| mug |") == first.count("| bowl |") == 1  # learned scenes are not held out
-    assert "30.0 (1 to 2)" in first
-    assert "10.0" not in first
-    assert second.count("| mug |") == 2
-    assert "| mug | `old` | train | 1 | 1 | 40.0 | 40.0 | 0 | – | – |" in second
+def test_rows_of_other_weights_stay_in_the_file(held_out: ModuleType, tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    path.write_text(",".join(held_out.HEAD) + "\nin the frame,mug,old,test,1\n")
+    held_out.write_rows([_row("mug", "old", "test", 10.0), _row("bowl", "old", "test", 20.0)], path)
+    held_out.write_rows([_row("mug", "old", "test", 30.0), _row("mug", "old", "train", 40.0)], path)
+    lines = path.read_text().splitlines()
+    assert lines[0] == ",".join(held_out.HEAD)
+    rows = [("bowl", "test", 20.0), ("mug", "test", 30.0), ("mug", "train", 40.0)]
+    expected = [
+        f"BOP,{name},old,{part},1,1,{area},1,2,3.0,2,4,50,50,1.0,1,{area},{area},0,,,0,,"
+        for name, part, area in rows
+    ]
+    # what was chosen by another visibility is no earlier row of the same
+    assert lines[1:] == [*expected, "in the frame,mug,old,test,1"]
+
+
+def test_the_file_in_the_docs_stays_as_it_is_without_rows(
+    held_out: ModuleType, tmp_path: Path
+) -> None:
+    copy = tmp_path / "rows.csv"
+    copy.write_bytes(held_out.ROWS.read_bytes())
+    held_out.write_rows([], copy)
+    assert copy.read_bytes() == held_out.ROWS.read_bytes()
+    with copy.open(newline="") as file:
+        assert {len(cells) for cells in csv.reader(file)} == {len(held_out.HEAD)}

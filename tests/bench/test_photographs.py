@@ -75,15 +75,13 @@ def metrics(auc: float, instances: int) -> dict[str, Any]:
     }
 
 
-def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
-    tmp_path: Path,
-) -> None:
+def test_the_file_has_the_runs_that_are_there_and_keeps_the_others(tmp_path: Path) -> None:
     run, gone = photograph_runs.plan()[:2]
-    page = tmp_path / "page.md"
-    marks = [f"<!-- table: {title} -->" for title, _, _ in photographs.TABLES]
-    kept = f"| `{gone.name}` | a run that is no longer there |"
-    old = f"| run |\n| --- |\n| `{run.name}` | old |\n{kept}\n"
-    page.write_text("Above.\n" + "".join(f"{m}\n{old}<!-- end -->\nBelow.\n" for m in marks))
+    path = tmp_path / "runs.csv"
+    tests = [title for title, _, _ in photographs.TESTS]
+    kept = [f"{test},{gone.name},a run that is no longer there" for test in tests]
+    old = [f"{test},{run.name},old" for test in tests]
+    path.write_text("\n".join([",".join(photographs.HEAD), *old, *kept]) + "\n")
     values = {
         f"runs/{run.name}": metrics(99.0, 2),
         f"evals/{run.name}/renders": metrics(88.0, 60),
@@ -92,19 +90,49 @@ def test_the_tables_show_the_runs_that_are_there_and_leave_the_rest_of_the_page(
     for folder, content in values.items():
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "metrics.json").write_text(json.dumps(content))
-    photographs.write_tables(tmp_path, page)
-    text = page.read_text()
-    assert text.startswith("Above.\n")
-    assert text.count("\nBelow.\n") == 3
-    assert text.count(kept) == 3
-    assert text.count("old") == 1  # no run of few images
-    rows = [line for line in text.splitlines() if line.startswith(f"| `{run.name}`")]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in rows]
-    assert [each[5:7] for each in cells[:2]] == [[str(run.steps), "5.0"]] * 2
-    assert cells[0][7:] == ["60", "88.0", "89.0", "90.0", "90.0", "4.2", "25"]
-    assert cells[1][7:] == ["20", "77.0", "78.0", "90.0", "90.0", "4.2", "25"]
-    page_in_docs = photographs.PAGE.read_text()
-    assert all(mark in page_in_docs for mark in marks)
+    photographs.write_runs(tmp_path, path)
+    head, *rows = path.read_text().splitlines()
+    assert head == ",".join(photographs.HEAD)
+    assert rows[1::2] == kept
+    assert rows[4] == old[2]  # no run of few images
+    first = f"{run.name},{run.object},pose_pf"
+    end = f"cracker box,{run.steps},5.0"
+    assert rows[0].startswith(f"renders,{first},")
+    assert rows[0].endswith(f"{end},60,88.0,89.0,90.0,90.0,4.2,25")
+    assert rows[2].startswith(f"photographs,{first},")
+    assert rows[2].endswith(f"{end},20,77.0,78.0,90.0,90.0,4.2,25")
+
+
+def test_the_file_in_the_docs_stays_as_it_is_without_runs(tmp_path: Path) -> None:
+    copy = tmp_path / "runs.csv"
+    copy.write_bytes(photographs.RUNS.read_bytes())
+    photographs.write_runs(tmp_path, copy)
+    assert copy.read_bytes() == photographs.RUNS.read_bytes()
+
+
+def read_figures(page: Path, title: str) -> dict[str, list[str]]:
+    """Return the cells of the first table of objects below a heading of a page, by object."""
+    below = page.read_text().split(f"\n## {title}\n")[1].split("\n## ")[0]
+    found: dict[str, list[str]] = {}
+    for line in below.splitlines():
+        name, *cells = [cell.strip(" `") for cell in line.strip("|").split("|")]
+        if name[:1] == "0":
+            found.setdefault(name.removesuffix(".ckpt"), cells)
+    return found
+
+
+def test_the_figures_of_what_ships_are_those_beside_the_weights() -> None:
+    weights = HOME / "weights" / "README.md"
+    real = read_figures(weights, "Accuracy on real images")
+    rendered = read_figures(weights, "Accuracy on held-out synthetic images")
+    page = HOME / "docs" / "results" / "photographs.md"
+    shown = read_figures(page, "Accuracy of the pretrained weights")
+    assert set(shown) == set(real) == set(rendered) == set(photograph_runs.TARGETS)
+    for name, cells in shown.items():
+        photographed = ["–"] * 3 if real[name][1] == "in neither" else real[name][1:4]
+        assert cells[:3] == photographed, name
+        area, symmetric, recall = rendered[name][1:4]
+        assert cells[3:] == [area, symmetric.split(" ")[0], recall], name
 
 
 def _sample(rgb: np.ndarray) -> Sample:
