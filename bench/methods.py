@@ -41,6 +41,8 @@ TELLING_BOX = "s2_bounded,c1_normalization,c6_position"
 SHIPPED = "weights/003_cracker_box.ckpt"  # of pose_pf
 MEMORISED = "memorize/experiment=memorize,model={},seed=0,variant=working"
 HELD_OUT = "held_out/model={},seed=0"
+OTHER_RUN = "objects/{}/*model={},*"  # its name is cut
+OTHER_OBJECTS = ("009_gelatin_box", "006_mustard_bottle", "004_sugar_box", "002_master_chef_can")
 POSE_ROWS = "model=pose_pf sweep=ablation_pose"
 POSE_RUN = "ablation_pose/ablation={},model=pose_pf,seed=0,sweep=ablation_pose"
 # the paper's variant small enough for many rows; detectors at the unit at which they gain, since
@@ -175,6 +177,36 @@ def plan(meshes: str | None = None, frames: str | None = None) -> list[Line]:
         }
         runs["pose_pf"] = SHIPPED
         lines += [Line("real_frames", real, run, model) for model, run in runs.items()]
+    if meshes:
+        lines += list_other_objects(meshes, frames)
+    return lines
+
+
+def list_other_objects(meshes: str, frames: str | None) -> list[Line]:
+    """Return the methods in image space on other objects of YCB, for half of the cracker box's
+    steps, and on the photographs that show them.
+    """
+    lines = []
+    for name in OTHER_OBJECTS:
+        at = (
+            f"experiment=cracker_box_pixels data.object={name} data.root=outputs/data/{name} "
+            f"data.meshes={meshes} data/augment=camera_full_image seed=0"
+        )
+        for models, steps in ((DETECTORS, 1500), (WITH_POSE, 3000)):
+            size = f"trainer.max_steps={steps} trainer.val_check_interval={steps // 2}"
+            lines.append(Line("objects", f"model={','.join(models)} {at} {size}", into=name))
+    if frames:
+        real = "data=ycb_video data.root={} data.meshes={} data.object={}"
+        lines += [
+            Line(
+                "object_frames",
+                real.format(frames, meshes, name),
+                OTHER_RUN.format(name, model),
+                f"{name}/{model}",
+            )
+            for name in OTHER_OBJECTS
+            for model in MODELS
+        ]
     return lines
 
 
@@ -380,8 +412,11 @@ def command(line: Line, root: Path, more: Sequence[str] = ()) -> list[str]:
 
 
 def evaluated(of: str, root: Path) -> Path:
-    """Return the checkpoint of a run, or the one that is named."""
-    return Path(of) if of.endswith(".ckpt") else root / of / "checkpoints" / "best.ckpt"
+    """Return the checkpoint of a run, whose name may hold a `*`, or the one that is named."""
+    if of.endswith(".ckpt"):
+        return Path(of)
+    run = min(root.glob(of), default=root / of) if "*" in of else root / of
+    return run / "checkpoints" / "best.ckpt"
 
 
 def waits(line: Line, root: Path) -> bool:
@@ -391,7 +426,7 @@ def waits(line: Line, root: Path) -> bool:
     if line.of is None:
         return False
     checkpoint = evaluated(line.of, root)
-    if line.of != str(checkpoint) and not (root / line.of / "metrics.json").is_file():
+    if line.of != str(checkpoint) and not (checkpoint.parents[1] / "metrics.json").is_file():
         return True
     made = checkpoint.stat().st_mtime
     done = [
