@@ -23,10 +23,8 @@ from torch import Generator, Tensor
 from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
-from posefilter.errors import UserError
 from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.traces import map_traces
-from posefilter.protocols import HasObjectness
 from posefilter.types import Batch, ObjectModel, Trace
 
 DOUBTFUL = 0.5  # rank below which an answer is doubtful
@@ -73,10 +71,7 @@ class Searcher(Protocol):
 
 def read_objectness(encoding: Any) -> Tensor | None:
     """Return the objectness of each cell, (B, 1, h, w); None where an encoding has none."""
-    try:
-        return encoding.objectness if isinstance(encoding, HasObjectness) else None
-    except UserError:  # before Python 3.12 `isinstance` asks, and there is no proposal network
-        return None
+    return getattr(encoding, "objectness", None)
 
 
 def measure_worth(encoding: Any) -> Tensor:

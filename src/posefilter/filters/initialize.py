@@ -6,12 +6,11 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Encoding, HasObjectness, Initialize, Method, ProposesPoses
+from posefilter.protocols import Encoding, Initialize, Method, ProposesPoses
 from posefilter.types import Batch
 
 
@@ -66,29 +65,6 @@ def draw_from_depth(
     return pose_about(R, center, depth.new_tensor(space.center))
 
 
-def require_pose_space(method: Method, choice: str) -> PoseSpace:
-    """Return the method's space.
-
-    Raises:
-        UserError: The method's particles are not poses; the message names the choice.
-    """
-    if not isinstance(method.space, PoseSpace):
-        raise UserError(
-            f"filter/initialize={choice} draws poses, but the particles of "
-            f"{type(method).__name__} are pixels"
-        )
-    return method.space
-
-
-def require_pixel_space(method: Method, choice: str) -> None:
-    """Raise UserError, naming the choice, if the method's particles are poses."""
-    if isinstance(method.space, PoseSpace):
-        raise UserError(
-            f"filter/initialize={choice} draws pixels, but the particles of "
-            f"{type(method).__name__} are poses"
-        )
-
-
 class UniformPixels:
     """Pixels drawn uniformly over the image."""
 
@@ -98,7 +74,6 @@ class UniformPixels:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], over the whole area of the image's pixels."""
-        require_pixel_space(method, "uniform")
         B, _, H, W = batch.rgb.shape
         share = torch.rand(B, particles, 2, generator=generator, device=batch.rgb.device)
         return share * share.new_tensor([W, H]) - 0.5
@@ -120,7 +95,8 @@ class FromDepth:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
-        space = require_pose_space(method, "from_depth")
+        space = method.space
+        assert isinstance(space, PoseSpace)  # of what `requires` says
         return draw_from_depth(
             batch.depth,
             batch.intrinsics,
@@ -148,12 +124,6 @@ class FromObjectness:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], uniform within each drawn cell."""
-        require_pixel_space(method, "from_objectness")
-        if not isinstance(encoding, HasObjectness):
-            raise UserError(
-                f"filter/initialize=from_objectness: {type(method).__name__} makes no map of "
-                f"objectness; choose uniform"
-            )
         weight = encoding.objectness[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
         weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
@@ -176,11 +146,7 @@ class FromProposals:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
-        if not isinstance(method, ProposesPoses):
-            raise UserError(
-                f"filter/initialize=from_proposals: {type(method).__name__} proposes no "
-                f"poses; choose another start"
-            )
+        assert isinstance(method, ProposesPoses)  # of what `requires` says
         return method.propose_poses(encoding, particles, generator)
 
 
@@ -213,7 +179,6 @@ class Informed(nn.Module):
         count = round(self.object_fraction * particles)
         if not self.training or count == 0:
             return state
-        require_pixel_space(method, "informed")
         mask = batch.mask[:, 0].to(state.dtype)
         visible = (mask > 0).flatten(1).any(1)[:, None, None]
         near = draw_cells(torch.where(visible, mask, torch.ones_like(mask)), count, generator).to(

@@ -11,7 +11,6 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Propagate, Space
 from posefilter.types import Step
@@ -104,17 +103,8 @@ class AxisRotations:
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
-        """Return the states, some rotated.
-
-        Raises:
-            UserError: The particles are not poses.
-        """
-        if not isinstance(space, PoseSpace):
-            raise UserError(
-                "propagate: turns about an axis need particles that are poses; leave them out for "
-                "a "
-                "method on pixels"
-            )
+        """Return the states, some rotated."""
+        assert isinstance(space, PoseSpace)  # of what `requires` says
         size, device = state.shape[:2], state.device
         axis = torch.randint(3, size, generator=generator, device=device)
         moves = torch.rand(size, generator=generator, device=device) < self.probability
@@ -131,15 +121,7 @@ def half_turns(
     """Rotate poses, each with a probability, by pi about a random object axis through the center.
 
     (B, N, 4, 4) -> (B, N, 4, 4).
-
-    Raises:
-        UserError: The particles are not poses.
     """
-    if space.dimensions != 6:
-        raise UserError(
-            "propagate: half turns need particles that are poses; leave them out for "
-            "a method on pixels"
-        )
     B, N = poses.shape[:2]
     axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
     flip = torch.rand(B, N, generator=generator, device=poses.device) < probability

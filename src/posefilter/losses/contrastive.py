@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -46,16 +45,7 @@ class Contrastive:
     requires: ClassVar[Capabilities] = ("candidates",)
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
-        """Return the divergence of each image, (B,) >= 0.
-
-        Raises:
-            UserError: The trace's particles are not poses.
-        """
-        if trace.particles[-1].state.dim() != 4:
-            raise UserError(
-                "loss=contrastive judges candidate poses, not points: choose "
-                "model/candidate_sampler=poses, or loss=regression"
-            )
+        """Return the divergence of each image, (B,) >= 0."""
         poses, scores, sigma = (
             trace.outputs[-1].pose,
             trace.outputs[-1].log_likelihood,

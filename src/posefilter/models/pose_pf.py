@@ -10,7 +10,6 @@ from posefilter.capabilities import Capabilities
 from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
 from posefilter.confidence.features import measure_coordinates
 from posefilter.data.absent import hide_annotation
-from posefilter.errors import UserError
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -34,18 +33,9 @@ class PoseEncoding(NamedTuple):
     cells: Cells | None
 
     @property
-    def objectness(self) -> Tensor:
-        """The probability that each cell shows the object, (B, 1, h, w).
-
-        Raises:
-            UserError: There is no proposal network.
-        """
-        if self.coordinates is None:
-            raise UserError(
-                "filter/initialize=from_objectness needs the proposal network; "
-                "choose model/proposals=dense"
-            )
-        return torch.sigmoid(self.coordinates.logit)[:, None]
+    def objectness(self) -> Tensor | None:
+        """The probability that each cell shows the object, (B, 1, h, w); None without a network."""
+        return None if self.coordinates is None else torch.sigmoid(self.coordinates.logit)[:, None]
 
     @property
     def measured_depth(self) -> Tensor:
@@ -171,13 +161,10 @@ class PosePF(PoseParticles):
             camera_from_object (B, particles, 4, 4) [m].
 
         Raises:
-            UserError: There is no proposal network, or an image without any depth.
+            UserError: An image has no depth.
         """
-        if encoding.coordinates is None or encoding.cells is None:
-            raise UserError(
-                "filter/initialize=from_proposals needs the proposal network; "
-                "choose model/proposals=dense"
-            )
+        assert encoding.coordinates is not None
+        assert encoding.cells is not None
         if not self.training:
             require_depth(encoding.cells.valid)
         return draw_poses(
