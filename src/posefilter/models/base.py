@@ -521,23 +521,24 @@ class PoseEstimator(Module):
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics; the best checkpoint has the highest `val/score`."""
-        results = self.compute_metrics()
-        self._log_step()
-        self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
+        results = self._log_metrics("val")
         self.log("val/score", compute_checkpoint_score(results), prog_bar=True)
-
-    def _log_step(self) -> None:
-        """Have the logger put what is logged at the step that the model has come to: by itself
-        Lightning counts from 0, one less, and adds the epoch.
-        """
-        self.log("step", float(self.trainer.global_step))
-        self.log("epoch", float(self.trainer.current_epoch))
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
+        self._log_metrics("test")
+
+    def _log_metrics(self, split: str) -> dict[str, Any]:
+        """Log the metrics of a split, and return them.
+
+        The logger is to put them at the step that the model has come to: by itself Lightning counts
+        from 0, one less, and adds the epoch.
+        """
         results = self.compute_metrics()
-        self._log_step()
-        self.log_dict({f"test/{name}": value for name, value in flatten(results).items()})
+        self.log("step", float(self.trainer.global_step))
+        self.log("epoch", float(self.trainer.current_epoch))
+        self.log_dict({f"{split}/{name}": value for name, value in flatten(results).items()})
+        return results
 
     # -- checkpoints ------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
 from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, loss_weights_at
+from posefilter.models.zoom import with_encoding
 from posefilter.nets.encoders import ContextMap
 from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import fill_depth
@@ -71,7 +72,6 @@ class ImageSpace(PoseEstimator):
         truncate: Truncate backpropagation through positions and latents at every so many steps;
             None: never. Values do not change. A position still passes its own gradient on to the
             next, so over a long roll-out this damps the growth of gradients; only 1 ends it.
-        object_model: The object, if it is known already.
         **base: Arguments of `PoseEstimator`.
     """
 
@@ -105,7 +105,6 @@ class ImageSpace(PoseEstimator):
         objectness_weight: float = 1.0,
         detach_position: bool = False,
         truncate: int | None = None,
-        object_model: ObjectModel | None = None,
         **base: Any,
     ) -> None:
         super().__init__(**base)
@@ -131,8 +130,6 @@ class ImageSpace(PoseEstimator):
             detach_position,
             truncate,
         )
-        if object_model is not None:  # not in the base, where the pose head does not exist yet
-            self.set_object(object_model)
 
     @property
     def space(self) -> PixelSpace:
@@ -236,7 +233,7 @@ class ImageSpace(PoseEstimator):
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
         encoding = self.encode(batch)
-        trace: Trace = self.train_filter(batch, _EncodedMethod(self, encoding), generator)
+        trace: Trace = self.train_filter(batch, with_encoding(self, encoding), generator)
         losses = {"loss": self.loss(trace, batch, self.object_model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.object_model)
@@ -276,23 +273,6 @@ class ImageSpace(PoseEstimator):
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box that the box head computes, (B, 4) [px]."""
         return self.box_head(trace, batch, self.object_model)
-
-
-class _EncodedMethod:
-    """A method whose images are encoded: the roll-out and the objectness loss share them."""
-
-    def __init__(self, method: ImageSpace, encoding: ImageEncoding) -> None:
-        self.method, self.encoding = method, encoding
-        self.space, self.latent_width, self.measure = (
-            method.space,
-            method.latent_width,
-            method.measure,
-        )
-        self.surface_points, self.object_model = method.surface_points, method.object_model
-
-    def encode(self, batch: Batch) -> ImageEncoding:
-        """Return what was encoded before."""
-        return self.encoding
 
 
 def check_latent_width(width: int, required: int | None) -> None:
