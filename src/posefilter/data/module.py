@@ -19,7 +19,7 @@ from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.points import read_model_points
-from posefilter.data.prepare import Criteria, usable
+from posefilter.data.prepare import usable
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
@@ -265,7 +265,9 @@ class PoseDataModule(LightningDataModule):
         chosen, _ = usable(
             [found[i] for i in order],
             decoder.fetch,
-            Criteria(limit=limit, on_error="skip"),
+            0.0,
+            limit,
+            "skip",
             max(self._workers, 2),
             "decoding frames without the object",
             self._progress,
@@ -352,10 +354,15 @@ class PoseDataModule(LightningDataModule):
             order = np.random.default_rng([self._split_seed, first]).permutation(len(part))
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
-        want = Criteria(self._least[split], limit, self._on_error)
-        title = f"decoding {split} frames"
         chosen, self._left_out[split] = usable(
-            records, self._decoder.fetch, want, max(self._workers, 2), title, self._progress
+            records,
+            self._decoder.fetch,
+            self._least[split],
+            limit,
+            self._on_error,
+            max(self._workers, 2),
+            f"decoding {split} frames",
+            self._progress,
         )
         if part and not chosen and limit != 0:
             raise UserError(

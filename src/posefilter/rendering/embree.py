@@ -92,7 +92,7 @@ class EmbreeRenderer(Renderer):
         away = (n * rays.reshape(-1, 3)[hit.pixel]).sum(1) > 0
         n[away] *= -1
         normal.reshape(-1, 3)[hit.pixel] = n
-        texture = one.mesh.texture if one.texture is None else one.texture
+        texture = one.mesh.texture
         if mesh.uv is None:
             color = np.broadcast_to(texture[0, 0] / np.float32(255), n.shape)
         else:

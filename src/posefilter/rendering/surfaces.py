@@ -20,7 +20,6 @@ class Instance:
 
     mesh: Mesh
     camera_from_object: np.ndarray  # (4, 4) [m]; its linear part may scale
-    texture: np.ndarray | None = None  # (h, w, 3) uint8, instead of the mesh's own
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from posefilter.synthetic.scenes import (
     remove_target,
     shift_camera,
 )
-from posefilter.synthetic.sensor import sensor_model, simulate_sensor
+from posefilter.synthetic.sensor import simulate_sensor
 
 ATTEMPTS = 400
 RENDERERS = ("embree", "opengl")
@@ -109,7 +109,6 @@ class FrameRenderer:
         self.K = np.array(job.K)
         self.library = SolidStore(store or MeshStore(job.meshes, scale=job.mesh_scale))
         self.renderer = make_renderer(job.renderer)
-        self.sensor = sensor_model(job.sensor)
         self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
         self._scenario: tuple[int, Scenario] | None = None
 
@@ -234,7 +233,7 @@ class FrameRenderer:
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
         """Return a camera's color, depth and segmentation images, and its JSON record."""
-        photo, depth = simulate_sensor(picture.rgb, picture.depth, self.sensor, rng)
+        photo, depth = simulate_sensor(picture.rgb, picture.depth, self.job.sensor, rng)
         ids = np.array([*(exported[p.solid.mesh.name].seg_id for p in layout.placed), 0], np.uint8)
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
         objects = []

@@ -68,7 +68,8 @@ class Scenario:
     def at(self, frame: int) -> Layout:
         """Return the layout of a frame."""
         first = self.layout.placed[0]
-        target = Placed(first.solid, _move(first.camera_from_object, self.target[frame], first))
+        moved = _rigid(self.target[frame], first.center) @ first.camera_from_object
+        target = Placed(first.solid, moved)
         whole = _rigid(self.camera[frame], first.center)
         placed = tuple(
             Placed(one.solid, whole @ one.camera_from_object)
@@ -205,10 +206,6 @@ def _rigid(twist: np.ndarray, about: np.ndarray) -> np.ndarray:
     out[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix()
     out[:3, 3] = about + twist[:3] - out[:3, :3] @ about
     return out
-
-
-def _move(pose: np.ndarray, twist: np.ndarray, one: Placed) -> np.ndarray:
-    return _rigid(twist, one.center) @ pose
 
 
 def _stay_on_table(path: np.ndarray, layout: Layout) -> np.ndarray:
