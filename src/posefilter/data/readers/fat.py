@@ -35,7 +35,7 @@ from posefilter.data.readers.fat_settings import (
     scene_folders,
 )
 from posefilter.data.readers.naming import choose_objects, choose_several
-from posefilter.data.readers.plausible import check_camera, check_sample, narrow
+from posefilter.data.readers.plausible import check_camera
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_json
 from posefilter.meshes import ycb
@@ -144,18 +144,9 @@ class FatReader(BaseReader):
         if int(seg.max()) > _LARGEST_ID:
             raise BadData(seg_path, "no segment image", f"id {int(seg.max())}; is it the depth?")
         mask = self._mask(entry, seg, seg_path)
-        sample = Sample(
-            rgb,
-            depth,
-            mask,
-            narrow(camera.K),
-            narrow(entry.camera_from_object),
-            self.objects.index(record.object),
-            i,
-            float("nan"),
-        )
-        native = entry.camera_from_object @ np.linalg.inv(entry.kind.aligned_from_mesh)
-        return check_sample(sample, native, (camera_path, json_path, depth_path, seg_path))
+        files = (camera_path, json_path, depth_path, seg_path)
+        aligned = entry.kind.aligned_from_mesh
+        return self._make_sample(i, rgb, depth, mask, camera.K, aligned, files)
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
