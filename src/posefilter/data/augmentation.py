@@ -249,10 +249,8 @@ class DepthNoise:
         d = sample.depth
         coarse = rng.standard_normal((d.shape[0] // 2, d.shape[1] // 2), dtype=np.float32)
         grain = cv2.resize(coarse, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        factor, noise = (
-            np.float32(1 + rng.normal() * self.scale),
-            np.float32(self.noise * rng.uniform()),
-        )
+        factor = np.float32(1 + rng.normal() * self.scale)
+        noise = np.float32(self.noise * rng.uniform())
         # 0, unknown, stays 0
         return dataclasses.replace(sample, depth=d * (factor + d * grain * noise))
 

@@ -206,10 +206,8 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     """Return the sample that was packed."""
     height, width = one.shape
     rgb, depth = np.split(image, [3 * height * width])
-    rgb, depth = (
-        rgb.reshape(height, width, 3).copy(),
-        depth.view("<u2").reshape(height, width) / np.float32(_UNITS),
-    )
+    rgb = rgb.reshape(height, width, 3).copy()
+    depth = depth.view("<u2").reshape(height, width) / np.float32(_UNITS)
     mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
     return Sample(
         rgb,

@@ -120,10 +120,8 @@ class PoseDataModule(LightningDataModule):
         self._object, self._meshes, self._mesh_scale = object, meshes, mesh_scale
         self._options, self._generate = dict(options or {}), generate
         self._image_width, self._image_height = image_width, image_height
-        self._split, self._split_seed = (
-            dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}),
-            split_seed,
-        )
+        self._split = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1})
+        self._split_seed = split_seed
         self._least = {
             "train": min_visibility,
             "val": min_visibility_test,

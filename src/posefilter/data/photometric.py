@@ -113,10 +113,8 @@ class MotionBlur:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, blurred or not."""
-        chosen, length = (
-            rng.random() < self.probability,
-            rng.uniform(0, self.length) * sample.mask.shape[1],
-        )
+        chosen = rng.random() < self.probability
+        length = rng.uniform(0, self.length) * sample.mask.shape[1]
         kernel = motion_kernel(rng, max(1, round(float(length))))
         if not chosen or len(kernel) < 2:
             return sample
@@ -135,10 +133,8 @@ class Jpeg:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, compressed or not."""
-        chosen, quality = (
-            rng.random() < self.probability,
-            int(rng.integers(self.quality[0], self.quality[1] + 1)),
-        )
+        chosen = rng.random() < self.probability
+        quality = int(rng.integers(self.quality[0], self.quality[1] + 1))
         if not chosen:
             return sample
         _, data = cv2.imencode(".jpg", sample.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])

@@ -108,10 +108,8 @@ def find_neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
 def _blend(four: Sequence[np.ndarray], fx: Any, fy: Any) -> np.ndarray:
     """Return depth between four neighbors, above left to below right, at fractions of a pixel."""
     a, b, c, d = four
-    low, high = (
-        np.minimum(np.minimum(a, b), np.minimum(c, d)),
-        np.maximum(np.maximum(a, b), np.maximum(c, d)),
-    )
+    low = np.minimum(np.minimum(a, b), np.minimum(c, d))
+    high = np.maximum(np.maximum(a, b), np.maximum(c, d))
     between = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
     nearest = np.where(fy <= 0.5, np.where(fx <= 0.5, a, b), np.where(fx <= 0.5, c, d))
     return np.where((low > 0) & (high - low <= SMOOTH * low), between, nearest).astype(np.float32)

@@ -84,12 +84,9 @@ class PointToPlaneIcp:
         """Return the belief with the estimate moved; the score stays."""
         object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
         first = belief.best
-        x, y, z = object_model.center.tolist()
-        space = PoseSpace((x, y, z), object_model.radius)
-        center, own = (
-            object_model.center.to(first),
-            self.choose_points(object_model.points).to(first),
-        )
+        space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
+        center = object_model.center.to(first)
+        own = self.choose_points(object_model.points).to(first)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, 1, dtype=torch.float64)

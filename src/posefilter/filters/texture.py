@@ -391,8 +391,7 @@ def _rotate_particles(
         generator: Draws the turns, systematically: their shares are those of the posterior.
     """
     poses, best = belief.poses, belief.best
-    x, y, z = object_model.center.tolist()
-    space = PoseSpace((x, y, z), object_model.radius)
+    space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
     distance = space.distance(poses[:, :, None], (best[:, None] @ turns)[:, None])  # (B, N, S)
     nearest, at = distance.min(-1)
     back = torch.linalg.inv(turns)[at]

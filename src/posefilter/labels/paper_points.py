@@ -32,10 +32,8 @@ class PaperPoints:
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return labels (1, B, N)."""
-        offset, own_color = (
-            trace.particles[-1].state[..., 2],
-            trace.particles[-1].state[..., 3] > 0.5,
-        )
+        offset = trace.particles[-1].state[..., 2]
+        own_color = trace.particles[-1].state[..., 3] > 0.5
         label = torch.where(offset > self.tolerance, self.behind_label, 0.0)
         return torch.where((offset.abs() <= self.tolerance) & own_color, self.surface_label, label)[
             None

@@ -46,11 +46,9 @@ class Contrastive:
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
         """Return the divergence of each image, (B,) >= 0."""
-        poses, scores, sigma = (
-            trace.outputs[-1].pose,
-            trace.outputs[-1].log_likelihood,
-            trace.steps[-1].sigma,
-        )
+        poses = trace.outputs[-1].pose
+        scores = trace.outputs[-1].log_likelihood
+        sigma = trace.steps[-1].sigma
         distance = pose_distance(poses, batch.camera_from_object, object_model)
         target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)
         divergence = (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)

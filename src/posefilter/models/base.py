@@ -413,20 +413,17 @@ class PoseEstimator(Module):
         self.scores["particles_on_object"].update(
             batch.mask, self.particle_pixels(trace.particles[-1], batch)
         )
+        best, true_pose = trace.belief.best, batch.camera_from_object
         if "poses" in self.scores:
-            self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
-            self.scores["bop"].update(
-                trace.belief.best, batch.camera_from_object, batch.intrinsics, width
-            )
-            self.scores["by_visibility"].collect(
-                trace.belief.best, batch.camera_from_object, batch.visibility
-            )
-            self.scores["belief"].update(trace.belief, batch.camera_from_object)
-            seen = score_truth(trace.belief, batch.camera_from_object, self.object_model)
+            self.scores["poses"].update(best, true_pose)
+            self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
+            self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
+            self.scores["belief"].update(trace.belief, true_pose)
+            seen = score_truth(trace.belief, true_pose, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
             self.judge_confidence(trace, batch, present=True)
         if "parts" in self.scores:
-            self.scores["parts"].update(trace.belief.best, batch)
+            self.scores["parts"].update(best, batch)
 
     def last_assessment(self, count: int) -> Assessment:
         """Return the probabilities of the batch that the metrics took in last, of `count` images;

@@ -34,6 +34,8 @@ class ImageEncoding:
     depth: Tensor  # (B, 2, H, W): depth with its holes filled [m], and 1 where it was measured
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: ContextMap
+    # (B, 1, h, w), the probability that the cell shows the object; None where no encoder tells
+    objectness: Tensor | None
 
     @property
     def measured_depth(self) -> Tensor:
@@ -44,13 +46,6 @@ class ImageEncoding:
     def measured_color(self) -> Tensor:
         """Red, green and blue (B, 3, H, W) in [0, 1]."""
         return (self.image[:, :3] + 1) / 2
-
-
-@dataclass(frozen=True)
-class ObjectnessEncoding(ImageEncoding):
-    """Encoded images with an objectness map."""
-
-    objectness: Tensor  # (B, 1, h, w), the probability that the cell shows the object
 
 
 class ImageSpace(PoseEstimator):
@@ -108,12 +103,10 @@ class ImageSpace(PoseEstimator):
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.glimpse, self.encoder, self.pose_head, self.displacement = (
-            glimpse,
-            encoder,
-            pose_head,
-            displacement,
-        )
+        self.glimpse = glimpse
+        self.encoder = encoder
+        self.pose_head = pose_head
+        self.displacement = displacement
         self.net = net(
             extra=self.encoder.width + self.position_width,
             size=glimpse.size,
@@ -125,11 +118,9 @@ class ImageSpace(PoseEstimator):
         check_loss_schedule(self.loss_schedule, ["loss", "objectness", *(aux_losses or {})])
         for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
             check_latent_width(self.latent_width, getattr(component, "latent_width", None))
-        self.objectness_weight, self.detach_position, self.truncate = (
-            objectness_weight,
-            detach_position,
-            truncate,
-        )
+        self.objectness_weight = objectness_weight
+        self.detach_position = detach_position
+        self.truncate = truncate
 
     @property
     def space(self) -> PixelSpace:
@@ -146,10 +137,9 @@ class ImageSpace(PoseEstimator):
         context = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
-        if context.objectness is None:
-            return ImageEncoding(image, depth, batch.intrinsics, context)
-        objectness = torch.sigmoid(context.objectness)[:, None]
-        return ObjectnessEncoding(image, depth, batch.intrinsics, context, objectness)
+        logit = context.objectness
+        objectness = None if logit is None else torch.sigmoid(logit)[:, None]
+        return ImageEncoding(image, depth, batch.intrinsics, context, objectness)
 
     def measure(
         self, encoding: ImageEncoding, particles: Particles, step: Step, generator: Generator
@@ -237,7 +227,7 @@ class ImageSpace(PoseEstimator):
         losses = {"loss": self.loss(trace, batch, self.object_model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.object_model)
-        if isinstance(encoding, ObjectnessEncoding) and self.objectness_weight:
+        if encoding.objectness is not None and self.objectness_weight:
             losses["objectness"] = self.objectness_weight * objectness_loss(
                 encoding.context, batch.mask
             )

@@ -35,10 +35,8 @@ class PoseParticles(PoseEstimator):
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
         if self._space is None:
-            x, y, z = self.object_model.center.tolist()
-            self._space = PoseSpace(
-                (x, y, z), self.object_model.radius, points=self.object_model.points
-            )
+            own = self.object_model
+            self._space = PoseSpace(tuple(own.center.tolist()), own.radius, points=own.points)
         return self._space
 
     @property

@@ -93,16 +93,12 @@ class PosePF(PoseParticles):
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.likelihood, self.proposals, self.candidate_sampler = (
-            likelihood,
-            proposals,
-            candidate_sampler,
-        )
-        self.pixels, self.quasi_monte_carlo, self.train_pixels = (
-            pixels,
-            quasi_monte_carlo,
-            train_pixels,
-        )
+        self.likelihood = likelihood
+        self.proposals = proposals
+        self.candidate_sampler = candidate_sampler
+        self.pixels = pixels
+        self.quasi_monte_carlo = quasi_monte_carlo
+        self.train_pixels = train_pixels
         self.likelihood_batch_size = likelihood_batch_size
         self.proposal_weight = proposal_weight
 

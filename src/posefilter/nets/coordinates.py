@@ -181,10 +181,8 @@ def flatten_context(coordinates: Coordinates, height: int, width: int) -> Contex
     grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[
         ..., :rows, :columns
     ]
-    share, position = (
-        coordinates.log_prob.detach().exp().flatten(1),
-        coordinates.position.detach().flatten(1, 3),
-    )
+    share = coordinates.log_prob.detach().exp().flatten(1)
+    position = coordinates.position.detach().flatten(1, 3)
     shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])
     return Context(
         grid.flatten(2).transpose(1, 2).contiguous(),

@@ -118,10 +118,8 @@ class EmbreeRenderer(Renderer):
         index: np.ndarray,
     ) -> None:
         """Write a plane into the buffers where it is the nearest so far."""
-        R, origin = (
-            plane.camera_from_plane[:3, :3].astype(np.float32),
-            plane.camera_from_plane[:3, 3].astype(np.float32),
-        )
+        R = plane.camera_from_plane[:3, :3].astype(np.float32)
+        origin = plane.camera_from_plane[:3, 3].astype(np.float32)
         facing = rays @ R[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             z = np.float32(origin @ R[:, 2]) / facing

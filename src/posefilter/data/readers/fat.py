@@ -134,11 +134,9 @@ class FatReader(BaseReader):
         color_path, depth_path, seg_path, json_path = self._files(record)
         camera_path = json_path.with_name("_camera_settings.json")
         check_camera(camera.K, camera_path)
-        rgb, depth, seg = (
-            read_color(color_path),
-            read_depth(depth_path, DEPTH_UNITS),
-            read_label(seg_path),
-        )
+        rgb = read_color(color_path)
+        depth = read_depth(depth_path, DEPTH_UNITS)
+        seg = read_label(seg_path)
         for path, image in zip(record.files, (rgb, depth, seg), strict=False):
             expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
         if int(seg.max()) > _LARGEST_ID:

@@ -124,11 +124,9 @@ class YCBVideoReader(BaseReader):
         entry = self._entries[i]
         color_path, depth_path, label_path, meta_path = self._files(entry.record)
         check_camera(entry.K, meta_path)
-        rgb, depth, label = (
-            read_color(color_path),
-            read_depth(depth_path, entry.units),
-            read_label(label_path),
-        )
+        rgb = read_color(color_path)
+        depth = read_depth(depth_path, entry.units)
+        label = read_label(label_path)
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(label_path, label, height, width, color_path.name)
