@@ -194,9 +194,7 @@ class PasteOccluder:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with the occluder's color and depth pasted in and the mask cut."""
-        if rng.random() >= self.probability:
-            return sample
-        if not sample.mask.any():
+        if rng.random() >= self.probability or not sample.mask.any():
             return sample
         cut, a, b = draw_rectangle(sample.mask, self.size, sample.mask.shape[1], rng)
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
