@@ -23,6 +23,12 @@ def find_reason(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
+def check_choice(key: str, value: object, *choices: str) -> None:
+    """Raise UserError, naming the key, unless a setting is one of its choices."""
+    if value not in choices:
+        raise UserError(f"{key}={value!r} is unknown: choose {' or '.join(choices)}")
+
+
 def missing_package(what: str, package: str, extra: str) -> UserError:
     """Return the error of a package that is not installed.
 

@@ -52,11 +52,9 @@ def draw_from_depth(
     weight = (depth[:, 0] > 0).to(depth.dtype)
     if prior is not None:
         weight = weight * prior[:, 0]
-    empty = ~(weight > 0).flatten(1).any(1)
-    z = torch.where(empty[:, None, None], torch.ones_like(depth[:, 0]), depth[:, 0])
-    cell = draw_cells(
-        torch.where(empty[:, None, None], torch.ones_like(weight), weight), count, generator
-    )
+    empty = ~(weight > 0).flatten(1).any(1)[:, None, None]
+    z = torch.where(empty, 1.0, depth[:, 0])
+    cell = draw_cells(torch.where(empty, 1.0, weight), count, generator)
     depth_at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
     ray = rays(cell.to(depth.dtype), K)
     push = torch.empty_like(depth_at).uniform_(*depth_offset, generator=generator) * space.radius
@@ -181,10 +179,7 @@ class Informed(nn.Module):
             return state
         mask = batch.mask[:, 0].to(state.dtype)
         visible = (mask > 0).flatten(1).any(1)[:, None, None]
-        near = draw_cells(torch.where(visible, mask, torch.ones_like(mask)), count, generator).to(
-            state.dtype
-        )
-        near = near + self.sigma_px * torch.randn(
-            near.shape, generator=generator, device=state.device
-        )
+        near = draw_cells(torch.where(visible, mask, 1.0), count, generator).to(state.dtype)
+        noise = torch.randn(near.shape, generator=generator, device=state.device)
+        near = near + self.sigma_px * noise
         return torch.cat([torch.where(visible, near, state[:, :count]), state[:, count:]], dim=1)

@@ -11,7 +11,7 @@ from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.renderer import Renderer
-from posefilter.rendering.surfaces import Rendered
+from posefilter.rendering.surfaces import Rendered, project
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.motion import MotionSettings, Scenario, draw_scenario, is_possible
 from posefilter.synthetic.placing import View
@@ -252,10 +252,7 @@ class FrameRenderer:
 
     def _truncated(self, hull: np.ndarray) -> float:
         """Return the fraction of a hull's outline, by area, that is out of the frame."""
-        pixels = (
-            hull[:, :2] / hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [self.K[0, 2], self.K[1, 2]]
-        ).astype(np.float32)
-        outline = cv2.convexHull(pixels)
+        outline = cv2.convexHull(project(hull, self.K).astype(np.float32))
         w, h = self.job.width - 0.5, self.job.height - 0.5
         frame = np.array([[[-0.5, -0.5]], [[w, -0.5]], [[w, h]], [[-0.5, h]]], np.float32)
         inside, _ = cv2.intersectConvexConvex(outline, frame)
