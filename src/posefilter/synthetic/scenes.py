@@ -5,6 +5,7 @@ the look-alikes. Each of its frames has its own camera, layout and lights.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -91,13 +92,7 @@ class SolidStore:
 
     def __init__(self, store: MeshStore) -> None:
         self.store = store
-        self._solids: dict[str, Solid] = {}
-
-    def solid(self, name: str) -> Solid:
-        """Return a mesh as a solid."""
-        if name not in self._solids:
-            self._solids[name] = make_solid(self.store.load(name))
-        return self._solids[name]
+        self.solid = cache(lambda name: make_solid(store.load(name)))
 
 
 def choose_distractors(
