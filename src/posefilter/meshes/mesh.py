@@ -27,7 +27,7 @@ def _identity() -> np.ndarray:
     return np.eye(4)[None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """A textured triangle mesh in its file's own frame [m].  Treat the arrays as read-only.
 
