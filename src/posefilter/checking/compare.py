@@ -109,11 +109,9 @@ def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str 
         fits = [compare(v, geometry, None, _shifted(v.sample.intrinsics, shift)) for v in views]
         after = float(np.median([fit.iou for fit in fits]))
         if 1 - after < 0.4 * (1 - before) and after - before > 0.004:
-            corner = (
-                "pixel corners, not centers, have whole numbers"
-                if shift < 0
-                else "half a pixel was taken off twice"
-            )
+            corner = "half a pixel was taken off twice"
+            if shift < 0:
+                corner = "pixel corners, not centers, have whole numbers"
             ious = f"silhouette IoU {before:.3f}, corrected {after:.3f}"
             return f"the principal point is off by {-shift:+.1f} px: {corner} ({ious})"
     return None

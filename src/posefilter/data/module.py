@@ -325,14 +325,11 @@ class PoseDataModule(LightningDataModule):
         """Return a sentence about a split."""
         own = self.describe()["splits"][split]
         left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
-        shown = (
-            f"{own['frames']} frames"
-            if own["frames"] == own["images"]
-            else f"{own['frames']} instances in {own['images']} images"
-        )
-        return f"{split}: {shown} of {own['scenes']} scenes" + (
-            f"; left out: {left}" if left else ""
-        )
+        shown = f"{own['frames']} frames"
+        if own["frames"] != own["images"]:
+            shown = f"{own['frames']} instances in {own['images']} images"
+        more = f"; left out: {left}" if left else ""
+        return f"{split}: {shown} of {own['scenes']} scenes{more}"
 
     def _dataset(self, split: str) -> FrameDataset:
         if split not in NAMES:

@@ -83,11 +83,9 @@ def _one_texture(raw: RawMesh, path: Path) -> tuple[np.ndarray | None, np.ndarra
     pictures = [_picture(raw.materials[i]) for i in used]
     if len(used) == 1 and (raw.corner_uv is None or pictures[0].shape[:2] == (1, 1)):
         return None, pictures[0][:1, :1]
-    uv = (
-        np.zeros((len(raw.faces), 3, 2))
-        if raw.corner_uv is None
-        else raw.corner_uv.astype(np.float64)
-    )
+    uv = np.zeros((len(raw.faces), 3, 2))
+    if raw.corner_uv is not None:
+        uv = raw.corner_uv.astype(np.float64)
     if len(used) == 1:
         return uv.astype(np.float32), pictures[0]
     height = max(p.shape[0] for p in pictures)

@@ -55,11 +55,9 @@ class BaseReader:
 
     def visible_share(self, sample: Sample) -> float:
         """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
-        return (
-            float("nan")
-            if self._geometry is None
-            else self._geometry.visible_share(self.objects[sample.object_id], sample)
-        )
+        if self._geometry is None:
+            return float("nan")
+        return self._geometry.visible_share(self.objects[sample.object_id], sample)
 
     def _files(self, record: FrameRecord) -> tuple[Path, ...]:
         """Return a record's files.

@@ -204,11 +204,9 @@ class FatReader(BaseReader):
             try:
                 if camera not in known:
                     raise BadData(folder / "_camera_settings.json", f"no camera named '{camera}'")
-                color = (
-                    f"{stem}.png"
-                    if f"{stem}.png" in names and f"{stem}.jpg" not in names
-                    else f"{stem}.jpg"
-                )
+                color = f"{stem}.jpg"
+                if color not in names and f"{stem}.png" in names:
+                    color = f"{stem}.png"
                 files = tuple(
                     folder / x
                     for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
@@ -231,51 +229,35 @@ class FatReader(BaseReader):
         content = read_json(check_inside(path, self.root))
         found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
         for k, one in enumerate(need_list(content, "objects", path)):
-            name = mesh_name(need(one, "class", path, f"objects[{k}]."), path)
+            where = f"objects[{k}]."
+            name = mesh_name(need(one, "class", path, where), path)
             if name not in classes:
                 raise BadData(
                     path, "unknown class", f"'{name}' is not in the folder's _object_settings.json"
                 )
             if name in self.objects:
-                pose = (
-                    camera_from_aligned(one, path, f"objects[{k}].")
-                    @ classes[name].aligned_from_mesh
-                )
-                visibility = (
-                    float(numbers(one, "visibility", path, (), f"objects[{k}]."))
-                    if "visibility" in one
-                    else 1.0
-                )
+                pose = camera_from_aligned(one, path, where) @ classes[name].aligned_from_mesh
+                visibility = 1.0
+                if "visibility" in one:
+                    visibility = float(numbers(one, "visibility", path, (), where))
                 found.setdefault(name, []).append((k, pose, visibility))
         entries = []
+        # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
+        group = path.parent.name
+        scene = path.parent.relative_to(self.root).as_posix() if path.parent != self.root else group
+        image = f"{scene}/{path.name.removesuffix('.json')}"
         for name, many in found.items():
             if len(many) > 1 and self._geometry is None:
-                self.skipped["two instances of one class, and no meshes to tell them apart"] += len(
-                    many
-                )
+                why = "two instances of one class, and no meshes to tell them apart"
+                self.skipped[why] += len(many)
                 continue
             if len(many) > 1:
                 self.notes["masks split between instances of one class by geometry"] += len(many)
             twins = tuple(pose for _, pose, _ in many)
+            listed = name in ycb.CLASSES
+            number = ycb.ycbvideo_index(name) if listed else classes[name].seg_id
             for twin, (k, pose, visibility) in enumerate(many):
-                scene = (
-                    path.parent.relative_to(self.root)
-                    if path.parent != self.root
-                    else Path(path.parent.name)
-                )
-                record = FrameRecord(
-                    name=f"{scene.as_posix()}/{path.name.removesuffix('.json')}",
-                    # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
-                    group=path.parent.name,
-                    scene_id=scene_id,
-                    im_id=im_id,
-                    obj_id=ycb.ycbvideo_index(name)
-                    if name in ycb.CLASSES
-                    else classes[name].seg_id,
-                    object=name,
-                    instance=k,
-                    files=files,
-                )
+                record = FrameRecord(image, group, scene_id, im_id, number, name, k, files)
                 entries.append(_Entry(record, classes[name], camera, pose, visibility, twins, twin))
         return entries
 
