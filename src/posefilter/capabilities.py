@@ -9,34 +9,11 @@ and drawn by these names alone.
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from posefilter.errors import UserError
 
-Capability = Literal[
-    "heatmaps",
-    "candidates",
-    "color",
-    "correspondences",
-    "depth",
-    "displacement",
-    "free_latent",
-    "grid_scores",
-    "image_patches",
-    "score_points",
-    "score_samples",
-    "object_coordinates",
-    "pixel_space",
-    "pose",
-    "pose_space",
-    "propose_poses",
-    "ray_samples",
-    "objectness",
-    "rollout",
-    "score_poses",
-    "surface_point_loss",
-    "surface_points",
-]
+Capability = str  # one of `MEANINGS`
 Capabilities = tuple[Capability, ...]
 
 # what is needed where a name is required, after "needs"

@@ -23,6 +23,12 @@ def find_reason(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
+def check_choice(key: str, value: object, *choices: str) -> None:
+    """Raise UserError, naming the key, unless a setting is one of its choices."""
+    if value not in choices:
+        raise UserError(f"{key}={value!r} is unknown: choose {' or '.join(choices)}")
+
+
 def missing_package(what: str, package: str, extra: str) -> UserError:
     """Return the error of a package that is not installed.
 
@@ -49,12 +55,11 @@ class BadData(UserError):  # noqa: N818
     """A file of a dataset is not as it should be.  `cause` groups the like for counting."""
 
     def __init__(self, path: Path, cause: str, detail: str = "") -> None:
-        super().__init__(f"{path}: {cause}" + (f" ({detail})" if detail else ""))
+        super().__init__(path, cause, detail)
         self.path, self.cause, self.detail = path, cause, detail
 
-    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
-        """Survive the way from one process to another."""
-        return BadData, (self.path, self.cause, self.detail)
+    def __str__(self) -> str:
+        return f"{self.path}: {self.cause}" + (f" ({self.detail})" if self.detail else "")
 
 
 class Carrier(BaseException):

@@ -49,7 +49,5 @@ def test_auxiliary_resampling_keeps_the_weighted_mean_and_prefers_the_object() -
 
 
 def test_auxiliary_resampling_needs_a_map() -> None:
-    with pytest.raises(UserError, match="no map of objectness"):
-        AuxiliaryResampling(Systematic()).bind(object(), 60, 80)
     with pytest.raises(UserError, match="bound"):
         AuxiliaryResampling(Systematic())(cloud_of(4, 0), 4, PixelSpace(), torch.Generator())

@@ -14,11 +14,12 @@ from posefilter.filters.candidates import (
     sample_around_truth,
     sample_from_depth,
 )
-from posefilter.filters.propagate import HalfTurnRotations, half_turns
+from posefilter.filters.propagate import HalfTurnRotations
 from posefilter.geometry.camera import project
 from posefilter.geometry.pose import make_pose, origin_of
 from posefilter.geometry.rotation import angle_between, exp_so3
 from posefilter.geometry.spaces import PoseSpace
+from posefilter.types import Step
 
 MODEL = square()
 SPACE = PoseSpace((0.0, 0.0, 0.0), MODEL.radius)
@@ -71,7 +72,8 @@ def test_half_turns_are_half_turns_about_the_center() -> None:
     batch = scenes(2)
     center = torch.tensor([0.03, 0.01, -0.02])
     poses = batch.camera_from_object[:, None].expand(-1, 6, -1, -1)
-    turned = half_turns(poses, PoseSpace((0.03, 0.01, -0.02), MODEL.radius), generator())
+    space, step = PoseSpace((0.03, 0.01, -0.02), MODEL.radius), Step(0, 1, torch.tensor(0.1))
+    turned = HalfTurnRotations(1.0)(poses, poses, step, space, generator())
     torch.testing.assert_close(origin_of(turned, center), origin_of(poses, center))
     assert (angle_between(turned[..., :3, :3], poses[..., :3, :3]) - torch.pi).abs().max() < 2e-3
 

@@ -176,12 +176,6 @@ def test_normals_of_a_slope_and_none_at_edges() -> None:
     assert torch.allclose(seen.points[0, 0] @ normal, torch.tensor(-0.8), atol=1e-5)
 
 
-def test_a_method_without_depth_is_refused() -> None:
-    for encoding, one in (((), method()), (look(CORNER), SimpleNamespace())):
-        with pytest.raises(UserError, match="no depth to align poses with"):
-            PointToPlaneIcp()(belief(CORNER[None]), encoding, one, Generator())
-
-
 @pytest.mark.parametrize(
     "wrong", [{"iterations": 0}, {"prior": 0}, {"initial_gate": 0.001}, {"points": 0}]
 )

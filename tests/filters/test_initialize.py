@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch import Generator, Tensor
 
-from posefilter.errors import UserError
 from posefilter.filters.initialize import (
     FromDepth,
     FromObjectness,
@@ -157,21 +156,6 @@ def test_informed_starts_read_the_mask_in_training_only() -> None:
 
 
 @pytest.mark.parametrize(
-    ("piece", "method", "words"),
-    [
-        (UniformPixels(), Poses(), "filter/initialize=uniform draws pixels"),
-        (FromObjectness(), Poses(), "filter/initialize=from_objectness draws pixels"),
-        (FromDepth(), Pixels(), "filter/initialize=from_depth draws poses"),
-        (FromObjectness(), Pixels(), "no map of objectness"),
-        (FromProposals(), Pixels(), "proposes no poses"),
-    ],
-)
-def test_what_does_not_fit_is_refused(piece: Initialize, method: object, words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        run(piece, method)
-
-
-@pytest.mark.parametrize(
     "piece",
     [UniformPixels(), FromObjectness(), Informed(UniformPixels())],
     ids=lambda x: type(x).__name__,
@@ -216,8 +200,3 @@ def test_none_one_or_all_of_two_start_at_the_object(fraction: float, near: int) 
     assert torch.equal(state[:, near:], plain[:, near:])
     assert overlaps_mask(images().mask, state)[0, :near].all()
     assert not overlaps_mask(images().mask, state)[0, near:].any()
-
-
-def test_an_informed_start_is_of_pixels() -> None:
-    with pytest.raises(UserError, match="filter/initialize=informed draws pixels"):
-        run(Informed(FromDepth()).train(), Poses())

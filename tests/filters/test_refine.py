@@ -10,7 +10,7 @@ from posefilter.errors import UserError
 from posefilter.filters.refine import Compose, Gradient, MeanShift, NoRefine, Rescore
 from posefilter.geometry.pose import is_rigid, make_pose, origin_of, rotation_of
 from posefilter.geometry.rotation import random_rotation
-from posefilter.geometry.spaces import PixelSpace, PoseSpace
+from posefilter.geometry.spaces import PoseSpace
 from posefilter.types import BeliefBatch
 
 SPACE = PoseSpace((0.05, 0.0, -0.02), 0.1)
@@ -182,12 +182,6 @@ def test_chains_and_nothing() -> None:
     assert off(found).max() < 0.002
 
 
-def test_what_cannot_be_refined_is_refused() -> None:
-    class Blind:
-        space = PixelSpace()
-
-    for piece in (Rescore(), MeanShift(), Gradient()):
-        with pytest.raises(UserError, match="Blind cannot score poses"):
-            piece(belief_around(0.02), truth(), Blind(), Generator())
+def test_a_gradient_is_refused_where_there_are_none() -> None:
     with torch.inference_mode(), pytest.raises(UserError, match="inference_mode"):
         Gradient()(belief_around(0.02), truth(), Peak(), Generator())

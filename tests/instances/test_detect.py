@@ -14,7 +14,7 @@ from posefilter.errors import UserError
 from posefilter.estimator import count_instances
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.pose import make_pose
-from posefilter.instances.detect import Detection, SearchSettings, detect
+from posefilter.instances.detect import Detection, detect
 from posefilter.models.base import PoseEstimator
 from posefilter.types import Batch, BeliefBatch, ObjectModel, Trace
 
@@ -92,9 +92,9 @@ def draw(squares: Sequence[tuple[int, int, int, float]]) -> Batch:
     )
 
 
-def run(toys: list[Toy], counts: list[int], batch: Batch, **more: Any) -> list[Detection]:
+def run(toys: list[Toy], counts: list[int], batch: Batch) -> list[Detection]:
     methods = [cast(PoseEstimator, toy) for toy in toys]
-    found, seconds = detect(methods, [batch] * len(toys), counts, Costs(), SearchSettings(**more))
+    found, seconds = detect(methods, [batch] * len(toys), counts, Costs())
     assert len(seconds) == len(toys)
     return found
 
@@ -167,7 +167,7 @@ def test_the_more_probable_class_keeps_the_pixels() -> None:
     assert corners(turned) == places
 
 
-def test_a_doubtful_answer_is_followed_by_another_search() -> None:
+def test_a_doubtful_answer_is_followed_by_another_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """The brightest may be something that only looks alike: here it is believed by half."""
 
     class Doubtful(Toy):
@@ -178,7 +178,8 @@ def test_a_doubtful_answer_is_followed_by_another_search() -> None:
 
     (one,) = run([Doubtful(0)], [1], draw(THREE))
     assert one.probability == pytest.approx(0.9)
-    (one,) = run([Doubtful(0)], [1], draw(THREE), spare=0)
+    monkeypatch.setattr("posefilter.instances.detect._SPARE", 0)
+    (one,) = run([Doubtful(0)], [1], draw(THREE))
     assert one.probability == pytest.approx(0.5)
 
 

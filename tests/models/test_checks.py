@@ -9,12 +9,30 @@ import pytest
 import torch
 from tests.models.toy import scenes, square
 
+from posefilter.capabilities import check_parts
 from posefilter.cli.checkpoints import build_method, recipe
 from posefilter.cli.command import compose_job
 from posefilter.errors import UserError
 from posefilter.filters.agreement import Agreement
+from posefilter.filters.auxiliary import AuxiliaryResampling
 from posefilter.filters.estimate import Argmax
+from posefilter.filters.icp import PointToPlaneIcp
+from posefilter.filters.importance import ImportanceSampling
+from posefilter.filters.initialize import (
+    FromDepth,
+    FromObjectness,
+    FromProposals,
+    Informed,
+    UniformPixels,
+)
+from posefilter.filters.propagate import AxisRotations, HalfTurnRotations
+from posefilter.filters.refine import Gradient, MeanShift, Rescore
 from posefilter.filters.resample import Systematic
+from posefilter.filters.resample_move import ResampleMove
+from posefilter.filters.texture import TextureRotations
+from posefilter.labels.paper_points import PaperPoints
+from posefilter.losses.contrastive import Contrastive
+from posefilter.losses.regression import Regression
 from posefilter.models.base import PoseEstimator
 from posefilter.models.image_space import ImageSpace, check_particle_counts
 from posefilter.nets.mlp import PatchNet
@@ -51,6 +69,51 @@ def test_agreement_is_refused_where_no_particle_knows_its_surface_point_of_the_o
     build(tmp_path, *choice.split())
 
 
+class Pixels:
+    """A method whose particles are pixels, and a part of it."""
+
+    provides = ("pixel_space", "pose")
+
+    def __init__(self, part: object) -> None:
+        self.part = part
+
+
+class Poses(Pixels):
+    """The same, whose particles are poses."""
+
+    provides = ("pose_space", "pose")
+
+
+@pytest.mark.parametrize(
+    ("method", "part", "need"),
+    [
+        (Poses, UniformPixels(), "pixel_space"),
+        (Poses, Informed(FromDepth()), "pixel_space"),
+        (Pixels, FromDepth(), "pose_space"),
+        (Pixels, FromObjectness(), "objectness"),
+        (Poses, FromProposals(), "propose_poses"),
+        (Pixels, AuxiliaryResampling(Systematic()), "objectness"),
+        (Pixels, HalfTurnRotations(), "pose_space"),
+        (Pixels, AxisRotations(), "pose_space"),
+        (Pixels, Agreement(), "surface_points"),
+        (Poses, Rescore(), "score_poses"),
+        (Poses, MeanShift(), "score_poses"),
+        (Poses, Gradient(), "score_poses"),
+        (Poses, ImportanceSampling(), "score_poses"),
+        (Poses, ResampleMove(), "score_poses"),
+        (Poses, PointToPlaneIcp(), "depth"),
+        (Poses, TextureRotations(), "color"),
+        (Poses, Contrastive(), "candidates"),
+        (Poses, Regression(PaperPoints()), "ray_samples"),
+    ],
+)
+def test_a_part_is_refused_by_a_method_that_has_not_what_it_needs(
+    method: type[Pixels], part: object, need: str
+) -> None:
+    with pytest.raises(UserError, match=rf"needs .* \({need}\), which none of its parts provides"):
+        check_parts(method(part))
+
+
 @pytest.mark.parametrize("model", ["patch_pf", "pixel_pf"])
 @pytest.mark.parametrize("train_rollout", ["full", "short"])
 def test_agreement_serves_both_pose_methods_before_they_know_their_object(
@@ -66,27 +129,18 @@ def test_agreement_serves_both_pose_methods_before_they_know_their_object(
     assert isinstance(method.filter.estimate, Agreement)
 
 
-def test_a_filter_that_agrees_refuses_poses_as_particles_when_it_runs(tmp_path: Path) -> None:
-    small = [
-        "filter.particles=8",
-        "filter.initial_particles=null",
-        "filter.steps=1",
-        "filter/refine=none",
-    ]
+def test_a_part_that_is_put_in_later_is_refused_when_the_object_is_set(tmp_path: Path) -> None:
     method = build(
         tmp_path,
         "filter/initialize=from_depth",
         "model/proposals=none",
         "model/likelihood=pointwise",
-        *small,
-    ).eval()
+    )
     assert isinstance(method.filter.estimate, Argmax)
-    with torch.no_grad():
-        assert method.predict_step(scenes(1), 0).belief.best.isfinite().all()
-        method.filter.estimate = Agreement()
-        with pytest.raises(UserError) as refusal:
-            method.predict_step(scenes(1), 0)
-    one_line(refusal, "filter/estimate=agreement", "PosePF", "filter/estimate=argmax")
+    method.filter.estimate = Agreement()
+    with pytest.raises(UserError) as refusal:
+        method.set_object(method.object_model)
+    one_line(refusal, "PosePF", "Agreement", "surface_points")
 
 
 @pytest.mark.parametrize("variant", ["paper", "working"])

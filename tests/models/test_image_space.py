@@ -98,9 +98,10 @@ def working(kind: type[ImageSpace], size: int, **changes: Any) -> ImageSpace:
         "train_filter": run_filter(64, 2, Informed(UniformPixels(), 0.5, 5.0)),
         "loss": Chamfer(size) if detects else Confidence(OnObject(size)),
         "optimizer": partial(torch.optim.AdamW, lr=3e-3),
-        "object_model": square(),
     }
-    return kind(**(parts | changes))
+    method = kind(**(parts | changes))
+    method.set_object(square())
+    return method
 
 
 def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> ImageSpace:
@@ -115,9 +116,10 @@ def paper(kind: type[ImageSpace], size: int, steps: int = 3, **changes: Any) -> 
         "filter": run_filter(50, steps),
         "loss": Chamfer(size) if detects else Add(),
         "optimizer": partial(torch.optim.Adam, lr=1e-3),
-        "object_model": square(),
     }
-    return kind(**(parts | changes))
+    method = kind(**(parts | changes))
+    method.set_object(square())
+    return method
 
 
 def teach(method: ImageSpace, steps: int, seed: int = 0) -> None:

@@ -155,13 +155,6 @@ def test_neither_mask_nor_truth_is_used(trained: PosePF) -> None:
     assert torch.equal(a.best, b.best)
 
 
-def test_without_proposals_the_start_must_be_another(trained: PosePF) -> None:
-    method = working()
-    method.proposals = None
-    with pytest.raises(UserError, match="model/proposals=dense"):
-        error(method, 1)
-
-
 def test_the_papers_samples_lie_along_the_rays() -> None:
     method = PosePF(
         PaperLikelihood(),
@@ -230,11 +223,15 @@ def test_every_ray_of_an_image_has_the_same_weight_and_padding_none() -> None:
     ).all()
 
 
-def test_labeled_rays_refuse_another_likelihood() -> None:
+def test_labeled_rays_and_a_start_from_proposals_refuse_another_method() -> None:
     method = working()
-    method.candidate_sampler = LabeledRays()
-    with pytest.raises(UserError, match="model/likelihood=paper"):
-        method.training_losses(scenes(1), torch.Generator().manual_seed(0))
+    method.candidate_sampler, method.loss = LabeledRays(), Regression(PaperPoints())
+    with pytest.raises(UserError, match=r"LabeledRays needs a likelihood that .*\(score_samples\)"):
+        method.set_object(method.object_model)
+    method = working()
+    method.proposals = None
+    with pytest.raises(UserError, match=r"FromProposals needs .*\(propose_poses\)"):
+        method.set_object(method.object_model)
 
 
 def test_candidates_hold_the_truth_whatever_the_camera() -> None:

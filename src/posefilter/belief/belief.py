@@ -456,8 +456,7 @@ class Belief:
 
     @property
     def _space(self) -> PoseSpace:
-        x, y, z = self.center.tolist()
-        return PoseSpace((x, y, z), self.radius)
+        return PoseSpace(tuple(self.center.tolist()), self.radius)
 
     def _mean(self, samples: Tensor, weights: Tensor) -> Tensor:
         return self._space.mean(samples, weights)

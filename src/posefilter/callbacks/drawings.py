@@ -33,7 +33,7 @@ from posefilter.figures.silhouettes import draw_silhouettes, outline_hulls, proj
 from posefilter.figures.trajectories import draw_glimpses, draw_trajectories
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
-from posefilter.protocols import HasImagePatches, HasObjectness, ProposesPoses, ScoresPoses
+from posefilter.protocols import HasImagePatches, ProposesPoses, ScoresPoses
 from posefilter.types import Batch, Trace
 
 
@@ -193,7 +193,7 @@ def proposals(o: Occasion) -> Drawn:
 @needs("pixel_space")
 def objectness(o: Occasion) -> Drawn:
     """Draw the map of objectness beside where particles started and ended."""
-    if not isinstance(o.encoding, HasObjectness):
+    if getattr(o.encoding, "objectness", None) is None:
         return None
     history = [
         (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())

@@ -2,13 +2,15 @@
 they disagree.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from posefilter.data.frames import Sample
 from posefilter.data.silhouette import Geometry
+from posefilter.geometry.camera import resize_intrinsics
 from posefilter.meshes import ycb
 from posefilter.meshes.store import Mesh
 
@@ -40,17 +42,6 @@ class Fit:
     depth_ratio: float  # median of measured over rendered depth, NaN without a common pixel
     ratio_spread: float  # half the width of its middle half
     visible_share: float
-
-
-Change = Callable[[View], tuple[np.ndarray, np.ndarray]]  # -> camera_from_object (4, 4), K (3, 3)
-
-
-@dataclass(frozen=True)
-class Cause:
-    """Something that may be wrong with a dataset: undo it, and mesh and frame agree."""
-
-    words: str
-    undo: Change
 
 
 def compare(
@@ -92,8 +83,10 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
     """Return in words what is probably wrong with poses, frames, intrinsics and depth; `before`:
     the median IoU as it is.
     """
+    tried = zip(*map(list_causes, views), strict=True)  # a cause, of each view
     fits = [
-        [compare(view, geometry, *cause.undo(view)) for view in views] for cause in causes(views[0])
+        [compare(view, geometry, *undone[1:]) for view, undone in zip(views, cause, strict=True)]
+        for cause in tried
     ]
     scores = [float(np.median([fit.iou for fit in each])) for each in fits]
     best = int(np.argmax(scores))
@@ -101,8 +94,8 @@ def likely_causes(views: Sequence[View], geometry: Geometry, before: float) -> l
     found, judged = [], as_read
     if scores[best] > before + max(0.05, 0.5 * (1 - before)) and scores[best] > 0.7:
         found.append(
-            f"{causes(views[0])[best].words} (silhouette IoU {before:.2f}, with that "
-            f"undone {scores[best]:.2f})"
+            f"{list_causes(views[0])[best][0]} (silhouette IoU {before:.2f}, with that undone "
+            f"{scores[best]:.2f})"
         )
         judged = fits[best]
     return found + _depth_scale(judged)
@@ -116,32 +109,41 @@ def half_pixel(views: Sequence[View], geometry: Geometry, before: float) -> str 
         fits = [compare(v, geometry, None, _shifted(v.sample.intrinsics, shift)) for v in views]
         after = float(np.median([fit.iou for fit in fits]))
         if 1 - after < 0.4 * (1 - before) and after - before > 0.004:
-            corner = (
-                "pixel corners, not centers, have whole numbers"
-                if shift < 0
-                else "half a pixel was taken off twice"
-            )
+            corner = "half a pixel was taken off twice"
+            if shift < 0:
+                corner = "pixel corners, not centers, have whole numbers"
             ious = f"silhouette IoU {before:.3f}, corrected {after:.3f}"
             return f"the principal point is off by {-shift:+.1f} px: {corner} ({ious})"
     return None
 
 
-def causes(view: View) -> list[Cause]:
-    """Return every cause that is tried, with how to undo it."""
+def list_causes(view: View) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return every cause that is tried: in words, with the pose (4, 4) and the camera (3, 3) that
+    undo it.
+    """
+    pose, K, mesh = view.sample.camera_from_object, view.sample.intrinsics, view.native_from_mesh
+    native = pose @ np.linalg.inv(mesh)
     width = view.sample.mask.shape[1]
-    units = {k: _UNITS.get(k, f"are too small by a factor of {k:g}") for k in _POWERS}
-    return [
-        *(Cause(f"translations {words}", _scaled(k)) for k, words in units.items()),
-        Cause("poses are the wrong way round (object from camera)", _inverse),
-        Cause("rotations are transposed", _transposed),
-        Cause("poses are in OpenGL's camera axes (y up, z backward)", _opengl),
-        *(Cause(words, _reframed(step)) for words, step in _frames(view)),
-        *(
-            Cause(f"intrinsics belong to pictures {k} px wide, not {width}", _resized(width / k))
-            for k in _WIDTHS
-            if k != width
-        ),
-    ]
+    out = []
+    for factor in _POWERS:
+        scaled = native.copy()
+        scaled[:3, 3] *= factor
+        words = _UNITS.get(factor, f"are too small by a factor of {factor:g}")
+        out.append((f"translations {words}", scaled @ mesh, K))
+    transposed = native.copy()
+    transposed[:3, :3] = native[:3, :3].T
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    inverse = np.linalg.inv(native) @ mesh
+    out.append(("poses are the wrong way round (object from camera)", inverse, K))
+    out.append(("rotations are transposed", transposed @ mesh, K))
+    out.append(("poses are in OpenGL's camera axes (y up, z backward)", flip @ pose, K))
+    out += [(words, pose @ step, K) for words, step in _frames(view)]
+    for other in _WIDTHS:
+        scale = width / other
+        resized = resize_intrinsics(torch.from_numpy(K.astype(np.float64)), scale, scale).numpy()
+        words = f"intrinsics belong to pictures {other} px wide, not {width}"
+        out.append((words, pose, resized))
+    return out
 
 
 def _depth_scale(fits: Sequence[Fit]) -> list[str]:
@@ -181,47 +183,6 @@ def _frames(view: View) -> list[tuple[str, np.ndarray]]:
     center[:3, 3] = -view.mesh.bounds.mean(0)
     words = "poses are in a frame at the center of the bounding box (as BOP's)"
     return [*out, (f"{words}, the mesh has another origin", center)]
-
-
-def _scaled(factor: float) -> Change:
-    def undo(view: View) -> tuple[np.ndarray, np.ndarray]:
-        # the reader's pose is camera_from_native @ native_from_mesh: the factor sits in the first
-        # only
-        camera_from_native = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
-        camera_from_native[:3, 3] *= factor
-        return camera_from_native @ view.native_from_mesh, view.sample.intrinsics
-
-    return undo
-
-
-def _reframed(step: np.ndarray) -> Change:
-    return lambda view: (view.sample.camera_from_object @ step, view.sample.intrinsics)
-
-
-def _resized(scale: float) -> Change:
-    def undo(view: View) -> tuple[np.ndarray, np.ndarray]:
-        K = view.sample.intrinsics.astype(np.float64).copy()
-        K[:2] *= scale
-        K[:2, 2] += (scale - 1) / 2
-        return view.sample.camera_from_object, K
-
-    return undo
-
-
-def _inverse(view: View) -> tuple[np.ndarray, np.ndarray]:
-    camera_from_native = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
-    return np.linalg.inv(camera_from_native) @ view.native_from_mesh, view.sample.intrinsics
-
-
-def _transposed(view: View) -> tuple[np.ndarray, np.ndarray]:
-    pose = view.sample.camera_from_object @ np.linalg.inv(view.native_from_mesh)
-    pose[:3, :3] = pose[:3, :3].T.copy()
-    return pose @ view.native_from_mesh, view.sample.intrinsics
-
-
-def _opengl(view: View) -> tuple[np.ndarray, np.ndarray]:
-    flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    return flip @ view.sample.camera_from_object, view.sample.intrinsics
 
 
 def _shifted(K: np.ndarray, shift: float) -> np.ndarray:

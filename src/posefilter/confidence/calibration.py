@@ -13,7 +13,7 @@ tolerance when it is asked for.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -169,21 +169,18 @@ class Calibration:
 
     def to_plain(self) -> dict[str, Any]:
         """Return it as dictionaries, lists, numbers and strings; `read_calibration` reads them."""
-        plain = asdict(self)
-        for name in ("presence", "success", "choice"):
-            one: Logistic | None = getattr(self, name)
-            if one is not None:
-                plain[name] = {"weights": list(one.weights), "bias": one.bias}
-        if self.conformal is not None:
-            scores = [list(own) for own in self.conformal.scores]
-            edges, by = list(self.conformal.edges), self.conformal.by
-            plain["conformal"] = {"by": by, "edges": edges, "scores": scores}
+        plain: dict[str, Any] = _with_lists(asdict(replace(self, errors=None)))
         if self.errors is not None:
             both = (torch.tensor(self.errors.features), torch.tensor(self.errors.errors))
             plain["errors"] = torch.cat(both, 1).half()  # a fifth of what lists take
-        return {
-            key: list(value) if isinstance(value, tuple) else value for key, value in plain.items()
-        }
+        return plain
+
+
+def _with_lists(plain: Any) -> Any:
+    """Return nested dictionaries and tuples with lists in place of the tuples."""
+    if isinstance(plain, dict):
+        return {key: _with_lists(value) for key, value in plain.items()}
+    return [_with_lists(one) for one in plain] if isinstance(plain, tuple) else plain
 
 
 def _evaluate(one: Logistic, x: Tensor) -> Tensor:

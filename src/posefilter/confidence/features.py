@@ -37,8 +37,7 @@ def measure_belief(belief: BeliefBatch, object_model: ObjectModel) -> dict[str, 
         (B,) each. `score`: the estimate's log-likelihood. `concentration`: the negative logarithm
         of the particles' root mean square distance from the estimate (`PoseSpace`), in diameters.
     """
-    x, y, z = object_model.center.tolist()
-    space = PoseSpace((x, y, z), object_model.radius)
+    space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
     weights = belief.log_weights.exp()
     distance = space.distance(belief.poses, belief.best[:, None]) / object_model.diameter
     spread = (weights * distance.square()).sum(1).sqrt()

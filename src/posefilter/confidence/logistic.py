@@ -9,14 +9,15 @@ References:
         (1999).
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 PENALTY = 1.0  # of the squared weights: the inverse variance of their prior
 
 
-class Logistic(NamedTuple):
+@dataclass(frozen=True)
+class Logistic:
     """A logistic regression on standardized features."""
 
     weights: tuple[float, ...]  # >= 0

@@ -15,19 +15,15 @@ print in another size, as of a package of the same brand. No answer of that kind
 import math
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
-from posefilter.confidence.apparent_size import ApparentSize
 from posefilter.confidence.calibration import Calibration
 from posefilter.confidence.visible_pixels import blank, find_visible
-from posefilter.errors import UserError
-from posefilter.filters.loop import ParticleFilter
 from posefilter.filters.traces import map_traces
-from posefilter.protocols import HasObjectness
-from posefilter.types import Batch, ObjectModel, Trace
+from posefilter.types import Batch, Trace
 
 DOUBTFUL = 0.5  # rank below which an answer is doubtful
 MARGIN = 1.0  # [nat] of the log-odds by which another answer must be better: the first has more
@@ -37,46 +33,9 @@ _CELLS = 6  # of the network, that a small object covers
 LEAST_DEPTH = 0.01  # share of the pixels whose depth is known
 
 
-class Searcher(Protocol):
-    """A method with its filter and its calibration."""
-
-    calibration: Calibration | None
-    filter: ParticleFilter
-
-    @property
-    def object_model(self) -> ObjectModel:
-        """The object."""
-        ...
-
-    def encode(self, batch: Batch) -> Any:
-        """Encode images."""
-        ...
-
-    def search(self, batch: Batch, generator: Generator, encoding: Any = None) -> Trace:
-        """Run the filter on images, which may be encoded already."""
-        ...
-
-    def choose_part(self, image: Batch) -> Batch | None:
-        """Return the magnified part of one image that most likely shows the object; None where it
-        cannot tell.
-        """
-        ...
-
-    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
-        """Return what speaks for each estimate, by name."""
-        ...
-
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
-        """Return how large the object appears; None where the method cannot tell."""
-        ...
-
-
 def read_objectness(encoding: Any) -> Tensor | None:
     """Return the objectness of each cell, (B, 1, h, w); None where an encoding has none."""
-    try:
-        return encoding.objectness if isinstance(encoding, HasObjectness) else None
-    except UserError:  # before Python 3.12 `isinstance` asks, and there is no proposal network
-        return None
+    return getattr(encoding, "objectness", None)
 
 
 def measure_worth(encoding: Any) -> Tensor:
@@ -91,11 +50,11 @@ def measure_worth(encoding: Any) -> Tensor:
 
 
 @torch.no_grad()
-def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generator) -> Trace:
+def look_again(method: Any, first: Trace, batch: Batch, generator: Generator) -> Trace:
     """Return the trace with each doubtful answer replaced by a better one, where one is found.
 
     Args:
-        method: A method that was calibrated; any other's trace is returned as it is.
+        method: A `PoseEstimator` that was calibrated; any other's trace is returned as it is.
         first: A finished run of its filter.
         batch: Its B images; mask and pose are not used.
         generator: Draws the other searches.
@@ -121,7 +80,7 @@ def look_again(method: Searcher, first: Trace, batch: Batch, generator: Generato
     return trace
 
 
-def _contradicts(method: Searcher, trace: Trace, batch: Batch) -> Tensor:
+def _contradicts(method: Any, trace: Trace, batch: Batch) -> Tensor:
     """Return of which images the object appears in another size than it has, (B,) bool."""
     size = method.measure_apparent_size(trace, batch)
     if size is None:
@@ -136,7 +95,7 @@ def _improve(rank: float) -> float:
 
 
 def _search(
-    method: Searcher,
+    method: Any,
     calibration: Calibration,
     first: Trace,
     row: int,
@@ -169,7 +128,7 @@ def _search(
     return best
 
 
-def _list_parts(method: Searcher, image: Batch, rest: Batch) -> Iterator[Batch]:
+def _list_parts(method: Any, image: Batch, rest: Batch) -> Iterator[Batch]:
     """Yield where one image is searched again, in turn; `rest` is it without the first answer."""
     yield rest
     yield image

@@ -194,9 +194,7 @@ class PasteOccluder:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample with the occluder's color and depth pasted in and the mask cut."""
-        if rng.random() >= self.probability:
-            return sample
-        if not sample.mask.any():
+        if rng.random() >= self.probability or not sample.mask.any():
             return sample
         cut, a, b = draw_rectangle(sample.mask, self.size, sample.mask.shape[1], rng)
         patch = (np.maximum(np.abs(a), np.abs(b)) if rng.random() < 0.5 else np.hypot(a, b)) < 1
@@ -249,10 +247,8 @@ class DepthNoise:
         d = sample.depth
         coarse = rng.standard_normal((d.shape[0] // 2, d.shape[1] // 2), dtype=np.float32)
         grain = cv2.resize(coarse, d.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        factor, noise = (
-            np.float32(1 + rng.normal() * self.scale),
-            np.float32(self.noise * rng.uniform()),
-        )
+        factor = np.float32(1 + rng.normal() * self.scale)
+        noise = np.float32(self.noise * rng.uniform())
         # 0, unknown, stays 0
         return dataclasses.replace(sample, depth=d * (factor + d * grain * noise))
 

@@ -149,16 +149,12 @@ class DiskCache:
         return self.folder / code[:2] / f"{code}{suffix}"
 
 
-class NoCache:
+class NoCache(MemoryCache):
     """Keep nothing but the numbers: decode anew each time."""
 
     def __init__(self, read: Callable[[FrameRecord], Sample]) -> None:
+        super().__init__()
         self._read = read
-        self._records: dict[str, Prepared] = {}
-
-    def find(self, record: FrameRecord) -> Prepared | None:
-        """Return the numbers of a record that was read once."""
-        return self._records.get(record.key)
 
     def keep(self, record: FrameRecord, sample: Sample) -> Prepared:
         """Keep the numbers."""
@@ -171,7 +167,7 @@ class NoCache:
         return unpack(pack_image(sample), one, frame_id)
 
 
-FrameCache = MemoryCache | DiskCache | NoCache
+FrameCache = MemoryCache | DiskCache
 
 
 def open_cache(
@@ -210,10 +206,8 @@ def unpack(image: np.ndarray, one: Prepared, frame_id: int) -> Sample:
     """Return the sample that was packed."""
     height, width = one.shape
     rgb, depth = np.split(image, [3 * height * width])
-    rgb, depth = (
-        rgb.reshape(height, width, 3).copy(),
-        depth.view("<u2").reshape(height, width) / np.float32(_UNITS),
-    )
+    rgb = rgb.reshape(height, width, 3).copy()
+    depth = depth.view("<u2").reshape(height, width) / np.float32(_UNITS)
     mask = np.unpackbits(one.mask_bits, count=height * width).reshape(height, width).astype(bool)
     return Sample(
         rgb,

@@ -52,10 +52,6 @@ class NotShown(BadData):
     either.
     """
 
-    def __reduce__(self) -> tuple[type, tuple[Path, str, str]]:
-        """Survive the way from one process to another."""
-        return NotShown, (self.path, self.cause, self.detail)
-
 
 class Implausible(BadData):
     """A frame was read, but a camera cannot have seen what it says; it carries the sample."""
@@ -63,10 +59,7 @@ class Implausible(BadData):
     def __init__(self, path: Path, cause: str, detail: str, sample: Sample) -> None:
         super().__init__(path, cause, detail)
         self.sample = sample
-
-    def __reduce__(self) -> tuple[type, tuple[Path, str, str, Sample]]:  # type: ignore[override]
-        """Survive the way from one process to another."""
-        return Implausible, (self.path, self.cause, self.detail, self.sample)
+        self.args = (path, cause, detail, sample)  # by which it is pickled
 
 
 def tight_box(mask: np.ndarray) -> tuple[int, int, int, int]:

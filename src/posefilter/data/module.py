@@ -19,7 +19,7 @@ from posefilter.data.frames import FrameRecord
 from posefilter.data.generated_scenes import ensure_scenes
 from posefilter.data.loaders import make_loader, spare_cores
 from posefilter.data.points import read_model_points
-from posefilter.data.prepare import Criteria, usable
+from posefilter.data.prepare import usable
 from posefilter.data.readers.base import BaseReader
 from posefilter.data.readers.registry import open_meshes, open_reader
 from posefilter.data.splits import NAMES, Share, split_records
@@ -120,10 +120,8 @@ class PoseDataModule(LightningDataModule):
         self._object, self._meshes, self._mesh_scale = object, meshes, mesh_scale
         self._options, self._generate = dict(options or {}), generate
         self._image_width, self._image_height = image_width, image_height
-        self._split, self._split_seed = (
-            dict(split or {"train": 0.8, "val": 0.1, "test": 0.1}),
-            split_seed,
-        )
+        self._split = dict(split or {"train": 0.8, "val": 0.1, "test": 0.1})
+        self._split_seed = split_seed
         self._least = {
             "train": min_visibility,
             "val": min_visibility_test,
@@ -265,7 +263,9 @@ class PoseDataModule(LightningDataModule):
         chosen, _ = usable(
             [found[i] for i in order],
             decoder.fetch,
-            Criteria(limit=limit, on_error="skip"),
+            0.0,
+            limit,
+            "skip",
             max(self._workers, 2),
             "decoding frames without the object",
             self._progress,
@@ -325,14 +325,11 @@ class PoseDataModule(LightningDataModule):
         """Return a sentence about a split."""
         own = self.describe()["splits"][split]
         left = ", ".join(f"{count} for {reason}" for reason, count in own["left_out"].items())
-        shown = (
-            f"{own['frames']} frames"
-            if own["frames"] == own["images"]
-            else f"{own['frames']} instances in {own['images']} images"
-        )
-        return f"{split}: {shown} of {own['scenes']} scenes" + (
-            f"; left out: {left}" if left else ""
-        )
+        shown = f"{own['frames']} frames"
+        if own["frames"] != own["images"]:
+            shown = f"{own['frames']} instances in {own['images']} images"
+        more = f"; left out: {left}" if left else ""
+        return f"{split}: {shown} of {own['scenes']} scenes{more}"
 
     def _dataset(self, split: str) -> FrameDataset:
         if split not in NAMES:
@@ -352,10 +349,15 @@ class PoseDataModule(LightningDataModule):
             order = np.random.default_rng([self._split_seed, first]).permutation(len(part))
             part = [part[i] for i in order]
         records = [self._records[i] for i in part]
-        want = Criteria(self._least[split], limit, self._on_error)
-        title = f"decoding {split} frames"
         chosen, self._left_out[split] = usable(
-            records, self._decoder.fetch, want, max(self._workers, 2), title, self._progress
+            records,
+            self._decoder.fetch,
+            self._least[split],
+            limit,
+            self._on_error,
+            max(self._workers, 2),
+            f"decoding {split} frames",
+            self._progress,
         )
         if part and not chosen and limit != 0:
             raise UserError(

@@ -12,13 +12,12 @@ import dataclasses
 import cv2
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from posefilter.data.augmentation import Draw, draw_rectangle
 from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 from posefilter.synthetic.sensor import motion_kernel
-
-_WHITE = np.ones(3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,10 +113,8 @@ class MotionBlur:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, blurred or not."""
-        chosen, length = (
-            rng.random() < self.probability,
-            rng.uniform(0, self.length) * sample.mask.shape[1],
-        )
+        chosen = rng.random() < self.probability
+        length = rng.uniform(0, self.length) * sample.mask.shape[1]
         kernel = motion_kernel(rng, max(1, round(float(length))))
         if not chosen or len(kernel) < 2:
             return sample
@@ -136,10 +133,8 @@ class Jpeg:
 
     def __call__(self, sample: Sample, draw: Draw, rng: Generator) -> Sample:
         """Return the sample, compressed or not."""
-        chosen, quality = (
-            rng.random() < self.probability,
-            int(rng.integers(self.quality[0], self.quality[1] + 1)),
-        )
+        chosen = rng.random() < self.probability
+        quality = int(rng.integers(self.quality[0], self.quality[1] + 1))
         if not chosen:
             return sample
         _, data = cv2.imencode(".jpg", sample.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -186,9 +181,7 @@ def hue_rotation(angle: float) -> np.ndarray:
     """Return the rotation (3, 3) of RGB by an angle [rad] about the gray axis: gray and the
     channels' mean stay.
     """
-    axis = _WHITE / np.sqrt(3)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    return np.asarray(Rotation.from_rotvec(np.full(3, angle / np.sqrt(3))).as_matrix())
 
 
 def mixing_matrix(off_diagonal: np.ndarray) -> np.ndarray:

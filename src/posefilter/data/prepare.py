@@ -5,7 +5,6 @@ fit for use.
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 from posefilter.data.cache import Prepared
 from posefilter.data.frames import FrameRecord, NotShown
@@ -16,43 +15,37 @@ _CHUNK = 64  # records decoded at a time
 Fetch = Callable[[FrameRecord], Prepared | BadData]
 
 
-@dataclass(frozen=True)
-class Criteria:
-    """Which frames are wanted."""
-
-    least_visibility: float = 0.0  # frames whose visibility is unknown pass
-    limit: int | None = None  # stop after so many
-    on_error: str = "raise"  # or "skip"
-
-
 def usable(
     records: Sequence[FrameRecord],
     fetch: Fetch,
-    want: Criteria,
+    min_visibility: float,
+    limit: int | None,
+    on_error: str,
     threads: int,
     title: str,
     progress: bool,
 ) -> tuple[list[FrameRecord], Counter[str]]:
     """Return the records that can be used, and how many were left out for which reason.
 
-    Raises UserError for the first broken file where `on_error` is "raise". An object that is listed
-    but not in the label is no error: it is left out and counted.
+    Frames whose visibility is unknown pass; `limit` is how many are enough. Raises UserError for
+    the first broken file where `on_error` is "raise". An object that is listed but not in the label
+    is no error: it is left out and counted.
     """
     chosen: list[FrameRecord] = []
     left_out: Counter[str] = Counter()
     for record, found in _decoded(records, fetch, threads, title, progress):
-        if want.limit is not None and len(chosen) >= want.limit:
+        if limit is not None and len(chosen) >= limit:
             break
         if isinstance(found, BadData):
-            if want.on_error == "raise" and not isinstance(found, NotShown):
+            if on_error == "raise" and not isinstance(found, NotShown):
                 raise UserError(
                     f"{found}; data.on_error=skip leaves such frames out and counts them"
                 ) from found
             left_out[found.cause] += 1
         elif found.pixels == 0:
             left_out["the mask vanishes at this image size"] += 1
-        elif found.visibility < want.least_visibility:
-            left_out[f"visibility below {want.least_visibility}"] += 1
+        elif found.visibility < min_visibility:
+            left_out[f"visibility below {min_visibility}"] += 1
         else:
             chosen.append(record)
     return chosen, left_out

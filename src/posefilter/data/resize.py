@@ -12,7 +12,7 @@ from posefilter.data.frames import Sample
 from posefilter.errors import UserError
 from posefilter.geometry.camera import resize_intrinsics
 
-_SMOOTH = 0.02  # neighboring depths within this share of each other lie on one surface
+SMOOTH = 0.02  # neighboring depths within this share of each other lie on one surface
 
 
 def network_size(
@@ -87,25 +87,29 @@ def resize_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
     if depth.shape == (2 * height, 2 * width):  # the same corners, without an index
         four = [depth[i::2, j::2] for i in (0, 1) for j in (0, 1)]
         return _blend(four, np.float32(0.5), np.float32(0.5))
-    corners, fractions = [], []
-    for new, old in ((height, depth.shape[0]), (width, depth.shape[1])):
-        at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
-        low = np.minimum(at.astype(int), old - 2 if old > 1 else 0)
-        corners.append((low, np.minimum(low + 1, old - 1)))
-        fractions.append((at - low).astype(np.float32))
-    (top, bottom), (left, right) = corners
-    fy, fx = fractions[0][:, None], fractions[1][None, :]
+    (top, fy), (left, fx) = map(find_neighbors, depth.shape, (height, width))
+    bottom, right = (
+        np.minimum(low + 1, old - 1) for low, old in zip((top, left), depth.shape, strict=True)
+    )
     four = [depth[rows][:, columns] for rows in (top, bottom) for columns in (left, right)]
-    return _blend(four, fx, fy)
+    return _blend(four, fx[None, :], fy[:, None])
+
+
+def find_neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return where new pixels' centers lie among the old: the pixel before, and how far beyond it.
+
+    -> (new,) int64, (new,) float32 in [0, 1].
+    """
+    at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
+    low = np.minimum(at.astype(np.int64), max(old - 2, 0))
+    return low, (at - low).astype(np.float32)
 
 
 def _blend(four: Sequence[np.ndarray], fx: Any, fy: Any) -> np.ndarray:
     """Return depth between four neighbors, above left to below right, at fractions of a pixel."""
     a, b, c, d = four
-    low, high = (
-        np.minimum(np.minimum(a, b), np.minimum(c, d)),
-        np.maximum(np.maximum(a, b), np.maximum(c, d)),
-    )
+    low = np.minimum(np.minimum(a, b), np.minimum(c, d))
+    high = np.maximum(np.maximum(a, b), np.maximum(c, d))
     between = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
     nearest = np.where(fy <= 0.5, np.where(fx <= 0.5, a, b), np.where(fx <= 0.5, c, d))
-    return np.where((low > 0) & (high - low <= _SMOOTH * low), between, nearest).astype(np.float32)
+    return np.where((low > 0) & (high - low <= SMOOTH * low), between, nearest).astype(np.float32)

@@ -68,7 +68,9 @@ def split_records(
         if isinstance(share, int | float) and not isinstance(share, bool) and share != 0
     }
     scenes = sorted({record.group for record in records} - set(taken))
-    if not all(0 < share <= 1 for share in fractions.values()) or _exceed_one(fractions):
+    if not all(0 < share <= 1 for share in fractions.values()) or (
+        sum(fractions.values()) > 1 + 1e-6
+    ):
         raise UserError(f"data.split: fractions {fractions} must be positive and sum to 1 at most")
     owner: dict[Any, str]
     if len(scenes) >= len(fractions):
@@ -84,11 +86,6 @@ def split_records(
         if isinstance(share, str) and share in NAMES:
             out[name] = out[share]
     return out
-
-
-def _exceed_one(fractions: Mapping[str, float]) -> bool:
-    """Tell whether fractions are to share out more than there is."""
-    return sum(fractions.values()) > 1 + 1e-6
 
 
 def _image(record: FrameRecord) -> tuple[str, int]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from posefilter.deploy.resizing import Resize
 from posefilter.filters.agreement import Agreement
-from posefilter.models.image_space import ImageEncoding, ImageSpace, ObjectnessEncoding
+from posefilter.models.image_space import ImageEncoding, ImageSpace
 from posefilter.models.pose_pf import PosePF
 from posefilter.nets.coordinates import Context, Coordinates
 from posefilter.nets.encoders import ContextMap
@@ -170,7 +170,7 @@ class EncodeForPixels(nn.Module):
         kept = [encoding.image[0], encoding.depth[0], encoding.intrinsics[0]]
         kept += [level[0] for level in encoding.context.levels]
         if self.objectness:
-            assert isinstance(encoding, ObjectnessEncoding)
+            assert encoding.objectness is not None
             kept.append(encoding.objectness[0, 0])
         return tuple(kept)
 
@@ -214,7 +214,9 @@ class MeasurePixels(nn.Module):
             be: probabilities `share` (N, k), `position` (N, k, 3) from the center, in radii.
         """
         context = ContextMap(tuple(level[None] for level in levels), self.strides, None)
-        encoding = ImageEncoding(image[None], surface[None], network_intrinsics[None], context)
+        encoding = ImageEncoding(
+            image[None], surface[None], network_intrinsics[None], context, None
+        )
         weights = state.new_zeros(1, state.shape[0])  # `len` would fix the number
         particles = Particles(state[None], latent[None], weights, weights.long())
         step = Step(0, 1, state.new_zeros(()))

@@ -8,9 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from posefilter.data.resize import SMOOTH, find_neighbors
 from posefilter.geometry.camera import resize_intrinsics
-
-_SMOOTH = 0.02  # neighboring depths within this share of each other lie on one surface
 
 
 class Resize(nn.Module):
@@ -81,7 +80,7 @@ class Resize(nn.Module):
         high = torch.maximum(torch.maximum(a, b), torch.maximum(c, d))
         between = (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
         nearest = torch.where(fy <= 0.5, torch.where(fx <= 0.5, a, b), torch.where(fx <= 0.5, c, d))
-        return torch.where((low > 0) & (high - low <= _SMOOTH * low), between, nearest)
+        return torch.where((low > 0) & (high - low <= SMOOTH * low), between, nearest)
 
 
 def area_weights(old: int, new: int) -> np.ndarray:
@@ -100,13 +99,3 @@ def linear_weights(old: int, new: int) -> np.ndarray:
     weights[rows, low] = 1 - fraction
     weights[rows, np.minimum(low + 1, old - 1)] += fraction
     return weights
-
-
-def find_neighbors(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return where new pixels' centers lie among the old: the pixel before, and how far beyond it.
-
-    -> (new,) int64, (new,) float32 in [0, 1].
-    """
-    at = np.clip((np.arange(new) + 0.5) * old / new - 0.5, 0, old - 1)
-    low = np.minimum(at.astype(np.int64), max(old - 2, 0))
-    return low, (at - low).astype(np.float32)

@@ -1,5 +1,6 @@
 """The settings of a trained filter as plain data, for programs that run the exported networks."""
 
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -158,18 +159,9 @@ def _describe_refinement(one: Any, method: PoseEstimator) -> list[dict[str, Any]
     if isinstance(one, refine.NoRefine):
         return []
     if isinstance(one, refine.Rescore):
-        names: tuple[str, ...] = ("top_k", "pixels", "sigma")
-        return [{"kind": "rescore", **{name: getattr(one, name) for name in names}}]
+        return [{"kind": "rescore", **asdict(one)}]
     if isinstance(one, refine.MeanShift):
-        names = (
-            "iterations",
-            "antithetic_pairs",
-            "initial_scale",
-            "final_scale",
-            "sigma",
-            "pixels",
-        )
-        return [{"kind": "mean_shift", **{name: getattr(one, name) for name in names}}]
+        return [{"kind": "mean_shift", **asdict(one)}]
     if isinstance(one, PointToPlaneIcp) and isinstance(method, PosePF):
         names = ("iterations", "initial_gate", "final_gate", "prior", "noise", "effective")
         surface = one.choose_points(method.object_model.points).tolist()

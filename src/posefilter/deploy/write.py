@@ -166,16 +166,12 @@ def to_onnx(graph: Graph) -> bytes:
 @contextmanager
 def _quietly() -> Any:
     """Leave out what the exporters say of packages and interfaces that are not used here."""
+    before = logging.root.manager.disable
     # onnx_ir, which onnxscript optimizes with, logs every constant that it merges
-    names = ("torch.onnx", "torch.export", "onnxscript", "onnx_ir")
-    loggers = [logging.getLogger(name) for name in names]
-    before = [one.level for one in loggers]
+    logging.disable(logging.WARNING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for one in loggers:
-            one.setLevel(logging.ERROR)
         try:
             yield
         finally:
-            for one, level in zip(loggers, before, strict=True):
-                one.setLevel(level)
+            logging.disable(before)

@@ -14,21 +14,6 @@ from posefilter.protocols import Encoding, HasSurfacePoints, Method
 from posefilter.types import BeliefBatch, ParticleOutput, Particles
 
 
-def require_surface_points(method: Method) -> HasSurfacePoints:
-    """Return the method as one whose particles stand on measured points.
-
-    Raises:
-        UserError: The method's particles stand on no measured point.
-    """
-    if not isinstance(method, HasSurfacePoints):
-        raise UserError(
-            f"filter/estimate=agreement: no particle of {type(method).__name__} stands on a "
-            "measured "
-            f"point; choose filter/estimate=argmax"
-        )
-    return method
-
-
 @dataclass(eq=False)
 class Agreement:
     """Estimate the pose that most particles' surface points agree on, weighted by likelihood.
@@ -83,12 +68,10 @@ class Agreement:
 
         Its score is the share of the weight that agrees, times the highest likelihood.
         """
-        provider = require_surface_points(method)
-        center, radius = (
-            provider.object_model.center.to(particles.state),
-            provider.object_model.radius,
-        )
-        point, known = provider.surface_points(encoding, particles.state)
+        assert isinstance(method, HasSurfacePoints)  # of what `requires` says
+        object_model = method.object_model
+        center, radius = object_model.center.to(particles.state), object_model.radius
+        point, known = method.surface_points(encoding, particles.state)
         share, position = self.list_object_points(output, point, center, radius)
         weight = output.log_likelihood.detach().exp() * known
         votes = draw_votes(

@@ -62,22 +62,14 @@ class AuxiliaryResampling:
         self.resampler = resampler
         self.floor = floor
 
-    def bind(self, encoding: Encoding, height: int, width: int) -> Resample:
+    def bind(self, encoding: HasObjectness, height: int, width: int) -> Resample:
         """Return the resampler for one encoding.
 
         Args:
-            encoding: The encoded images, with an objectness map.
+            encoding: The encoded images.
             height: The images' height [px].
             width: The images' width [px].
-
-        Raises:
-            UserError: The encoding has no objectness map.
         """
-        if not isinstance(encoding, HasObjectness):
-            raise UserError(
-                "filter/resample=auxiliary: the method makes no map of objectness; choose an "
-                "encoder that does, such as unet"
-            )
         objectness = encoding.objectness.detach()
 
         def resample(

@@ -88,9 +88,7 @@ class Mean:
             method.space if isinstance(method.space, PoseSpace) else PoseSpace((0.0, 0.0, 0.0), 1.0)
         )
         weights = particles.log_weights.exp()
-        weighted = torch.where(
-            weights > 0, weights * output.log_likelihood, torch.zeros_like(weights)
-        )
+        weighted = torch.where(weights > 0, weights * output.log_likelihood, 0.0)
         return BeliefBatch(
             output.pose, particles.log_weights, space.mean(output.pose, weights), weighted.sum(1)
         )

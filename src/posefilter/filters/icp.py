@@ -81,24 +81,12 @@ class PointToPlaneIcp:
     def __call__(
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
-        """Return the belief with the estimate moved; the score stays.
-
-        Raises:
-            UserError: The method has no depth.
-        """
-        object_model: ObjectModel | None = getattr(method, "object_model", None)
-        if not isinstance(encoding, HasDepth) or object_model is None:
-            raise UserError(
-                f"filter/refine: {type(method).__name__} keeps no depth to align poses with; "
-                "choose filter/refine=mean_shift or none"
-            )
+        """Return the belief with the estimate moved; the score stays."""
+        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
         first = belief.best
-        x, y, z = object_model.center.tolist()
-        space = PoseSpace((x, y, z), object_model.radius)
-        center, own = (
-            object_model.center.to(first),
-            self.choose_points(object_model.points).to(first),
-        )
+        space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
+        center = object_model.center.to(first)
+        own = self.choose_points(object_model.points).to(first)
         precision = space.noise_scale(first.new_tensor(self.prior)).double().pow(-2).diag()
         pose, known = first, torch.zeros(len(first), dtype=torch.bool, device=first.device)
         moved = first.new_zeros(len(first), 6, 1, dtype=torch.float64)

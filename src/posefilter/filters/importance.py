@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.modes import find_pose_modes
-from posefilter.filters.refine import require_scorer
+from posefilter.filters.refine import scorer_of
 from posefilter.geometry.pose_density import fit_density, log_density
 from posefilter.geometry.pose_sampling import draw_poses, widen
 from posefilter.geometry.spaces import PoseSpace
@@ -70,7 +70,7 @@ class ImportanceSampling:
         for number in range(self.rounds):
             widening = self.widening if number == 0 else 1.0
             poses, log_q = self.propose(poses, log_weights, method, widening, generator)
-            score = require_scorer(method).score_poses(
+            score = scorer_of(method).score_poses(
                 encoding, poses, self.sigma, generator, self.pixels
             )
             log_weights = (score.double() / self.temperature - log_q).log_softmax(1)

@@ -6,12 +6,11 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.camera import rays
 from posefilter.geometry.pose import pose_about
 from posefilter.geometry.rotation import random_rotation
 from posefilter.geometry.spaces import PoseSpace
-from posefilter.protocols import Encoding, HasObjectness, Initialize, Method, ProposesPoses
+from posefilter.protocols import Encoding, Initialize, Method, ProposesPoses
 from posefilter.types import Batch
 
 
@@ -53,40 +52,15 @@ def draw_from_depth(
     weight = (depth[:, 0] > 0).to(depth.dtype)
     if prior is not None:
         weight = weight * prior[:, 0]
-    empty = ~(weight > 0).flatten(1).any(1)
-    z = torch.where(empty[:, None, None], torch.ones_like(depth[:, 0]), depth[:, 0])
-    cell = draw_cells(
-        torch.where(empty[:, None, None], torch.ones_like(weight), weight), count, generator
-    )
+    empty = ~(weight > 0).flatten(1).any(1)[:, None, None]
+    z = torch.where(empty, 1.0, depth[:, 0])
+    cell = draw_cells(torch.where(empty, 1.0, weight), count, generator)
     depth_at = z.flatten(1).gather(1, cell[..., 1] * depth.shape[3] + cell[..., 0])[..., None]
     ray = rays(cell.to(depth.dtype), K)
     push = torch.empty_like(depth_at).uniform_(*depth_offset, generator=generator) * space.radius
     center = ray * depth_at + ray / ray.norm(dim=-1, keepdim=True) * push
     R = random_rotation(*center.shape[:2], generator=generator, device=depth.device)
     return pose_about(R, center, depth.new_tensor(space.center))
-
-
-def require_pose_space(method: Method, choice: str) -> PoseSpace:
-    """Return the method's space.
-
-    Raises:
-        UserError: The method's particles are not poses; the message names the choice.
-    """
-    if not isinstance(method.space, PoseSpace):
-        raise UserError(
-            f"filter/initialize={choice} draws poses, but the particles of "
-            f"{type(method).__name__} are pixels"
-        )
-    return method.space
-
-
-def require_pixel_space(method: Method, choice: str) -> None:
-    """Raise UserError, naming the choice, if the method's particles are poses."""
-    if isinstance(method.space, PoseSpace):
-        raise UserError(
-            f"filter/initialize={choice} draws pixels, but the particles of "
-            f"{type(method).__name__} are poses"
-        )
 
 
 class UniformPixels:
@@ -98,7 +72,6 @@ class UniformPixels:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], over the whole area of the image's pixels."""
-        require_pixel_space(method, "uniform")
         B, _, H, W = batch.rgb.shape
         share = torch.rand(B, particles, 2, generator=generator, device=batch.rgb.device)
         return share * share.new_tensor([W, H]) - 0.5
@@ -120,7 +93,8 @@ class FromDepth:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
-        space = require_pose_space(method, "from_depth")
+        space = method.space
+        assert isinstance(space, PoseSpace)  # of what `requires` says
         return draw_from_depth(
             batch.depth,
             batch.intrinsics,
@@ -148,12 +122,6 @@ class FromObjectness:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 2) [px], uniform within each drawn cell."""
-        require_pixel_space(method, "from_objectness")
-        if not isinstance(encoding, HasObjectness):
-            raise UserError(
-                f"filter/initialize=from_objectness: {type(method).__name__} makes no map of "
-                f"objectness; choose uniform"
-            )
         weight = encoding.objectness[:, 0].detach()
         weight = weight / weight.sum((1, 2), keepdim=True).clamp_min(1e-12)
         weight = (1 - self.uniform_fraction) * weight + max(self.uniform_fraction, 1e-6) / weight[
@@ -176,11 +144,7 @@ class FromProposals:
         self, batch: Batch, encoding: Encoding, method: Method, particles: int, generator: Generator
     ) -> Tensor:
         """Return (B, N, 4, 4) [m]."""
-        if not isinstance(method, ProposesPoses):
-            raise UserError(
-                f"filter/initialize=from_proposals: {type(method).__name__} proposes no "
-                f"poses; choose another start"
-            )
+        assert isinstance(method, ProposesPoses)  # of what `requires` says
         return method.propose_poses(encoding, particles, generator)
 
 
@@ -213,13 +177,9 @@ class Informed(nn.Module):
         count = round(self.object_fraction * particles)
         if not self.training or count == 0:
             return state
-        require_pixel_space(method, "informed")
         mask = batch.mask[:, 0].to(state.dtype)
         visible = (mask > 0).flatten(1).any(1)[:, None, None]
-        near = draw_cells(torch.where(visible, mask, torch.ones_like(mask)), count, generator).to(
-            state.dtype
-        )
-        near = near + self.sigma_px * torch.randn(
-            near.shape, generator=generator, device=state.device
-        )
+        near = draw_cells(torch.where(visible, mask, 1.0), count, generator).to(state.dtype)
+        noise = torch.randn(near.shape, generator=generator, device=state.device)
+        near = near + self.sigma_px * noise
         return torch.cat([torch.where(visible, near, state[:, :count]), state[:, count:]], dim=1)

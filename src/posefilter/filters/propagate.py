@@ -11,7 +11,6 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.protocols import Propagate, Space
 from posefilter.types import Step
@@ -81,7 +80,11 @@ class HalfTurnRotations:
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
         """Return the states, some rotated."""
-        return half_turns(state, space, generator, self.probability)
+        axis = torch.randint(3, state.shape[:2], generator=generator, device=state.device)
+        chance = torch.rand(state.shape[:2], generator=generator, device=state.device)
+        axes = math.pi * torch.eye(3, dtype=state.dtype, device=state.device)
+        turn = axes[axis] * (chance < self.probability)[..., None]
+        return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
 class AxisRotations:
@@ -104,17 +107,8 @@ class AxisRotations:
     def __call__(
         self, state: Tensor, displacement: Tensor, step: Step, space: Space, generator: Generator
     ) -> Tensor:
-        """Return the states, some rotated.
-
-        Raises:
-            UserError: The particles are not poses.
-        """
-        if not isinstance(space, PoseSpace):
-            raise UserError(
-                "propagate: turns about an axis need particles that are poses; leave them out for "
-                "a "
-                "method on pixels"
-            )
+        """Return the states, some rotated."""
+        assert isinstance(space, PoseSpace)  # of what `requires` says
         size, device = state.shape[:2], state.device
         axis = torch.randint(3, size, generator=generator, device=device)
         moves = torch.rand(size, generator=generator, device=device) < self.probability
@@ -123,28 +117,6 @@ class AxisRotations:
         angle = torch.where(free, angle, torch.full_like(angle, math.pi)) * moves
         turn = space.axes.to(state)[axis] * angle[..., None]
         return space.move(state, torch.cat([torch.zeros_like(turn), turn], dim=-1))
-
-
-def half_turns(
-    poses: Tensor, space: Space, generator: Generator, probability: float = 1.0
-) -> Tensor:
-    """Rotate poses, each with a probability, by pi about a random object axis through the center.
-
-    (B, N, 4, 4) -> (B, N, 4, 4).
-
-    Raises:
-        UserError: The particles are not poses.
-    """
-    if space.dimensions != 6:
-        raise UserError(
-            "propagate: half turns need particles that are poses; leave them out for "
-            "a method on pixels"
-        )
-    B, N = poses.shape[:2]
-    axis = torch.randint(3, (B, N), generator=generator, device=poses.device)
-    flip = torch.rand(B, N, generator=generator, device=poses.device) < probability
-    turn = math.pi * torch.eye(3, dtype=poses.dtype, device=poses.device)[axis] * flip[..., None]
-    return space.move(poses, torch.cat([torch.zeros_like(turn), turn], dim=-1))
 
 
 class Compose:

@@ -49,13 +49,9 @@ class Compose:
         return belief
 
 
-def require_scorer(method: Method) -> ScoresPoses:
-    """Return the method as one that scores poses; raise UserError if it cannot."""
-    if not isinstance(method, ScoresPoses):
-        raise UserError(
-            f"filter/refine: {type(method).__name__} cannot score poses on their own; choose "
-            "filter/refine=none"
-        )
+def scorer_of(method: Method) -> ScoresPoses:
+    """Return the method as one that scores poses, as `requires` of what calls this says it does."""
+    assert isinstance(method, ScoresPoses)
     return method
 
 
@@ -95,7 +91,7 @@ class Rescore:
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the pose of highest score as its estimate."""
-        scorer, poses = require_scorer(method), top_poses(belief, self.top_k)
+        scorer, poses = scorer_of(method), top_poses(belief, self.top_k)
         with torch.no_grad():
             scores = scorer.score_poses(encoding, poses, self.sigma, generator, self.pixels)
         return select_best(belief, poses, scores)
@@ -144,7 +140,7 @@ class MeanShift:
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate shifted; without gradient."""
-        scorer, best = require_scorer(method), belief.best
+        scorer, best = scorer_of(method), belief.best
         for index in range(self.iterations):
             fraction = index / max(self.iterations - 1, 1)
             spread = self.initial_scale * (self.final_scale / self.initial_scale) ** fraction
@@ -195,9 +191,9 @@ class Gradient:
         """Return the belief with a refined estimate; without gradient.
 
         Raises:
-            UserError: Gradients are disabled by inference mode, or the method scores no poses.
+            UserError: Gradients are disabled by inference mode.
         """
-        scorer = require_scorer(method)
+        scorer = scorer_of(method)
         if torch.is_inference_mode_enabled():
             raise UserError(
                 "refine: gradient ascent needs gradients; set trainer.inference_mode=false"

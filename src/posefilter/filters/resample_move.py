@@ -23,7 +23,7 @@ from torch import Generator, Tensor
 from posefilter.capabilities import Capabilities
 from posefilter.errors import UserError
 from posefilter.filters.propagate import AxisRotations
-from posefilter.filters.refine import require_scorer
+from posefilter.filters.refine import scorer_of
 from posefilter.filters.resample import inverse_cdf
 from posefilter.geometry.pose_statistics import twist_between
 from posefilter.geometry.spaces import PoseSpace
@@ -98,7 +98,7 @@ class ResampleMove:
         def score(poses: Tensor) -> Tensor:
             # the same image points each time: the target stays as it is
             fixed = torch.Generator(device).manual_seed(seed)
-            found = require_scorer(method).score_poses(
+            found = scorer_of(method).score_poses(
                 encoding, poses.to(belief.poses), self.sigma, fixed, self.pixels
             )
             return found.double() / self.temperature

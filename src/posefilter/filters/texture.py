@@ -228,19 +228,19 @@ class TextureRotations:
         """Return the belief with the estimate and its particles turned; the score stays.
 
         Raises:
-            UserError: The method keeps no color, or its object has no texture.
+            UserError: The object has no texture.
         """
-        object_model, colored = self._check(encoding, method)
+        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
         first = belief.best
         turns, first_tried = list_rotations(object_model)
         if len(turns) == 1:
             return belief
         turns = turns.to(first)
         log_posterior, tried = self._score(
-            first, turns, first_tried, colored, method, object_model, generator
+            first, turns, first_tried, encoding, method, object_model, generator
         )
         chosen = turns[tried.gather(1, log_posterior.argmax(1, keepdim=True))[:, 0]]
-        best = self._rotate_finely(first, chosen, turns, colored, object_model)
+        best = self._rotate_finely(first, chosen, turns, encoding, object_model)
         poses = _rotate_particles(
             belief, turns[first_tried], turns[tried], log_posterior, object_model, generator
         )
@@ -256,22 +256,12 @@ class TextureRotations:
         Raises:
             UserError: As when called.
         """
-        object_model, colored = self._check(encoding, method)
+        object_model: ObjectModel = method.object_model  # type: ignore[attr-defined]
         turns, first_tried = list_rotations(object_model)
         if len(first_tried) <= _MOST:
             return None
         here = torch.eye(4).expand_as(best).to(best)
-        return self._rotate_finely(best, here, turns.to(best), colored, object_model)
-
-    @staticmethod
-    def _check(encoding: Encoding, method: Method) -> tuple[ObjectModel, HasColor]:
-        object_model: ObjectModel | None = getattr(method, "object_model", None)
-        if not isinstance(encoding, HasColor) or object_model is None:
-            raise UserError(
-                f"filter/refine: {type(method).__name__} keeps no color to compare a texture with; "
-                "choose filter/refine=icp or none"
-            )
-        return object_model, encoding
+        return self._rotate_finely(best, here, turns.to(best), encoding, object_model)
 
     def _score(
         self,
@@ -401,8 +391,7 @@ def _rotate_particles(
         generator: Draws the turns, systematically: their shares are those of the posterior.
     """
     poses, best = belief.poses, belief.best
-    x, y, z = object_model.center.tolist()
-    space = PoseSpace((x, y, z), object_model.radius)
+    space = PoseSpace(tuple(object_model.center.tolist()), object_model.radius)
     distance = space.distance(poses[:, :, None], (best[:, None] @ turns)[:, None])  # (B, N, S)
     nearest, at = distance.min(-1)
     back = torch.linalg.inv(turns)[at]

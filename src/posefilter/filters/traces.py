@@ -8,25 +8,26 @@ from torch import Tensor
 from posefilter.types import Trace
 
 
-def map_traces(change: Callable[..., Tensor], *traces: Trace) -> Trace:
-    """Return a trace each of whose tensors is made of the same one of all traces.
+def map_tensors(change: Callable[..., Tensor], *parts: Any) -> Any:
+    """Return nested tuples each of whose tensors is made of the same one of all that are given.
 
-    What belongs to no image stays as the first has it, and so does the encoding.
+    What belongs to no image, a number or a tensor of no dimension, stays as the first has it.
 
     Args:
-        change: Given a tensor of each trace, images first.
-        traces: Runs of one filter.
+        change: Given a tensor of each, images first.
+        parts: Tuples of one form.
     """
+    one = parts[0]
+    if isinstance(one, Tensor):
+        return one if one.dim() == 0 else change(*parts)
+    if isinstance(one, tuple):
+        made = [map_tensors(change, *same) for same in zip(*parts, strict=True)]
+        return type(one)(*made) if hasattr(one, "_fields") else tuple(made)
+    return one
 
-    def make(*parts: Any) -> Any:
-        one = parts[0]
-        if isinstance(one, Tensor):
-            return one if one.dim() == 0 else change(*parts)
-        if isinstance(one, tuple):
-            made = [make(*same) for same in zip(*parts, strict=True)]
-            return type(one)(*made) if hasattr(one, "_fields") else tuple(made)
-        return one
 
+def map_traces(change: Callable[..., Tensor], *traces: Trace) -> Trace:
+    """Return a trace made of traces by `map_tensors`; the encoding stays that of the first."""
     bare = [trace._replace(encoding=None) for trace in traces]
-    out: Trace = make(*bare)
+    out: Trace = map_tensors(change, *bare)
     return out._replace(encoding=traces[0].encoding)

@@ -19,7 +19,7 @@ def applies(*tensors: Tensor) -> bool:
     return plain and not asked and not torch.compiler.is_compiling()
 
 
-def move(pose: Tensor, tangent: Tensor, center: tuple[float, float, float]) -> Tensor:
+def move(pose: Tensor, tangent: Tensor, center: tuple[float, ...]) -> Tensor:
     """Return moved poses, as `move_about` does.
 
     Args:
@@ -45,7 +45,7 @@ def move(pose: Tensor, tangent: Tensor, center: tuple[float, float, float]) -> T
     return out.view(*lead, 4, 4)
 
 
-def _move(rows: Tensor, steps: Tensor, center: tuple[float, float, float], out: Tensor) -> None:
+def _move(rows: Tensor, steps: Tensor, center: tuple[float, ...], out: Tensor) -> None:
     """Write moved poses.  (n, 16), (n, 6), -> (n, 16)."""
     n = len(rows)
     entries = rows.t().contiguous().view(4, 4, n)

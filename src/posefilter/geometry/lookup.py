@@ -86,19 +86,20 @@ def erode(mask: Tensor, margin_px: int) -> Tensor:
     """
     if margin_px == 0:
         return mask
-    outside = F.pad((~mask).float(), (margin_px,) * 4, value=1.0)
-    # an axis at a time
-    inner = ~_any_within(_any_within(outside, 2 * margin_px + 1).mT, 2 * margin_px + 1).mT
+    side = 2 * margin_px + 1
+    inner = _all_within(_all_within(mask, side, 1), 1, side)  # an axis at a time
     return torch.where(inner.flatten(1).any(1)[:, None, None, None], inner, mask)
 
 
-def _any_within(values: Tensor, side: int) -> Tensor:
-    """Return whether any of `side` neighbors along the last axis is above 0, by running sums.
+def _all_within(mask: Tensor, height: int, width: int) -> Tensor:
+    """Return where all of the window about a pixel, of odd sides, is in the mask; there is none
+    beyond the frame.
 
-    (*, n) -> (*, n - side + 1).
+    (B, 1, H, W) bool -> the same shape.
     """
-    sums = F.pad(values.float().cumsum(-1), (1, 0))
-    return sums[..., side:] > sums[..., :-side]
+    margins = (width // 2, width // 2, height // 2, height // 2)
+    outside = F.pad((~mask).float(), margins, value=1.0)
+    return F.max_pool2d(outside, (height, width), stride=1) == 0
 
 
 def mask_pixels(mask: Tensor, max_pixels: int | None = None) -> tuple[Tensor, Tensor]:
@@ -150,14 +151,7 @@ def nearest_mask_pixel(mask: Tensor, pixels: Tensor, chunk: int = 1 << 17) -> Te
         Nearest pixels (B, P, 2) [px].
     """
     pixels = pixels.detach()
-    inner = (
-        F.max_pool2d(F.pad((~mask).float(), (1, 1, 1, 1), value=1.0), (3, 1), stride=1)[..., 1:-1]
-        == 0
-    )
-    inner &= (
-        F.max_pool2d(F.pad((~mask).float(), (1, 1, 1, 1), value=1.0), (1, 3), stride=1)[:, :, 1:-1]
-        == 0
-    )
+    inner = _all_within(mask, 3, 1) & _all_within(mask, 1, 3)
     rim, real = mask_pixels(mask & ~inner)
     rim = rim.to(pixels.dtype)
     square = torch.where(real, rim.square().sum(-1), torch.inf)[:, None]

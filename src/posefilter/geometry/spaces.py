@@ -5,6 +5,7 @@ A space perturbs, averages and compares states.
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from posefilter.geometry.rotation import angle_between, project_to_so3
 class PixelSpace:
     """States are pixels (2,) [px]."""
 
-    dimensions: int = 2
+    dimensions: ClassVar[int] = 2
 
     def move(self, state: Tensor, tangent: Tensor) -> Tensor:
         """Return pixels shifted by offsets.  (*, 2), (*, 2) [px] -> (*, 2)."""
@@ -46,18 +47,16 @@ class PoseSpace:
     Args:
         center: The object's center in its own frame [m].
         radius: Radius of its bounding sphere [m].
-        dimensions: Width of a tangent vector.
-        max_rotation_std: Largest standard deviation of a rotation [rad].
         points: (P, 3) surface points of the object [m], for `axes`.
     """
 
-    center: tuple[float, float, float]
+    center: tuple[float, ...]
     radius: float
-    dimensions: int = 6
-    max_rotation_std: float = (
-        1.2  # [rad]; a wider Gaussian turn wraps round and covers SO(3) no better
-    )
     points: Tensor | None = field(default=None, compare=False, repr=False)
+
+    dimensions: ClassVar[int] = 6  # of a tangent vector
+    # [rad] of a rotation; a wider Gaussian turn wraps round and covers SO(3) no better
+    max_rotation_std: ClassVar[float] = 1.2
 
     @cached_property
     def axes(self) -> Tensor:

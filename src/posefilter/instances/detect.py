@@ -21,25 +21,11 @@ from posefilter.protocols import Encoding
 from posefilter.types import Batch, BeliefBatch, Trace
 
 _LIKELY = 0.5  # probability from which an answer is taken out of the image for other classes
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """How instances are searched for.
-
-    Attributes:
-        particles: Of the filter that follows one instance, at most.
-        initial_particles: Of its first step, at most.
-        spare: Searches beyond the instances asked for, while an answer is doubtful.
-        share: Of its visible pixels, that an answer must have for itself.
-        worth: Mean probability of the network's surest cells, below which there is no more to find.
-    """
-
-    particles: int = 80
-    initial_particles: int = 320
-    spare: int = 1
-    share: float = 0.5
-    worth: float = 0.3
+# particles of the filter that follows one instance at most, and of its first step
+_PARTICLES, _INITIAL_PARTICLES = 80, 320
+_SPARE = 1  # searches beyond the instances asked for, while an answer is doubtful
+_SHARE = 0.5  # of its visible pixels, that an answer must have for itself
+_WORTH = 0.3  # mean probability of the network's surest cells, below which there is no more to find
 
 
 class Detection(NamedTuple):
@@ -77,7 +63,6 @@ def detect(
     batches: Sequence[Batch],
     counts: Sequence[int],
     costs: Costs,
-    settings: SearchSettings | None = None,
 ) -> tuple[list[Detection], list[float]]:
     """Find the instances of several classes in one image, no two on the same pixels.
 
@@ -88,28 +73,19 @@ def detect(
         batches: The image, as each method takes it.
         counts: Instances of each class at most.
         costs: What errors cost: an object that is absent by these is left out.
-        settings: Of the search.
 
     Returns:
         What is found, the most probable first; and the seconds that each class took.
     """
-    settings = settings or SearchSettings()
-    jobs = [
-        _begin(i, *one, settings)
-        for i, one in enumerate(zip(methods, batches, counts, strict=True))
-    ]
+    jobs = [_begin(i, *one) for i, one in enumerate(zip(methods, batches, counts, strict=True))]
     grid = (batches[0].depth.shape[-2], batches[0].depth.shape[-1])
     found: list[Detection] = []
-    while any(_is_open(job, found, costs, settings) for job in jobs):
-        fresh = [
-            _search(job, found, grid, costs, settings)
-            for job in jobs
-            if _is_open(job, found, costs, settings)
-        ]
-        found = resolve([*found, *(one for one in fresh if one is not None)], settings.share)
+    while any(_is_open(job, found, costs) for job in jobs):
+        fresh = [_search(job, found, grid, costs) for job in jobs if _is_open(job, found, costs)]
+        found = resolve([*found, *(one for one in fresh if one is not None)])
         found = [_judge_again(jobs[one.number], one, found, grid, costs) for one in found]
     there = [one for one in found if is_there(one, costs)]
-    return _keep_best(resolve(there, settings.share), counts), [job.seconds for job in jobs]
+    return _keep_best(resolve(there), counts), [job.seconds for job in jobs]
 
 
 def is_there(one: Detection, costs: Costs) -> bool:
@@ -119,45 +95,35 @@ def is_there(one: Detection, costs: Costs) -> bool:
     return _judge(one, costs) != "absent"
 
 
-def resolve(found: Sequence[Detection], share: float) -> list[Detection]:
+def resolve(found: Sequence[Detection]) -> list[Detection]:
     """Return the detections that keep pixels, the most probable first.
 
     The more probable answer keeps the pixels, and one that has hardly any of its own is dropped.
     Those without a probability come last, by their scores.
-
-    Args:
-        found: Detections of one image.
-        share: Of its pixels, that each must have for itself.
     """
     order = sorted(found, key=lambda one: (-one.probability, -float(one.belief.score[0])))
-    kept = keep_pixels([one.mask for one in order], share)
+    kept = keep_pixels([one.mask for one in order], _SHARE)
     pairs = zip(order, kept, strict=True)
     return [one._replace(mask=mask) for one, mask in pairs if mask is not None]
 
 
-def _begin(
-    number: int, method: PoseEstimator, batch: Batch, count: int, settings: SearchSettings
-) -> _Job:
+def _begin(number: int, method: PoseEstimator, batch: Batch, count: int) -> _Job:
     small = copy.copy(method.filter)
-    small.particles = min(small.particles, settings.particles)
-    small.initial_particles = min(small.initial_particles, settings.initial_particles)
+    small.particles = min(small.particles, _PARTICLES)
+    small.initial_particles = min(small.initial_particles, _INITIAL_PARTICLES)
     return _Job(number, method, batch, count, small, method.generator("predict", 0))
 
 
-def _is_open(job: _Job, found: Sequence[Detection], costs: Costs, settings: SearchSettings) -> bool:
+def _is_open(job: _Job, found: Sequence[Detection], costs: Costs) -> bool:
     """Tell whether a class is to be searched for once more."""
-    if job.exhausted or job.searches >= job.count + settings.spare:
+    if job.exhausted or job.searches >= job.count + _SPARE:
         return False
     own = [_judge(one, costs) for one in found if one.number == job.number]
     return sum(verdict != "unsure" for verdict in own) < job.count
 
 
 def _search(
-    job: _Job,
-    found: Sequence[Detection],
-    grid: tuple[int, int],
-    costs: Costs,
-    settings: SearchSettings,
+    job: _Job, found: Sequence[Detection], grid: tuple[int, int], costs: Costs
 ) -> Detection | None:
     """Search for one instance more, in the image without what is found; None if there is none."""
     start = time.perf_counter()
@@ -165,9 +131,7 @@ def _search(
     hidden = _hide(job, [x for x in found if x.number == job.number or x.probability >= _LIKELY])
     image, encoding = _encode(job, hidden)
     one = None
-    if bool(image.depth.any()) and (
-        job.searches == 1 or float(measure_worth(encoding)) >= settings.worth
-    ):
+    if bool(image.depth.any()) and (job.searches == 1 or float(measure_worth(encoding)) >= _WORTH):
         trace = search(job.method, image, job.generator, encoding, job.filter)
         depth, K = job.batch.depth[0, 0], job.batch.intrinsics[0]
         visible = find_visible(trace.belief.best, job.method.object_model, depth, K)[0]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import check_choice
 from posefilter.geometry.lookup import centroid, erode, nearest_mask_pixel
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -29,8 +29,7 @@ class TowardsObject:
     def __init__(
         self, target: str = "nearest", margin_px: int = 0, max_displacement: float = float("inf")
     ) -> None:
-        if target not in ("nearest", "center"):
-            raise UserError(f"label.target={target!r} is unknown: choose nearest or center")
+        check_choice("label.target", target, "nearest", "center")
         self.target = target
         self.margin_px = margin_px
         self.max_displacement = max_displacement

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.types import Batch, ObjectModel, Trace
 
 
@@ -32,20 +31,9 @@ class PaperPoints:
     behind_label: float = -100.0
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
-        """Return labels (1, B, N).
-
-        Raises:
-            UserError: The trace's particles are not samples along rays.
-        """
-        if trace.particles[-1].state.dim() != 3:
-            raise UserError(
-                "loss=regression judges points along rays, not poses: choose "
-                "model/candidate_sampler=labeled_rays, or loss=contrastive"
-            )
-        offset, own_color = (
-            trace.particles[-1].state[..., 2],
-            trace.particles[-1].state[..., 3] > 0.5,
-        )
+        """Return labels (1, B, N)."""
+        offset = trace.particles[-1].state[..., 2]
+        own_color = trace.particles[-1].state[..., 3] > 0.5
         label = torch.where(offset > self.tolerance, self.behind_label, 0.0)
         return torch.where((offset.abs() <= self.tolerance) & own_color, self.surface_label, label)[
             None

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import check_choice
 from posefilter.geometry.lookup import mask_pixels
 from posefilter.geometry.pose import origin_of, rotation_of
 from posefilter.types import Batch, ObjectModel, ParticleOutput, Particles, Trace
@@ -150,8 +150,7 @@ class BeliefNll:
     requires: ClassVar[Capabilities] = ("rollout",)
 
     def __init__(self, terms: Mapping[str, TruthDensity], steps: str = "all") -> None:
-        if steps not in ("last", "all"):
-            raise UserError(f"loss.steps={steps!r} is unknown: choose last or all")
+        check_choice("loss.steps", steps, "last", "all")
         self.terms, self.steps = dict(terms), steps
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:

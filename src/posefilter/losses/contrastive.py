@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.geometry.pose_error import add_distance, subsample
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -46,21 +45,10 @@ class Contrastive:
     requires: ClassVar[Capabilities] = ("candidates",)
 
     def __call__(self, trace: Trace, batch: Batch, object_model: ObjectModel) -> Tensor:
-        """Return the divergence of each image, (B,) >= 0.
-
-        Raises:
-            UserError: The trace's particles are not poses.
-        """
-        if trace.particles[-1].state.dim() != 4:
-            raise UserError(
-                "loss=contrastive judges candidate poses, not points: choose "
-                "model/candidate_sampler=poses, or loss=regression"
-            )
-        poses, scores, sigma = (
-            trace.outputs[-1].pose,
-            trace.outputs[-1].log_likelihood,
-            trace.steps[-1].sigma,
-        )
+        """Return the divergence of each image, (B,) >= 0."""
+        poses = trace.outputs[-1].pose
+        scores = trace.outputs[-1].log_likelihood
+        sigma = trace.steps[-1].sigma
         distance = pose_distance(poses, batch.camera_from_object, object_model)
         target = torch.log_softmax(-0.5 * (distance / sigma[..., None]) ** 2, dim=1)
         divergence = (target.exp() * (target - torch.log_softmax(scores, dim=1))).sum(1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import check_choice
 from posefilter.protocols import Label
 from posefilter.types import Batch, ObjectModel, Trace
 
@@ -28,8 +28,7 @@ def stack_log_likelihoods(trace: Trace, steps: str) -> Tensor:
     Raises:
         UserError: `steps` is neither "last" nor "all".
     """
-    if steps not in ("last", "all"):
-        raise UserError(f"loss.steps={steps!r} is unknown: choose last or all")
+    check_choice("loss.steps", steps, "last", "all")
     outputs = trace.outputs if steps == "all" else trace.outputs[-1:]
     return torch.stack([output.log_likelihood for output in outputs])
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import check_choice
 from posefilter.geometry.camera import back_project
 from posefilter.geometry.fragments import fragment_errors, within_bounds
 from posefilter.geometry.lookup import gather_pixels, nearest_pixel
@@ -34,8 +34,7 @@ class Add:
     distance = staticmethod(add_distance)
 
     def __init__(self, weighting: str = "mean", points: int = 256) -> None:
-        if weighting not in ("mean", "likelihood"):
-            raise UserError(f"loss.weighting={weighting!r} is unknown: choose mean or likelihood")
+        check_choice("loss.weighting", weighting, "mean", "likelihood")
         self.weighting = weighting
         self.points = points
 

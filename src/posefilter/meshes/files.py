@@ -83,11 +83,9 @@ def _one_texture(raw: RawMesh, path: Path) -> tuple[np.ndarray | None, np.ndarra
     pictures = [_picture(raw.materials[i]) for i in used]
     if len(used) == 1 and (raw.corner_uv is None or pictures[0].shape[:2] == (1, 1)):
         return None, pictures[0][:1, :1]
-    uv = (
-        np.zeros((len(raw.faces), 3, 2))
-        if raw.corner_uv is None
-        else raw.corner_uv.astype(np.float64)
-    )
+    uv = np.zeros((len(raw.faces), 3, 2))
+    if raw.corner_uv is not None:
+        uv = raw.corner_uv.astype(np.float64)
     if len(used) == 1:
         return uv.astype(np.float32), pictures[0]
     height = max(p.shape[0] for p in pictures)
@@ -125,23 +123,27 @@ def _read_other(path: Path) -> RawMesh:
     raws = [_from_trimesh(part, path) for part in parts if isinstance(part, trimesh.Trimesh)]
     if not raws:
         raise UserError(f"{path}: the mesh has no triangles (is it a point cloud, or cut short?)")
-    vertex_start = np.cumsum([0] + [len(r.vertices) for r in raws])
-    both_uv = [np.zeros((len(r.faces), 3, 2)) if r.corner_uv is None else r.corner_uv for r in raws]
-    colors = [
-        np.ones((len(r.faces), 3, 3)) if r.corner_colors is None else r.corner_colors for r in raws
-    ]
-    normals = [
-        np.zeros((len(r.faces), 3, 3)) if r.corner_normals is None else r.corner_normals
-        for r in raws
-    ]
+
+    def join(name: str, width: int, missing: float) -> np.ndarray | None:
+        """Join what corners have; parts without get `missing`."""
+        own = [getattr(raw, name) for raw in raws]
+        if all(x is None for x in own):
+            return None
+        pairs = zip(own, counts, strict=True)
+        return np.concatenate(
+            [np.full((n, 3, width), missing) if x is None else x for x, n in pairs]
+        )
+
+    counts = [len(raw.faces) for raw in raws]
+    starts = np.cumsum([0] + [len(raw.vertices) for raw in raws])[:-1]
     return RawMesh(
-        np.concatenate([r.vertices for r in raws]),
-        np.concatenate([r.faces + start for r, start in zip(raws, vertex_start[:-1], strict=True)]),
-        None if all(r.corner_uv is None for r in raws) else np.concatenate(both_uv),
-        np.concatenate(normals),
-        None if all(r.corner_colors is None for r in raws) else np.concatenate(colors),
-        np.concatenate([np.full(len(r.faces), i) for i, r in enumerate(raws)]),
-        [r.materials[0] for r in raws],
+        np.concatenate([raw.vertices for raw in raws]),
+        np.concatenate([raw.faces + start for raw, start in zip(raws, starts, strict=True)]),
+        join("corner_uv", 2, 0.0),
+        join("corner_normals", 3, 0.0),
+        join("corner_colors", 3, 1.0),
+        np.repeat(np.arange(len(raws)), counts),
+        [raw.materials[0] for raw in raws],
     )
 
 

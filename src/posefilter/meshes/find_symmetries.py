@@ -163,12 +163,9 @@ def _register(surface: _Surface, transform: np.ndarray, rounds: int = 15) -> np.
         moved = _move(surface.points, transform)
         distance, near = surface.nearest.query(moved)
         kept = distance <= np.quantile(distance, 0.9)
-        x, y = moved[kept], surface.dense[near[kept]]
-        U, _, Vt = np.linalg.svd((x - x.mean(0)).T @ (y - y.mean(0)))
-        flip = np.diag([1, 1, np.sign(np.linalg.det(Vt.T @ U.T))])
-        step = np.eye(4)
-        step[:3, :3] = Vt.T @ flip @ U.T
-        step[:3, 3] = y.mean(0) - step[:3, :3] @ x.mean(0)
+        step, _, _ = trimesh.registration.procrustes(
+            moved[kept], surface.dense[near[kept]], reflection=False, scale=False
+        )
         transform = step @ transform
     return transform
 

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -28,7 +27,7 @@ def _identity() -> np.ndarray:
     return np.eye(4)[None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """A textured triangle mesh in its file's own frame [m].  Treat the arrays as read-only.
 
@@ -285,9 +284,6 @@ def grid_faces(rows: int, columns: int) -> np.ndarray:
         (2 * (rows - 1) * (columns - 1), 3) indices.
     """
     index = np.arange(rows * columns).reshape(rows, columns)
-    quads = [(a, b) for a, b in pairwise(range(rows))]
-    a = np.concatenate([index[i, :-1] for i, _ in quads])
-    b = np.concatenate([index[i, 1:] for i, _ in quads])
-    c = np.concatenate([index[j, 1:] for _, j in quads])
-    d = np.concatenate([index[j, :-1] for _, j in quads])
+    a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
+    c, d = index[1:, 1:].ravel(), index[1:, :-1].ravel()
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])

@@ -9,25 +9,14 @@ from typing import TYPE_CHECKING, Any
 from posefilter.lazy import import_lazily
 
 if TYPE_CHECKING:
-    from posefilter.models.cnn_patch import CnnPatch
-    from posefilter.models.dense_coordinates import DenseCoordinates
-    from posefilter.models.downsized import Downsized
-    from posefilter.models.keypoints import Keypoints
-    from posefilter.models.patch_pf import PatchPF
-    from posefilter.models.pixel_pf import PixelPF
-    from posefilter.models.pose_pf import PosePF
-    from posefilter.models.rotation_grid import RotationGrid
-
-__all__ = [
-    "CnnPatch",
-    "DenseCoordinates",
-    "Downsized",
-    "Keypoints",
-    "PatchPF",
-    "PixelPF",
-    "PosePF",
-    "RotationGrid",
-]
+    from posefilter.models.cnn_patch import CnnPatch as CnnPatch
+    from posefilter.models.dense_coordinates import DenseCoordinates as DenseCoordinates
+    from posefilter.models.downsized import Downsized as Downsized
+    from posefilter.models.keypoints import Keypoints as Keypoints
+    from posefilter.models.patch_pf import PatchPF as PatchPF
+    from posefilter.models.pixel_pf import PixelPF as PixelPF
+    from posefilter.models.pose_pf import PosePF as PosePF
+    from posefilter.models.rotation_grid import RotationGrid as RotationGrid
 
 _HOMES = {
     "CnnPatch": "cnn_patch",
@@ -39,6 +28,7 @@ _HOMES = {
     "PosePF": "pose_pf",
     "RotationGrid": "rotation_grid",
 }
+__all__ = [*_HOMES]
 
 
 def _make_lightning_module(kind: Any) -> Any:

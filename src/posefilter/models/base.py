@@ -413,20 +413,17 @@ class PoseEstimator(Module):
         self.scores["particles_on_object"].update(
             batch.mask, self.particle_pixels(trace.particles[-1], batch)
         )
+        best, true_pose = trace.belief.best, batch.camera_from_object
         if "poses" in self.scores:
-            self.scores["poses"].update(trace.belief.best, batch.camera_from_object)
-            self.scores["bop"].update(
-                trace.belief.best, batch.camera_from_object, batch.intrinsics, width
-            )
-            self.scores["by_visibility"].collect(
-                trace.belief.best, batch.camera_from_object, batch.visibility
-            )
-            self.scores["belief"].update(trace.belief, batch.camera_from_object)
-            seen = score_truth(trace.belief, batch.camera_from_object, self.object_model)
+            self.scores["poses"].update(best, true_pose)
+            self.scores["bop"].update(best, true_pose, batch.intrinsics, width)
+            self.scores["by_visibility"].collect(best, true_pose, batch.visibility)
+            self.scores["belief"].update(trace.belief, true_pose)
+            seen = score_truth(trace.belief, true_pose, self.object_model)
             self.scores["credibility"].update(seen, batch.visibility)
             self.judge_confidence(trace, batch, present=True)
         if "parts" in self.scores:
-            self.scores["parts"].update(trace.belief.best, batch)
+            self.scores["parts"].update(best, batch)
 
     def last_assessment(self, count: int) -> Assessment:
         """Return the probabilities of the batch that the metrics took in last, of `count` images;
@@ -521,23 +518,24 @@ class PoseEstimator(Module):
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics; the best checkpoint has the highest `val/score`."""
-        results = self.compute_metrics()
-        self._log_step()
-        self.log_dict({f"val/{name}": value for name, value in flatten(results).items()})
+        results = self._log_metrics("val")
         self.log("val/score", compute_checkpoint_score(results), prog_bar=True)
-
-    def _log_step(self) -> None:
-        """Have the logger put what is logged at the step that the model has come to: by itself
-        Lightning counts from 0, one less, and adds the epoch.
-        """
-        self.log("step", float(self.trainer.global_step))
-        self.log("epoch", float(self.trainer.current_epoch))
 
     def on_test_epoch_end(self) -> None:
         """Log the metrics."""
+        self._log_metrics("test")
+
+    def _log_metrics(self, split: str) -> dict[str, Any]:
+        """Log the metrics of a split, and return them.
+
+        The logger is to put them at the step that the model has come to: by itself Lightning counts
+        from 0, one less, and adds the epoch.
+        """
         results = self.compute_metrics()
-        self._log_step()
-        self.log_dict({f"test/{name}": value for name, value in flatten(results).items()})
+        self.log("step", float(self.trainer.global_step))
+        self.log("epoch", float(self.trainer.current_epoch))
+        self.log_dict({f"{split}/{name}": value for name, value in flatten(results).items()})
+        return results
 
     # -- checkpoints ------------------------------------------------------------------------------
 

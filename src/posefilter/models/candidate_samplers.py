@@ -7,7 +7,6 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
 from posefilter.filters.candidates import (
     PersistentParticles,
     sample_around_truth,
@@ -224,11 +223,7 @@ class LabeledRays(CandidateSampler):
             where the color is the observed one.
         """
         net = method.likelihood
-        if not isinstance(net, ScoresSamples):
-            raise UserError(
-                "model/candidate_sampler=labeled_rays: labeled rays train the paper's likelihood "
-                "only; choose model/likelihood=paper or model/candidate_sampler=poses"
-            )
+        assert isinstance(net, ScoresSamples)  # of what `requires` says
         B, _, _, W = batch.depth.shape
         device = batch.rgb.device
         depth = batch.depth.flatten(1)

@@ -12,8 +12,6 @@ import torch
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
-from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
-from posefilter.confidence.features import measure_coordinates
 from posefilter.geometry.ransac import (
     agreement,
     draw_minimal_fits,
@@ -24,7 +22,7 @@ from posefilter.models.pose_particles import Hypotheses, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates
 from posefilter.nets.pose_votes import measure_cells
 from posefilter.nets.proposals import ObjectCoordinateNet
-from posefilter.types import Batch, ObjectModel, Trace
+from posefilter.types import Batch
 
 
 class DenseEncoding(NamedTuple):
@@ -119,23 +117,3 @@ class DenseCoordinates(Hypotheses):
     def tolerance(self) -> float:
         """The distance of an inlier [m]."""
         return self.inlier * self.object_model.diameter
-
-    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
-        """Return what speaks for each estimate, with what the network sees of it."""
-        encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
-        seen = measure_coordinates(
-            trace.belief.best, encoding.coordinates, encoding.cells, self.object_model
-        )
-        return super().collect_features(trace, batch) | seen
-
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize:
-        """Return how large the object appears by the network's object points."""
-        encoding: DenseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
-        return measure_apparent_size(
-            trace.belief.best, encoding.coordinates, encoding.cells, self.object_model
-        )
-
-    def set_object(self, object_model: ObjectModel) -> None:
-        """Set the object of the network too."""
-        super().set_object(object_model)
-        self.proposals.set_object(object_model.points, object_model.center, object_model.radius)

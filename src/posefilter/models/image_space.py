@@ -19,6 +19,7 @@ from posefilter.geometry.spaces import PixelSpace
 from posefilter.models.base import PoseEstimator
 from posefilter.models.box_heads import BoxHead
 from posefilter.models.loss_schedule import Auxiliary, Stage, check_loss_schedule, loss_weights_at
+from posefilter.models.zoom import with_encoding
 from posefilter.nets.encoders import ContextMap
 from posefilter.nets.glimpse import BilinearGlimpse, IntegerCut
 from posefilter.nets.heads import fill_depth
@@ -33,6 +34,8 @@ class ImageEncoding:
     depth: Tensor  # (B, 2, H, W): depth with its holes filled [m], and 1 where it was measured
     intrinsics: Tensor  # (B, 3, 3) [px]
     context: ContextMap
+    # (B, 1, h, w), the probability that the cell shows the object; None where no encoder tells
+    objectness: Tensor | None
 
     @property
     def measured_depth(self) -> Tensor:
@@ -43,13 +46,6 @@ class ImageEncoding:
     def measured_color(self) -> Tensor:
         """Red, green and blue (B, 3, H, W) in [0, 1]."""
         return (self.image[:, :3] + 1) / 2
-
-
-@dataclass(frozen=True)
-class ObjectnessEncoding(ImageEncoding):
-    """Encoded images with an objectness map."""
-
-    objectness: Tensor  # (B, 1, h, w), the probability that the cell shows the object
 
 
 class ImageSpace(PoseEstimator):
@@ -71,7 +67,6 @@ class ImageSpace(PoseEstimator):
         truncate: Truncate backpropagation through positions and latents at every so many steps;
             None: never. Values do not change. A position still passes its own gradient on to the
             next, so over a long roll-out this damps the growth of gradients; only 1 ends it.
-        object_model: The object, if it is known already.
         **base: Arguments of `PoseEstimator`.
     """
 
@@ -105,16 +100,13 @@ class ImageSpace(PoseEstimator):
         objectness_weight: float = 1.0,
         detach_position: bool = False,
         truncate: int | None = None,
-        object_model: ObjectModel | None = None,
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.glimpse, self.encoder, self.pose_head, self.displacement = (
-            glimpse,
-            encoder,
-            pose_head,
-            displacement,
-        )
+        self.glimpse = glimpse
+        self.encoder = encoder
+        self.pose_head = pose_head
+        self.displacement = displacement
         self.net = net(
             extra=self.encoder.width + self.position_width,
             size=glimpse.size,
@@ -126,13 +118,9 @@ class ImageSpace(PoseEstimator):
         check_loss_schedule(self.loss_schedule, ["loss", "objectness", *(aux_losses or {})])
         for component in (box_head, *(aux.loss for aux in self.aux_losses.values())):
             check_latent_width(self.latent_width, getattr(component, "latent_width", None))
-        self.objectness_weight, self.detach_position, self.truncate = (
-            objectness_weight,
-            detach_position,
-            truncate,
-        )
-        if object_model is not None:  # not in the base, where the pose head does not exist yet
-            self.set_object(object_model)
+        self.objectness_weight = objectness_weight
+        self.detach_position = detach_position
+        self.truncate = truncate
 
     @property
     def space(self) -> PixelSpace:
@@ -149,10 +137,9 @@ class ImageSpace(PoseEstimator):
         context = self.encoder(batch.rgb, batch.depth, batch.intrinsics)
         image = torch.cat([batch.rgb * 2 - 1, batch.depth], dim=1)
         depth = torch.cat([fill_depth(batch.depth), (batch.depth > 0).to(batch.depth)], dim=1)
-        if context.objectness is None:
-            return ImageEncoding(image, depth, batch.intrinsics, context)
-        objectness = torch.sigmoid(context.objectness)[:, None]
-        return ObjectnessEncoding(image, depth, batch.intrinsics, context, objectness)
+        logit = context.objectness
+        objectness = None if logit is None else torch.sigmoid(logit)[:, None]
+        return ImageEncoding(image, depth, batch.intrinsics, context, objectness)
 
     def measure(
         self, encoding: ImageEncoding, particles: Particles, step: Step, generator: Generator
@@ -236,11 +223,11 @@ class ImageSpace(PoseEstimator):
         own = self.train_filter is not self.filter
         check_particle_counts(self.train_filter, "model.train_filter" if own else "filter")
         encoding = self.encode(batch)
-        trace: Trace = self.train_filter(batch, _EncodedMethod(self, encoding), generator)
+        trace: Trace = self.train_filter(batch, with_encoding(self, encoding), generator)
         losses = {"loss": self.loss(trace, batch, self.object_model)}
         for name, aux in self.aux_losses.items():
             losses[name] = aux.weight * aux.loss(trace, batch, self.object_model)
-        if isinstance(encoding, ObjectnessEncoding) and self.objectness_weight:
+        if encoding.objectness is not None and self.objectness_weight:
             losses["objectness"] = self.objectness_weight * objectness_loss(
                 encoding.context, batch.mask
             )
@@ -276,23 +263,6 @@ class ImageSpace(PoseEstimator):
     def box(self, trace: Trace, batch: Batch) -> Tensor:
         """Return the bounding box that the box head computes, (B, 4) [px]."""
         return self.box_head(trace, batch, self.object_model)
-
-
-class _EncodedMethod:
-    """A method whose images are encoded: the roll-out and the objectness loss share them."""
-
-    def __init__(self, method: ImageSpace, encoding: ImageEncoding) -> None:
-        self.method, self.encoding = method, encoding
-        self.space, self.latent_width, self.measure = (
-            method.space,
-            method.latent_width,
-            method.measure,
-        )
-        self.surface_points, self.object_model = method.surface_points, method.object_model
-
-    def encode(self, batch: Batch) -> ImageEncoding:
-        """Return what was encoded before."""
-        return self.encoding
 
 
 def check_latent_width(width: int, required: int | None) -> None:

@@ -6,9 +6,13 @@ from typing import Any, ClassVar
 from torch import Generator, Tensor
 
 from posefilter.capabilities import Capabilities
+from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
+from posefilter.confidence.features import measure_coordinates
 from posefilter.errors import UserError
 from posefilter.geometry.spaces import PoseSpace
 from posefilter.models.base import PoseEstimator
+from posefilter.nets.coordinates import Cells, Coordinates, HasCoordinates
+from posefilter.nets.proposals import ObjectCoordinateNet
 from posefilter.types import Batch, BeliefBatch, ObjectModel, ParticleOutput, Particles, Step, Trace
 
 _LEAST = 1e-6  # score whose logarithm is finite
@@ -31,10 +35,8 @@ class PoseParticles(PoseEstimator):
     def space(self) -> PoseSpace:
         """SE(3) about the object's center."""
         if self._space is None:
-            x, y, z = self.object_model.center.tolist()
-            self._space = PoseSpace(
-                (x, y, z), self.object_model.radius, points=self.object_model.points
-            )
+            own = self.object_model
+            self._space = PoseSpace(tuple(own.center.tolist()), own.radius, points=own.points)
         return self._space
 
     @property
@@ -43,9 +45,46 @@ class PoseParticles(PoseEstimator):
         return 0
 
     def set_object(self, object_model: ObjectModel) -> None:
-        """Set the object, and forget the space about another's center."""
+        """Set the object, also that of the proposal network, and forget the space about another's
+        center.
+        """
         super().set_object(object_model)
         self._space = None
+        network = self._coordinate_net
+        if network is not None:
+            network.set_object(object_model.points, object_model.center, object_model.radius)
+
+    @property
+    def _coordinate_net(self) -> ObjectCoordinateNet | None:
+        """The network of dense object coordinates, of those methods that have one."""
+        return getattr(self, "proposals", None)
+
+    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
+        """Return what speaks for each estimate, with what such a network sees of it."""
+        features = super().collect_features(trace, batch)
+        if self._coordinate_net is None:
+            return features
+        return features | measure_coordinates(*self._see_estimate(trace, batch))
+
+    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
+        """Return how large the object appears by such a network; None without one."""
+        if self._coordinate_net is None:
+            return None
+        return measure_apparent_size(*self._see_estimate(trace, batch))
+
+    def _see_estimate(
+        self, trace: Trace, batch: Batch
+    ) -> tuple[Tensor, Coordinates, Cells, ObjectModel]:
+        """Return the estimates of a finished run, and what the network sees of their images."""
+        encoding: HasCoordinates = self.encode(batch) if trace.encoding is None else trace.encoding
+        return trace.belief.best, encoding.coordinates, encoding.cells, self.object_model
+
+    def measure_encoding_loss(self, encoding: Any, batch: Batch) -> Tensor:
+        """Return the loss of what a network puts out, (B,), for methods whose training runs no
+        filter.
+        """
+        none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
+        return self.loss(Trace((), (), (), none, encoding=encoding), batch, self.object_model)
 
 
 class Hypotheses(PoseParticles):
@@ -80,11 +119,7 @@ class Hypotheses(PoseParticles):
 
     def training_losses(self, batch: Batch, generator: Generator) -> dict[str, Tensor]:
         """Return the loss of the network's output, one value for each image."""
-        encoding = self.encode(batch)
-        none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {
-            "loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.object_model)
-        }
+        return {"loss": self.measure_encoding_loss(self.encode(batch), batch)}
 
 
 def require_depth(valid: Tensor) -> None:

@@ -7,10 +7,8 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.confidence.apparent_size import ApparentSize, measure_apparent_size
-from posefilter.confidence.features import measure_coordinates
 from posefilter.data.absent import hide_annotation
-from posefilter.errors import UserError
+from posefilter.filters.traces import map_tensors
 from posefilter.models.candidate_samplers import CandidateSampler
 from posefilter.models.pose_particles import PoseParticles, require_depth
 from posefilter.nets.coordinates import Cells, Coordinates, coordinate_loss
@@ -34,18 +32,9 @@ class PoseEncoding(NamedTuple):
     cells: Cells | None
 
     @property
-    def objectness(self) -> Tensor:
-        """The probability that each cell shows the object, (B, 1, h, w).
-
-        Raises:
-            UserError: There is no proposal network.
-        """
-        if self.coordinates is None:
-            raise UserError(
-                "filter/initialize=from_objectness needs the proposal network; "
-                "choose model/proposals=dense"
-            )
-        return torch.sigmoid(self.coordinates.logit)[:, None]
+    def objectness(self) -> Tensor | None:
+        """The probability that each cell shows the object, (B, 1, h, w); None without a network."""
+        return None if self.coordinates is None else torch.sigmoid(self.coordinates.logit)[:, None]
 
     @property
     def measured_depth(self) -> Tensor:
@@ -65,10 +54,6 @@ class PoseEncoding(NamedTuple):
     def with_quasi_monte_carlo(self) -> "PoseEncoding":
         """Return the same images, whose poses are scored by points that are drawn evenly."""
         return self._replace(image=self.image._replace(even=True))
-
-    def first(self, count: int) -> "PoseEncoding":
-        """Return the first `count` images."""
-        return PoseEncoding(*(None if x is None else x.first(count) for x in self))  # type: ignore[arg-type]
 
 
 class PosePF(PoseParticles):
@@ -108,16 +93,12 @@ class PosePF(PoseParticles):
         **base: Any,
     ) -> None:
         super().__init__(**base)
-        self.likelihood, self.proposals, self.candidate_sampler = (
-            likelihood,
-            proposals,
-            candidate_sampler,
-        )
-        self.pixels, self.quasi_monte_carlo, self.train_pixels = (
-            pixels,
-            quasi_monte_carlo,
-            train_pixels,
-        )
+        self.likelihood = likelihood
+        self.proposals = proposals
+        self.candidate_sampler = candidate_sampler
+        self.pixels = pixels
+        self.quasi_monte_carlo = quasi_monte_carlo
+        self.train_pixels = train_pixels
         self.likelihood_batch_size = likelihood_batch_size
         self.proposal_weight = proposal_weight
 
@@ -171,13 +152,10 @@ class PosePF(PoseParticles):
             camera_from_object (B, particles, 4, 4) [m].
 
         Raises:
-            UserError: There is no proposal network, or an image without any depth.
+            UserError: An image has no depth.
         """
-        if encoding.coordinates is None or encoding.cells is None:
-            raise UserError(
-                "filter/initialize=from_proposals needs the proposal network; "
-                "choose model/proposals=dense"
-            )
+        assert encoding.coordinates is not None
+        assert encoding.cells is not None
         if not self.training:
             require_depth(encoding.cells.valid)
         return draw_poses(
@@ -194,7 +172,9 @@ class PosePF(PoseParticles):
         encoding = self.encode(batch)
         count = self.likelihood_batch_size or len(batch.rgb)
         part = Batch(*(x[:count] for x in batch))
-        candidates = self.candidate_sampler(self, encoding.first(count), part, generator)
+        image = encoding.image._replace(tables=None)  # whose rows are of all images
+        seen = map_tensors(lambda x: x[:count], encoding._replace(image=image))
+        candidates = self.candidate_sampler(self, seen, part, generator)
         losses = {"likelihood": self.loss(candidates, part, self.object_model)}
         if encoding.coordinates is not None and encoding.cells is not None:
             assert self.proposals is not None
@@ -206,37 +186,12 @@ class PosePF(PoseParticles):
             self.log_scalar("coordinate_error_mm", 1000 * error.mean())
         return losses
 
-    def collect_features(self, trace: Trace, batch: Batch) -> dict[str, Tensor]:
-        """Return what speaks for each estimate, with what the proposal network sees of it."""
-        features = super().collect_features(trace, batch)
-        if self.proposals is None:
-            return features
-        seen = self._predict_coordinates(trace, batch)
-        return features | measure_coordinates(trace.belief.best, *seen, self.object_model)
-
-    def measure_apparent_size(self, trace: Trace, batch: Batch) -> ApparentSize | None:
-        """Return how large the object appears by the proposal network; None without one."""
-        if self.proposals is None:
-            return None
-        return measure_apparent_size(
-            trace.belief.best, *self._predict_coordinates(trace, batch), self.object_model
-        )
-
-    def _predict_coordinates(self, trace: Trace, batch: Batch) -> tuple[Coordinates, Cells]:
-        """Return what the proposal network sees of the images of a finished run."""
-        encoding: PoseEncoding = self.encode(batch) if trace.encoding is None else trace.encoding
-        assert encoding.coordinates is not None
-        assert encoding.cells is not None
-        return encoding.coordinates, encoding.cells
-
     def set_object(self, object_model: ObjectModel) -> None:
         """Set the object of the networks too."""
         super().set_object(object_model)
         surface = getattr(self.likelihood, "surface", None)
         if surface is not None:
             surface.set_object(object_model.points)
-        if self.proposals is not None:
-            self.proposals.set_object(object_model.points, object_model.center, object_model.radius)
 
     def make_metrics(self) -> dict[str, nn.Module]:
         """Create the metrics, with a count of how often the truth is outscored."""

@@ -29,6 +29,7 @@ _NORMAL = 1e-3  # of the log of the weights' sum
 # a method that provides one of these names has a function of this name
 _FUNCTIONS = ("image_patches", "propose_poses", "score_poses", "surface_points")
 _FLOAT = (torch.float32,)
+_VERBS = ("schedule", "initialize", "reweight", "resample", "propagate", "estimate", "refine")
 Watch = Callable[..., Any]  # given a part's name, the call, and its arguments
 
 
@@ -198,13 +199,8 @@ class _Watcher:
         self._extend(method, **watches)
 
     def _watch_filter(self, one: ParticleFilter) -> None:
-        self._extend(one.schedule, __call__=self._schedule)
-        self._extend(one.initialize, __call__=self._initialize)
-        self._extend(one.reweight, __call__=self._reweight)
-        self._extend(one.resample, __call__=self._resample)
-        self._extend(one.propagate, __call__=self._propagate)
-        self._extend(one.estimate, __call__=self._estimate)
-        self._extend(one.refine, __call__=self._refine)
+        for name in _VERBS:
+            self._extend(getattr(one, name), __call__=getattr(self, f"_{name}"))
 
     def _extend(self, part: Any, **watches: Watch) -> None:
         if id(part) in self._known:

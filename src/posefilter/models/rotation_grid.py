@@ -24,7 +24,7 @@ from posefilter.geometry.pose import origin_of, pose_about, rotation_of
 from posefilter.geometry.rotation import spread_rotations
 from posefilter.models.pose_particles import PoseParticles
 from posefilter.nets.crop_encoder import CropEncoder
-from posefilter.types import Batch, BeliefBatch, ParticleOutput, Particles, Step, Trace
+from posefilter.types import Batch, ParticleOutput, Particles, Step
 
 if TYPE_CHECKING:
     from posefilter.meshes.mesh import Mesh  # prediction has none
@@ -219,10 +219,7 @@ class RotationGrid(PoseParticles):
         seen, known = codes.split([len(crops), len(cells)])
         scores = self.net.scale * (seen @ known.T).unflatten(0, centers.shape[:2])
         encoding = TrainingEncoding(scores, centers, self.grid[cells])
-        none = BeliefBatch(*(batch.depth.new_zeros(0) for _ in BeliefBatch._fields))
-        return {
-            "loss": self.loss(Trace((), (), (), none, encoding=encoding), batch, self.object_model)
-        }
+        return {"loss": self.measure_encoding_loss(encoding, batch)}
 
     def draw_centers(self, batch: Batch, generator: Generator) -> Tensor:
         """Return points to crop about, (B, crops, 3) [m]: near the truth, from close to far, and

@@ -41,10 +41,6 @@ class Coordinates(NamedTuple):
         """
         return gather_fragment(self.position, self.log_prob.argmax(-1))
 
-    def first(self, count: int) -> "Coordinates":
-        """Return the first `count` images."""
-        return Coordinates(*(x[:count] for x in self))
-
     def detach(self) -> "Coordinates":
         """Return the same without gradient."""
         return Coordinates(*(x.detach() for x in self))
@@ -55,10 +51,6 @@ class Cells(NamedTuple):
 
     point: Tensor  # (B, h, w, 3) camera point [m]
     valid: Tensor  # (B, h, w) bool: depth is known there
-
-    def first(self, count: int) -> "Cells":
-        """Return the first `count` images."""
-        return Cells(*(x[:count] for x in self))
 
 
 def whole_cells(image: Tensor) -> Tensor:
@@ -176,11 +168,6 @@ class Context(NamedTuple):
     grid: tuple[int, int]  # h, w
     columns: int  # W / 2
 
-    def first(self, count: int) -> "Context":
-        """Return the first `count` images."""
-        smooth, share, position, centers = (x[:count] for x in self[:4])
-        return Context(smooth, share, position, centers, self.grid, self.columns)
-
 
 def flatten_context(coordinates: Coordinates, height: int, width: int) -> Context:
     """Flatten the output of H x W images for gathering.
@@ -194,10 +181,8 @@ def flatten_context(coordinates: Coordinates, height: int, width: int) -> Contex
     grid = F.interpolate(grid, scale_factor=STRIDE // 2, mode="bilinear", align_corners=False)[
         ..., :rows, :columns
     ]
-    share, position = (
-        coordinates.log_prob.detach().exp().flatten(1),
-        coordinates.position.detach().flatten(1, 3),
-    )
+    share = coordinates.log_prob.detach().exp().flatten(1)
+    position = coordinates.position.detach().flatten(1, 3)
     shape = (coordinates.logit.shape[1], coordinates.logit.shape[2])
     return Context(
         grid.flatten(2).transpose(1, 2).contiguous(),

@@ -160,11 +160,9 @@ class UNetEncoder(_Encoder, UNet):
         self.build_trunk(widths)
         a, b = widths[:2]
         self.up8 = ResBlock(b)
-        self.to4, self.skip4, self.up4 = (
-            nn.Conv2d(b, width, 1),
-            nn.Conv2d(a, width, 1),
-            ResBlock(width),
-        )
+        self.to4 = nn.Conv2d(b, width, 1)
+        self.skip4 = nn.Conv2d(a, width, 1)
+        self.up4 = ResBlock(width)
 
     def forward(self, rgb: Tensor, depth: Tensor, K: Tensor) -> ContextMap:
         """Return one map, of 4 pixels of the downsampled image a cell."""

@@ -42,12 +42,6 @@ class Pixels(NamedTuple):
     tables: Tables | None = None  # of the context, where poses are scored without gradient
     even: bool = False  # whether a pose's image points are drawn evenly instead of independently
 
-    def first(self, count: int) -> "Pixels":
-        """Return the first `count` images."""
-        context = None if self.context is None else self.context.first(count)
-        values, K = self.values[:count], self.intrinsics[:count]
-        return Pixels(values, self.size, K, context, even=self.even)
-
 
 class Points(NamedTuple):
     """The image points of each pose, in that pose's object frame, relative to the object's

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_choice
 from posefilter.nets.linear import Linear
 
 
@@ -33,8 +33,7 @@ class ParticleNorm(nn.Module):
 
     def __init__(self, kind: str, width: int) -> None:
         super().__init__()
-        if kind not in ("batch", "layer"):
-            raise UserError(f"model.net.normalization={kind!r} is unknown: choose batch or layer")
+        check_choice("model.net.normalization", kind, "batch", "layer")
         self.inner: nn.Module = nn.BatchNorm1d(width) if kind == "batch" else nn.LayerNorm(width)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -92,11 +91,7 @@ class LatentNet(nn.Module):
         displacement_input: str = "logit",
     ) -> None:
         super().__init__()
-        if displacement_input not in ("logit", "likelihood"):
-            raise UserError(
-                f"model.net.displacement_input={displacement_input!r} is unknown: choose logit or "
-                "likelihood"
-            )
+        check_choice("model.net.displacement_input", displacement_input, "logit", "likelihood")
         if min(latent_width, width, layers) < 1:
             raise UserError(
                 f"net: latent_width={latent_width}, width={width} and layers={layers} "

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from posefilter.capabilities import Capabilities
-from posefilter.errors import UserError
+from posefilter.errors import check_choice
 from posefilter.nets.layers import ResnetFC
 from posefilter.nets.likelihood import SPREAD, Pixels, Points, sample_points
 from posefilter.nets.linear import Linear
@@ -35,10 +35,7 @@ class PaperLikelihood(nn.Module):
         self, width: int = 128, blocks: int = 5, spread: float = SPREAD, anchor: str = "center"
     ) -> None:
         super().__init__()
-        if anchor not in ("origin", "center"):
-            raise UserError(
-                f"model.likelihood.anchor={anchor!r} is unknown: choose origin or center"
-            )
+        check_choice("model.likelihood.anchor", anchor, "origin", "center")
         self.anchor = anchor
         self.spread = spread
         self.net = nn.Sequential(

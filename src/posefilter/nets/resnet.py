@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from posefilter.errors import UserError
+from posefilter.errors import UserError, check_choice
 
 DEPTHS = {"resnet18": (2, 2, 2, 2), "resnet34": (3, 4, 6, 3)}
 # statistics of ImageNet's colors, which published weights expect
@@ -53,10 +53,7 @@ class ResNet(nn.Module):
         self, kind: str = "resnet18", weights: str | None = None, frozen: bool = False
     ) -> None:
         super().__init__()
-        if kind not in DEPTHS:
-            raise UserError(
-                f"model.encoder.trunk.kind={kind!r} is unknown: choose {' or '.join(DEPTHS)}"
-            )
+        check_choice("model.encoder.trunk.kind", kind, *DEPTHS)
         self.conv1 = nn.Conv2d(3, 64, 7, 2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
         self.geometry = nn.Conv2d(7, 64, 7, padding=3)

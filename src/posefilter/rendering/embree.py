@@ -92,7 +92,7 @@ class EmbreeRenderer(Renderer):
         away = (n * rays.reshape(-1, 3)[hit.pixel]).sum(1) > 0
         n[away] *= -1
         normal.reshape(-1, 3)[hit.pixel] = n
-        texture = one.mesh.texture if one.texture is None else one.texture
+        texture = one.mesh.texture
         if mesh.uv is None:
             color = np.broadcast_to(texture[0, 0] / np.float32(255), n.shape)
         else:
@@ -118,10 +118,8 @@ class EmbreeRenderer(Renderer):
         index: np.ndarray,
     ) -> None:
         """Write a plane into the buffers where it is the nearest so far."""
-        R, origin = (
-            plane.camera_from_plane[:3, :3].astype(np.float32),
-            plane.camera_from_plane[:3, 3].astype(np.float32),
-        )
+        R = plane.camera_from_plane[:3, :3].astype(np.float32)
+        origin = plane.camera_from_plane[:3, 3].astype(np.float32)
         facing = rays @ R[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             z = np.float32(origin @ R[:, 2]) / facing

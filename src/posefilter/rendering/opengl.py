@@ -137,13 +137,12 @@ class GLRenderer(Renderer):
 
     def _draw(self, one: Instance, index: int) -> None:
         linear = one.camera_from_object[:3, :3]
-        texture = one.mesh.texture if one.texture is None else one.texture
         self._submit(
             one.mesh,
             _mesh_vertices,
             one.camera_from_object,
             np.linalg.inv(linear).T,
-            texture,
+            one.mesh.texture,
             index,
         )
 

@@ -5,7 +5,8 @@ A pose then costs nothing, and one mesh can stand in an image many times, scaled
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -20,7 +21,6 @@ from posefilter.rendering.surfaces import NEAR, Instance, Lights, Surfaces, cove
 class CastMesh:
     """A mesh with its Embree scene."""
 
-    mesh: Mesh
     scene: Any
     normals: np.ndarray  # (F, 3, 3) float32
     uv: np.ndarray | None  # (F, 3, 2) float32
@@ -58,41 +58,32 @@ def _build_scene(corners: np.ndarray) -> Any:
     return scene
 
 
-@dataclass(eq=False)
+def _prepare(mesh: Mesh) -> CastMesh:
+    """Return a mesh with its Embree scene.
+
+    Raises:
+        UserError: Embree is missing.
+    """
+    corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
+    scene = _build_scene(corners)
+    uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
+    colors = None if mesh.corner_colors is None else mesh.corner_colors.astype(np.float32)
+    hull = hull_vertices(mesh.vertices[np.unique(mesh.faces)])
+    density = 0.0
+    if uv is not None:
+        density = float(np.sqrt(_area(uv).sum() / max(_area(corners).sum(), 1e-12)))
+    return CastMesh(scene, mesh.corner_normals.astype(np.float32), uv, colors, hull, density)
+
+
 class RayCaster:
     """Meshes built for Embree; must not be shared between processes.
 
     Args:
-        keep: The number of newest meshes that stay built.
+        keep: The number of meshes that stay built, those that were cast at last.
     """
 
-    keep: int = 96
-    _meshes: dict[int, CastMesh] = field(default_factory=dict)
-
-    def prepare(self, mesh: Mesh) -> CastMesh:
-        """Return a mesh with its Embree scene, built on first use.
-
-        Raises:
-            UserError: Embree is missing.
-        """
-        key = id(mesh)
-        if key not in self._meshes:
-            corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=np.float32)
-            scene = _build_scene(corners)
-            uv = None if mesh.corner_uv is None else mesh.corner_uv.astype(np.float32)
-            colors = None if mesh.corner_colors is None else mesh.corner_colors.astype(np.float32)
-            hull = hull_vertices(mesh.vertices[np.unique(mesh.faces)])
-            density = (
-                0.0
-                if uv is None
-                else float(np.sqrt(_area(uv).sum() / max(_area(corners).sum(), 1e-12)))
-            )
-            while len(self._meshes) >= self.keep:
-                del self._meshes[next(iter(self._meshes))]
-            self._meshes[key] = CastMesh(
-                mesh, scene, mesh.corner_normals.astype(np.float32), uv, colors, hull, density
-            )
-        return self._meshes[key]
+    def __init__(self, keep: int = 96) -> None:
+        self.prepare = lru_cache(maxsize=keep)(_prepare)
 
     def cast(self, one: Instance, rays: np.ndarray, K: np.ndarray) -> Hits:
         """Cast the rays of the pixels that an instance's convex hull covers.

@@ -20,7 +20,6 @@ class Instance:
 
     mesh: Mesh
     camera_from_object: np.ndarray  # (4, 4) [m]; its linear part may scale
-    texture: np.ndarray | None = None  # (h, w, 3) uint8, instead of the mesh's own
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +76,11 @@ def pixel_rays(K: np.ndarray, height: int, width: int) -> np.ndarray:
     return rays
 
 
+def project(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return where a camera sees points before it.  (P, 3) [m], (3, 3) [px] -> (P, 2) [px]."""
+    return points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+
+
 def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Find the pixels that the convex hull of points may cover.
 
@@ -93,7 +97,7 @@ def covered_pixels(points: np.ndarray, K: np.ndarray, shape: tuple[int, ...]) ->
         return np.zeros(0, np.int64)
     if (points[:, 2] < NEAR).any():
         return np.arange(height * width)
-    pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+    pixels = project(points, K)
     pixels = np.clip(pixels, [-4.0 * width, -4.0 * height], [5.0 * width, 5.0 * height])
     low = np.maximum(np.floor(pixels.min(0)).astype(int) - 2, 0)
     high = np.minimum(np.ceil(pixels.max(0)).astype(int) + 3, [width, height])

@@ -20,6 +20,8 @@ import torch
 from posefilter.files import write_whole
 from posefilter.geometry.rotation import quat_xyzw_from_matrix
 from posefilter.meshes.mesh import Mesh
+from posefilter.rendering.surfaces import project
+from posefilter.synthetic.solids import rigid
 
 CM = 100.0  # centimeters a meter
 DEPTH_UNITS = 10_000.0  # depth image units a meter
@@ -72,9 +74,7 @@ class ObjectInFrame:
 def export_object(mesh: Mesh, seg_id: int) -> ExportedObject:
     """Return a mesh's class; its aligned frame is centered on the bounding box, y down."""
     center = mesh.bounds.mean(0)
-    aligned = np.eye(4)
-    aligned[:3, :3] = _ALIGNED_FROM_UPRIGHT
-    aligned[:3, 3] = -_ALIGNED_FROM_UPRIGHT @ center
+    aligned = rigid(_ALIGNED_FROM_UPRIGHT, -_ALIGNED_FROM_UPRIGHT @ center)
     sides = np.abs(_ALIGNED_FROM_UPRIGHT @ (mesh.bounds[1] - mesh.bounds[0]))
     return ExportedObject(mesh.name, seg_id, aligned, sides)
 
@@ -139,7 +139,7 @@ def _object_record(one: ObjectInFrame, K: np.ndarray) -> dict[str, Any]:
     camera_from_aligned = one.camera_from_object @ np.linalg.inv(one.exported.aligned_from_mesh)
     R, t = camera_from_aligned[:3, :3], camera_from_aligned[:3, 3]
     corners = (CUBOID_SIGNS * one.exported.dimensions / 2) @ R.T + t
-    pixels = _project(corners, K)
+    pixels = project(corners, K)
     # aligned axes permuted as the exporter does: x' = z, y' = x, z' = -y; row vectors
     permuted = np.eye(4)
     permuted[:3, :3] = np.stack([R[:, 2], R[:, 0], -R[:, 1]])
@@ -153,7 +153,7 @@ def _object_record(one: ObjectInFrame, K: np.ndarray) -> dict[str, Any]:
         "quaternion_xyzw": _numbers(quat_xyzw_from_matrix(torch.from_numpy(R.copy())).numpy(), 9),
         "pose_transform_permuted": _numbers(permuted, 6),
         "cuboid_centroid": _numbers(t * CM, 6),
-        "projected_cuboid_centroid": _numbers(_project(t[None], K)[0], 4),
+        "projected_cuboid_centroid": _numbers(project(t[None], K)[0], 4),
         "bounding_box": {"top_left": _numbers(low, 4), "bottom_right": _numbers(high, 4)},
         "cuboid": _numbers(corners * CM, 6),
         "projected_cuboid": _numbers(pixels, 4),
@@ -190,10 +190,6 @@ def depth_units(depth: np.ndarray) -> np.ndarray:
     """
     units = np.round(depth * DEPTH_UNITS)
     return np.where(units > 65535, 0, units).astype(np.uint16)
-
-
-def _project(points: np.ndarray, K: np.ndarray) -> np.ndarray:
-    return points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
 
 
 def _numbers(array: np.ndarray, decimals: int) -> Any:

@@ -1,6 +1,7 @@
 """Render the frames of a generated dataset; each depends on settings, seed and its number alone."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from posefilter.errors import UserError
 from posefilter.meshes.store import MeshStore
 from posefilter.rendering.embree import EmbreeRenderer
 from posefilter.rendering.renderer import Renderer
-from posefilter.rendering.surfaces import Rendered
+from posefilter.rendering.surfaces import Rendered, project
 from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.motion import MotionSettings, Scenario, draw_scenario, is_possible
 from posefilter.synthetic.placing import View
@@ -25,7 +26,7 @@ from posefilter.synthetic.scenes import (
     remove_target,
     shift_camera,
 )
-from posefilter.synthetic.sensor import sensor_model, simulate_sensor
+from posefilter.synthetic.sensor import simulate_sensor
 
 ATTEMPTS = 400
 RENDERERS = ("embree", "opengl")
@@ -109,26 +110,24 @@ class FrameRenderer:
         self.K = np.array(job.K)
         self.library = SolidStore(store or MeshStore(job.meshes, scale=job.mesh_scale))
         self.renderer = make_renderer(job.renderer)
-        self.sensor = sensor_model(job.sensor)
-        self._scene: tuple[int, SceneSet, dict[str, fat.ExportedObject]] | None = None
-        self._scenario: tuple[int, Scenario] | None = None
+        # frames of one scene are rendered one after another
+        self.scene = lru_cache(maxsize=1)(self._draw_scene)
+        self.scenario = lru_cache(maxsize=1)(self._draw_scenario)
 
-    def scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
+    def _draw_scene(self, number: int) -> tuple[SceneSet, dict[str, fat.ExportedObject]]:
         """Return a folder's scene set and its classes by name; write the folder's settings."""
-        if self._scene is None or self._scene[0] != number:
-            rng = self.job.scene_generator(number)
-            scene = draw_scene_set(self.library, self.job.object, self.job.scenes, rng)
-            solids = (scene.target, *scene.distractors, *scene.lookalikes)
-            step = min(12, 255 // len(solids))
-            exported = [fat.export_object(s.mesh, step * (k + 1)) for k, s in enumerate(solids)]
-            folder = self.out / self.job.folder(number * self.job.frames_per_scene)
-            folder.mkdir(parents=True, exist_ok=True)
-            names = [name for name, _ in self.job.cameras()]
-            fat.write_json(folder / fat.OBJECT_SETTINGS, fat.object_settings(exported))
-            camera = fat.camera_settings(self.K, self.job.height, self.job.width, names)
-            fat.write_json(folder / fat.CAMERA_SETTINGS, camera)
-            self._scene = number, scene, {one.name: one for one in exported}
-        return self._scene[1], self._scene[2]
+        rng = self.job.scene_generator(number)
+        scene = draw_scene_set(self.library, self.job.object, self.job.scenes, rng)
+        solids = (scene.target, *scene.distractors, *scene.lookalikes)
+        step = min(12, 255 // len(solids))
+        exported = [fat.export_object(s.mesh, step * (k + 1)) for k, s in enumerate(solids)]
+        folder = self.out / self.job.folder(number * self.job.frames_per_scene)
+        folder.mkdir(parents=True, exist_ok=True)
+        names = [name for name, _ in self.job.cameras()]
+        fat.write_json(folder / fat.OBJECT_SETTINGS, fat.object_settings(exported))
+        camera = fat.camera_settings(self.K, self.job.height, self.job.width, names)
+        fat.write_json(folder / fat.CAMERA_SETTINGS, camera)
+        return scene, {one.name: one for one in exported}
 
     def draw(self, frame: int) -> tuple[Layout, Rendered, np.random.Generator]:
         """Draw and render a frame.
@@ -161,17 +160,12 @@ class FrameRenderer:
             "leave no room"
         )
 
-    def scenario(self, number: int) -> Scenario:
+    def _draw_scenario(self, number: int) -> Scenario:
         """Return what happens in a scene whose frames follow each other.
 
         Raises:
             UserError: No layout and path keep the target in view.
         """
-        if self._scenario is None or self._scenario[0] != number:
-            self._scenario = number, self._draw_scenario(number)
-        return self._scenario[1]
-
-    def _draw_scenario(self, number: int) -> Scenario:
         scene, _ = self.scene(number)
         rng = np.random.default_rng([self.job.seed, 4, number])
         view = View(self.K, self.job.height, self.job.width)
@@ -205,14 +199,11 @@ class FrameRenderer:
         """Render a frame and write its files."""
         layout, picture, rng = self.draw(frame)
         _, exported = self.scene(frame // self.job.frames_per_scene)
-        pending = []
-        for k, (_, right) in enumerate(self.job.cameras()):
-            if k > 0:
-                layout_here = shift_camera(layout, right)
-                picture = self._render(layout_here)
-            else:
-                layout_here = layout
-            pending.append(self._images(layout_here, picture, exported, right, rng))
+        pending = [self._images(layout, picture, exported, 0.0, rng)]
+        for _, right in self.job.cameras()[1:]:
+            shifted = shift_camera(layout, right)
+            picture = self._render(shifted)
+            pending.append(self._images(shifted, picture, exported, right, rng))
         files = iter(self.job.files(self.out, frame))
         for images, record in reversed(pending):
             for image in images:
@@ -234,7 +225,7 @@ class FrameRenderer:
         rng: np.random.Generator,
     ) -> tuple[list[np.ndarray], dict[str, Any]]:
         """Return a camera's color, depth and segmentation images, and its JSON record."""
-        photo, depth = simulate_sensor(picture.rgb, picture.depth, self.sensor, rng)
+        photo, depth = simulate_sensor(picture.rgb, picture.depth, self.job.sensor, rng)
         ids = np.array([*(exported[p.solid.mesh.name].seg_id for p in layout.placed), 0], np.uint8)
         seen = np.bincount(picture.index.reshape(-1) + 1, minlength=len(layout.placed) + 1)[1:]
         objects = []
@@ -253,10 +244,7 @@ class FrameRenderer:
 
     def _truncated(self, hull: np.ndarray) -> float:
         """Return the fraction of a hull's outline, by area, that is out of the frame."""
-        pixels = (
-            hull[:, :2] / hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [self.K[0, 2], self.K[1, 2]]
-        ).astype(np.float32)
-        outline = cv2.convexHull(pixels)
+        outline = cv2.convexHull(project(hull, self.K).astype(np.float32))
         w, h = self.job.width - 0.5, self.job.height - 0.5
         frame = np.array([[[-0.5, -0.5]], [[w, -0.5]], [[w, h]], [[-0.5, h]]], np.float32)
         inside, _ = cv2.intersectConvexConvex(outline, frame)

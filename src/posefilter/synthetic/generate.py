@@ -25,7 +25,7 @@ from posefilter.synthetic import fat_format as fat
 from posefilter.synthetic.frame_renderer import Job, make_renderer
 from posefilter.synthetic.motion import MotionSettings
 from posefilter.synthetic.scenes import SceneSettings, choose_distractors
-from posefilter.synthetic.sensor import sensor_model
+from posefilter.synthetic.sensor import SENSORS
 from posefilter.synthetic.settle import load_mujoco
 from posefilter.synthetic.workers import render_frames
 
@@ -144,6 +144,8 @@ def generate(
     Raises:
         UserError: A value or mesh is wrong, or `out` was begun with other settings.
     """
+    numbers = {name: value for name, value in locals().items() if name != "camera"}
+    check_ranges(numbers, "generate")
     out = Path(out)
     scenes = SceneSettings(
         distractors=(int(distractors[0]), int(distractors[1])),
@@ -167,13 +169,13 @@ def generate(
         rows,
         stereo,
         sensor,
-        _frames_per_scene(frames_per_scene, moving),
+        (2 if moving == "none" else 30) if frames_per_scene is None else int(frames_per_scene),
         renderer,
         scenes,
         1.0 if mesh_scale is None else float(mesh_scale),
         MotionSettings(moving, float(moving_mm), float(moving_deg), int(fully_occluded_frames)),
     )
-    _check(job, frames, workers)
+    _check(job)
     store = MeshStore(meshes, scale=job.mesh_scale)
     todo = [i for i in range(frames) if not all(path.is_file() for path in job.files(out, i))]
     check_meshes(job, store, todo)
@@ -191,13 +193,6 @@ def generate(
             release(out)
     folders = len({job.folder(i) for i in range(frames)})
     return Summary(out, frames, len(todo), folders, time.perf_counter() - began)
-
-
-def _frames_per_scene(typed: int | None, moving: str) -> int:
-    """Return how many frames share a scene: as typed, or what suits still or moving scenes."""
-    if typed is not None:
-        return int(typed)
-    return 2 if moving == "none" else 30
 
 
 def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.ndarray:
@@ -235,27 +230,9 @@ def camera_matrix(camera: str | Sequence[float], width: int, height: int) -> np.
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-def _check(job: Job, frames: int, workers: int) -> None:
-    """Raise UserError for impossible values."""
+def _check(job: Job) -> None:
+    """Raise UserError for settings that do not fit each other, or name what there is not."""
     low, high = job.scenes.distractors
-    numbers = {
-        "frames": frames,
-        "workers": workers,
-        "seed": job.seed,
-        "frames_per_scene": job.frames_per_scene,
-        "size": [job.width, job.height],
-        "distractors": [low, high],
-        "max_occlusion": job.scenes.max_occlusion,
-        "occluded_fraction": job.scenes.occluded_fraction,
-        "tabletop_fraction": job.scenes.tabletop_fraction,
-        "absent_fraction": job.scenes.absent_fraction,
-        "instances": job.scenes.instances,
-        "mesh_scale": job.mesh_scale,
-        "moving_mm": job.motion.translation_mm,
-        "moving_deg": job.motion.rotation_deg,
-        "fully_occluded_frames": job.motion.fully_occluded_frames,
-    }
-    check_ranges(numbers, "generate")
     if high < low:
         raise UserError(f"distractors={low},{high}: needs 0 <= min <= max")
     if job.motion.fully_occluded_frames > job.frames_per_scene:
@@ -267,7 +244,8 @@ def _check(job: Job, frames: int, workers: int) -> None:
         raise UserError(
             f"lookalike_texture={job.scenes.lookalike_texture}: unknown; choose different or same"
         )
-    sensor_model(job.sensor)
+    if job.sensor not in SENSORS:
+        raise UserError(f"sensor={job.sensor}: unknown; choose from {', '.join(SENSORS)}")
     make_renderer(job.renderer)
     if job.scenes.settle:
         load_mujoco()

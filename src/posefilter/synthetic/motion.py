@@ -15,6 +15,7 @@ from posefilter.errors import UserError
 from posefilter.rendering.surfaces import Plane
 from posefilter.synthetic.placing import Placed, View, are_separate
 from posefilter.synthetic.scenes import Layout
+from posefilter.synthetic.solids import rigid
 
 MOTIONS = ("none", "camera", "object", "both")
 _PERIODS = (16.0, 48.0)  # [frames] of the sine along each axis
@@ -68,8 +69,9 @@ class Scenario:
     def at(self, frame: int) -> Layout:
         """Return the layout of a frame."""
         first = self.layout.placed[0]
-        target = Placed(first.solid, _move(first.camera_from_object, self.target[frame], first))
-        whole = _rigid(self.camera[frame], first.center)
+        moved = _move_about(self.target[frame], first.center) @ first.camera_from_object
+        target = Placed(first.solid, moved)
+        whole = _move_about(self.camera[frame], first.center)
         placed = tuple(
             Placed(one.solid, whole @ one.camera_from_object)
             for one in (target, *self.layout.placed[1:])
@@ -101,11 +103,10 @@ class Scenario:
         towards = target.center / distance
         right = np.cross([0.0, 1.0, 0.0], towards)
         right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(towards, right), towards], 1)
+        axes = np.stack([right, np.cross(towards, right), towards], 1)
         sign = 1 if frame < self.covered.start else -1
         shift = sign * self.side * 2 * half * away / _SLIDE
-        pose[:3, 3] = _DEPTH * target.center + pose[:3, :2] @ shift
+        pose = rigid(axes, _DEPTH * target.center + axes[:, :2] @ shift)
         return replace(self.cover, camera_from_plane=pose, half_extent=(half, half))
 
 
@@ -199,16 +200,10 @@ def _is_carried(one: Placed, table: Plane) -> bool:
     return bool(over and -rotation[:, 2] @ origin > 0.02)
 
 
-def _rigid(twist: np.ndarray, about: np.ndarray) -> np.ndarray:
+def _move_about(twist: np.ndarray, about: np.ndarray) -> np.ndarray:
     """Return the motion (4, 4) that turns about a point, and shifts."""
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix()
-    out[:3, 3] = about + twist[:3] - out[:3, :3] @ about
-    return out
-
-
-def _move(pose: np.ndarray, twist: np.ndarray, one: Placed) -> np.ndarray:
-    return _rigid(twist, one.center) @ pose
+    turn = Rotation.from_rotvec(twist[3:]).as_matrix()
+    return rigid(turn, about + twist[:3] - turn @ about)
 
 
 def _stay_on_table(path: np.ndarray, layout: Layout) -> np.ndarray:

@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from posefilter.synthetic.solids import Solid, outline_mask, separated
+from posefilter.rendering.surfaces import project
+from posefilter.synthetic.solids import Solid, outline_mask, rigid, separated
 
 _STRIDE = 8  # [px] of the masks by which occlusion is predicted
 _NEAREST = 0.2  # [m] no object comes nearer to the camera
@@ -51,10 +52,7 @@ class View:
         """
         if one.hull[:, 2].min() < _NEAREST:
             return False
-        pixels = one.hull[:, :2] / one.hull[:, 2:] * [self.K[0, 0], self.K[1, 1]] + [
-            self.K[0, 2],
-            self.K[1, 2],
-        ]
+        pixels = project(one.hull, self.K)
         inside = ((pixels >= 0) & (pixels < [self.width, self.height])).all(1)
         return bool(inside.mean() >= 1 - largest_truncation)
 
@@ -132,13 +130,12 @@ def place_target_on_table(
     roll = Rotation.from_euler("z", rng.normal(0, 6), degrees=True).as_matrix()
     up = roll @ np.array([0, -np.cos(elevation), -np.sin(elevation)])
     right = roll @ np.array([1.0, 0, 0])
-    camera_from_spot = np.eye(4)
-    camera_from_spot[:3, :3] = np.stack([right, np.cross(up, right), up], 1)
     rest = _draw_stable_rotation(solid, rng, 0.5)
     bottom = (solid.hull @ rest.T).min(0)[2]
     middle = float((rest @ solid.center)[2] - bottom)
     center = view.ray(rng.uniform(0.15, 0.85), rng.uniform(0.18, 0.85)) * distance
-    camera_from_spot[:3, 3] = center - up * middle
+    axes = np.stack([right, np.cross(up, right), up], 1)
+    camera_from_spot = rigid(axes, center - up * middle)
     return _place_on_table(solid, rest, np.zeros(2), camera_from_spot), camera_from_spot
 
 
@@ -257,18 +254,11 @@ def _place_on_table(
 ) -> Placed:
     """Return a solid in a stable rotation with its center over a point of the table."""
     center = rest @ solid.center
-    table_from_object = np.eye(4)
-    table_from_object[:3, :3] = rest
-    table_from_object[:3, 3] = [
-        spot[0] - center[0],
-        spot[1] - center[1],
-        -(solid.hull @ rest.T)[:, 2].min(),
-    ]
+    lowest = (solid.hull @ rest.T)[:, 2].min()
+    table_from_object = rigid(rest, [spot[0] - center[0], spot[1] - center[1], -lowest])
     return Placed(solid, camera_from_spot @ table_from_object)
 
 
 def _place_floating(solid: Solid, rotation: np.ndarray, center: np.ndarray) -> Placed:
     """Return a solid of this rotation with its center at a point in the camera."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, center - rotation @ solid.center
-    return Placed(solid, pose)
+    return Placed(solid, rigid(rotation, center - rotation @ solid.center))

@@ -5,6 +5,7 @@ the look-alikes. Each of its frames has its own camera, layout and lights.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,7 +26,7 @@ from posefilter.synthetic.placing import (
     set_table,
 )
 from posefilter.synthetic.settle import settle
-from posefilter.synthetic.solids import Solid, make_solid
+from posefilter.synthetic.solids import Solid, make_solid, rigid
 from posefilter.synthetic.textures import random_color, random_texture
 
 # [degrees] highest camera over a table where something has to stand in front
@@ -91,13 +92,7 @@ class SolidStore:
 
     def __init__(self, store: MeshStore) -> None:
         self.store = store
-        self._solids: dict[str, Solid] = {}
-
-    def solid(self, name: str) -> Solid:
-        """Return a mesh as a solid."""
-        if name not in self._solids:
-            self._solids[name] = make_solid(self.store.load(name))
-        return self._solids[name]
+        self.solid = cache(lambda name: make_solid(store.load(name)))
 
 
 def choose_distractors(
@@ -260,19 +255,14 @@ def _surroundings(
 ) -> tuple[Plane, ...]:
     """Return table, floor and wall, or the one plane behind objects in the air."""
     if table is None:
-        back = np.eye(4)
-        back[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.45, 3)).as_matrix()
-        back[2, 3] = target.center[2] + target.solid.radius + rng.uniform(0.1, 1.2)
+        turn = Rotation.from_rotvec(rng.normal(0, 0.45, 3)).as_matrix()
+        far = target.center[2] + target.solid.radius + rng.uniform(0.1, 1.2)
+        back = rigid(turn, [0, 0, far])
         kind = int(rng.integers(3))
         return (Plane(back, (9.0, 9.0), scene.textures[kind], scene.tiles[kind]),)
-    drop = np.eye(4)
-    drop[2, 3] = -scene.table_height
-    floor = table.camera_from_top @ drop
-    wall_turn = np.eye(4)
-    wall_turn[:3, :3] = Rotation.from_euler(
-        "zx", [rng.uniform(-30, 30), 90], degrees=True
-    ).as_matrix()
-    wall_turn[:3, 3] = wall_turn[:3, 2] * -rng.uniform(0.6, 2.5)
+    floor = table.camera_from_top @ rigid(np.eye(3), [0, 0, -scene.table_height])
+    turn = Rotation.from_euler("zx", [rng.uniform(-30, 30), 90], degrees=True).as_matrix()
+    wall_turn = rigid(turn, turn[:, 2] * -rng.uniform(0.6, 2.5))
     return (
         Plane(table.camera_from_top, table.half_extent, scene.textures[0], scene.tiles[0]),
         Plane(floor, (9.0, 9.0), scene.textures[1], scene.tiles[1]),
@@ -305,8 +295,7 @@ def remove_target(layout: Layout) -> Layout:
 
 def shift_camera(layout: Layout, offset: float) -> Layout:
     """Return the layout in the frame of a camera that stands `offset` [m] to the right."""
-    move = np.eye(4)
-    move[0, 3] = -offset
+    move = rigid(np.eye(3), [-offset, 0, 0])
     placed = tuple(Placed(p.solid, move @ p.camera_from_object) for p in layout.placed)
     planes = tuple(replace(p, camera_from_plane=move @ p.camera_from_plane) for p in layout.planes)
     return replace(layout, placed=placed, planes=planes)

@@ -5,55 +5,33 @@ squared), correlated noise, a slowly varying offset, ragged edges, shadows on on
 projector does not reach, holes on dark and shiny surfaces, a maximum range.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
-from posefilter.errors import UserError
 from posefilter.synthetic.textures import blurred_noise, noise_field
 
-
-@dataclass(frozen=True)
-class SensorModel:
-    """Which images of a camera are degraded."""
-
-    name: str
-    color: bool
-    depth: bool
-
-
-_MODELS = {"ideal": SensorModel("ideal", False, False), "kinect": SensorModel("kinect", True, True)}
-
-
-def sensor_model(name: str) -> SensorModel:
-    """Return a sensor by its name.
-
-    Raises:
-        UserError: There is none of that name.
-    """
-    if name not in _MODELS:
-        raise UserError(f"sensor={name}: unknown; choose from {', '.join(_MODELS)}")
-    return _MODELS[name]
+SENSORS = ("ideal", "kinect")
 
 
 def simulate_sensor(
-    rgb: np.ndarray, depth: np.ndarray, model: SensorModel, rng: np.random.Generator
+    rgb: np.ndarray, depth: np.ndarray, sensor: str, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the images of a camera.
 
     Args:
         rgb: (H, W, 3) float32, 1 = white.
         depth: (H, W) float32 [m], 0 = nothing there.
-        model: The sensor.
+        sensor: One of `SENSORS`; "ideal" changes nothing.
         rng: Source of randomness.
 
     Returns:
         The photograph (H, W, 3) uint8 RGB, and the depth (H, W) float32 [m], 0 = no measurement.
     """
-    photo = simulate_color(rgb, rng) if model.color else np.clip(rgb, 0, 1)
-    measured = simulate_depth(depth, photo, rng) if model.depth else depth
-    return (np.clip(photo, 0, 1) * 255 + 0.5).astype(np.uint8), measured
+    photo, measured = np.clip(rgb, 0, 1), depth
+    if sensor != "ideal":
+        photo = simulate_color(rgb, rng)
+        measured = simulate_depth(depth, photo, rng)
+    return (photo * 255 + 0.5).astype(np.uint8), measured
 
 
 def simulate_color(rgb: np.ndarray, rng: np.random.Generator) -> np.ndarray:

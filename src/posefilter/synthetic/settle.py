@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from posefilter.errors import missing_package
 from posefilter.synthetic.placing import Placed, Table, are_separate
-from posefilter.synthetic.solids import Solid
+from posefilter.synthetic.solids import Solid, rigid
 
 _STEP = 0.004  # [s]
 _LONGEST = 2.0  # [s]; round things roll on for ever
@@ -69,10 +69,8 @@ def settle(
             break
     out = []
     for k, one in enumerate(start):
-        pose = np.eye(4)
         w, x, y, z = data.qpos[7 * k + 3 : 7 * k + 7]
-        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-        pose[:3, 3] = data.qpos[7 * k : 7 * k + 3]
+        pose = rigid(Rotation.from_quat([x, y, z, w]).as_matrix(), data.qpos[7 * k : 7 * k + 3])
         rested = Placed(one.solid, table.camera_from_spot @ pose)
         if k == 0 or table.carries(rested):
             out.append(rested)
@@ -81,9 +79,8 @@ def settle(
 
 def _drop(one: Placed, placed: Sequence[Placed], table: Table, rng: np.random.Generator) -> Placed:
     """Return an object in a random rotation, raised by up to 12 cm; unchanged if that touches."""
-    pose = one.camera_from_object.copy()
-    pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    pose[:3, 3] = one.center - pose[:3, :3] @ one.solid.center
+    turn = Rotation.random(rng=rng).as_matrix()
+    pose = rigid(turn, one.center - turn @ one.solid.center)
     up = table.camera_from_spot[:3, 2]
     lowest = (
         (one.solid.hull @ pose[:3, :3].T + pose[:3, 3] - table.camera_from_spot[:3, 3]) @ up

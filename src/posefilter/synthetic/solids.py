@@ -1,11 +1,13 @@
 """The geometry of a mesh that placing needs: convex hull, bounding sphere, stable rotations."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from posefilter.meshes.mesh import Mesh
+from posefilter.rendering.surfaces import project
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,13 @@ def find_stable_rotations(hull: np.ndarray, directions: int = 200) -> tuple[np.n
     ].sum()
 
 
+def rigid(rotation: np.ndarray, translation: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return a rigid transform (4, 4) of a rotation (3, 3) and a translation (3,) [m]."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, translation
+    return out
+
+
 def rotation_down(direction: np.ndarray) -> np.ndarray:
     """Return the smallest rotation that takes a unit direction to -z.  (3,) -> (3, 3)."""
     target = np.array([0.0, 0.0, -1.0])
@@ -116,8 +125,7 @@ def outline_mask(
     Returns:
         (height // stride, width // stride) bool.
     """
-    pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
-    pixels = np.clip(pixels / stride, -2000, 2000)
+    pixels = np.clip(project(points, K) / stride, -2000, 2000)
     mask = np.zeros((height // stride, width // stride), np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels * 16).astype(np.int32)), 1, shift=4)
     return mask > 0

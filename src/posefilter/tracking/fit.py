@@ -7,7 +7,7 @@ by the likelihood rests on the few of them that score highest; a regression uses
 import torch
 from torch import Generator, Tensor
 
-from posefilter.filters.refine import require_scorer
+from posefilter.filters.refine import scorer_of
 from posefilter.protocols import Encoding, Method
 from posefilter.types import BeliefBatch
 
@@ -54,7 +54,7 @@ class QuadraticFit:
         self, belief: BeliefBatch, encoding: Encoding, method: Method, generator: Generator
     ) -> BeliefBatch:
         """Return the belief with the estimate moved."""
-        scorer, best, space = require_scorer(method), belief.best, method.space
+        scorer, best, space = scorer_of(method), belief.best, method.space
         for _ in range(self.iterations):
             scale = space.noise_scale(best.new_tensor(self.spread))
             noise = draw_orthogonal(best, self.pairs, space.dimensions, generator)

@@ -1,7 +1,6 @@
 """One frame of a video, prepared once for all objects that are tracked in it."""
 
 from functools import cached_property
-from threading import Lock
 
 from posefilter.confidence.blank import find_blank
 from posefilter.images import Images, drop_unknown, make_batch
@@ -12,8 +11,6 @@ from posefilter.types import Batch
 class Frame:
     """A photograph, and what objects that look at it have in common.
 
-    Objects may ask from several threads at once.
-
     Args:
         images: One photograph.
     """
@@ -21,7 +18,6 @@ class Frame:
     def __init__(self, images: Images) -> None:
         self.images = images._replace(depth=drop_unknown(images.depth))
         self._whole: dict[tuple[int | None, int | None], Batch] = {}
-        self._lock = Lock()
 
     @cached_property
     def blank(self) -> str:
@@ -34,10 +30,9 @@ class Frame:
         Args:
             size: Width and height that a network was trained on [px]; None: see `make_batch`.
         """
-        with self._lock:
-            if size not in self._whole:
-                self._whole[size] = make_batch(self.images, *size)
-            return self._whole[size]
+        if size not in self._whole:
+            self._whole[size] = make_batch(self.images, *size)
+        return self._whole[size]
 
     def see_window(self, window: Window) -> Batch:
         """Return a part of the photograph."""

@@ -1,7 +1,5 @@
 """A method as tracking uses it: its own network and likelihood, with fewer image points a pose."""
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from torch import Generator, Tensor
 
@@ -23,15 +21,6 @@ def check_method(method: PoseEstimator) -> None:
             f"tracking: {type(method).__name__} provides no {missing[0]}; track with a checkpoint "
             f"of model=pose_pf model/proposals=dense"
         )
-
-
-@runtime_checkable
-class SupportsQuasiMonteCarlo(Protocol):
-    """An encoded frame that can have its poses scored by points that are drawn evenly."""
-
-    def with_quasi_monte_carlo(self) -> Encoding:
-        """Return the frame, so set."""
-        ...
 
 
 class FrameScorer:
@@ -57,11 +46,8 @@ class FrameScorer:
     ) -> None:
         self.method, self.points = method, points
         # few points tell more of a pose where they are spread evenly
-        self.encoding = (
-            encoding.with_quasi_monte_carlo()
-            if isinstance(encoding, SupportsQuasiMonteCarlo)
-            else encoding
-        )
+        spread = getattr(encoding, "with_quasi_monte_carlo", None)
+        self.encoding = encoding if spread is None else spread()
         self.jumps, self.against = jumps, against
 
     @property

@@ -95,10 +95,10 @@ class FrameEstimate(NamedTuple):
     """What one frame shows."""
 
     batch: Batch  # the image, or the window of it that was looked at
-    belief: BeliefBatch | None  # None where nothing has depth, or the frame cannot be judged
-    objectness: float  # the mean objectness of the pixels that the estimate covers
-    presence: float  # what the track is judged by
-    found: Assessment | None  # the calibrated probabilities
+    belief: BeliefBatch | None = None  # None where nothing has depth, or it cannot be judged
+    objectness: float = 0.0  # the mean objectness of the pixels that the estimate covers
+    presence: float = 0.0  # what the track is judged by
+    found: Assessment | None = None  # the calibrated probabilities
     size: ApparentSize | None = None  # of estimates from the whole image
 
 
@@ -173,14 +173,19 @@ class Track:
         """Return where the object is in the next frame."""
         start = time.perf_counter()
         predicted = None if self.state is None else self._predict(self.state)
-        if predicted is None:
-            sight = self._estimate(frame)
-        elif self._rests:
-            sight = FrameEstimate(self._take(frame.see_whole(self.size)), None, 0.0, 0.0, None)
-        elif self.loss_detector.lost:
-            sight = self._search(frame, predicted)
+        lost, window = self.loss_detector.lost, None
+        if predicted is not None and not lost:
+            window = self._choose_window(frame.images, predicted)
+        seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
+        batch = Batch(*(x.to(self.method.device) for x in seen))
+        if self._rests or frame.blank or not bool(batch.depth.any()):
+            sight = FrameEstimate(batch)
+        elif predicted is None:
+            sight = self._estimate(batch)
+        elif lost:
+            sight = self._search(batch, predicted)
         else:
-            sight = self._follow(frame, predicted)
+            sight = self._follow(batch, predicted, windowed=window is not None)
         trusted, status = self.loss_detector.judge(sight.presence)
         belief = sight.belief if trusted or predicted is None else None
         self.state = self._correct(predicted, belief, status)
@@ -209,23 +214,15 @@ class Track:
         count = count_needed(cells, epsilon, quantile, least)
         return state._replace(belief=make_particles(draws[:, :count], 0), best=expected)
 
-    def _estimate(self, frame: Frame) -> FrameEstimate:
+    def _estimate(self, batch: Batch) -> FrameEstimate:
         """Run the estimator's own filter on the whole image."""
-        batch = self._take(frame.see_whole(self.size))
-        if frame.blank or not bool(batch.depth.any()):
-            return FrameEstimate(batch, None, 0.0, 0.0, None)
         self.method.seed = self.seed
         trace = self.method.predict_step(batch, 0)
         size = self.method.measure_apparent_size(trace, batch)
         return self._weigh(batch, trace)._replace(size=size)
 
-    def _follow(self, frame: Frame, predicted: State) -> FrameEstimate:
+    def _follow(self, batch: Batch, predicted: State, windowed: bool) -> FrameEstimate:
         """Run a filter of few particles from the predicted belief."""
-        window = self._choose_window(frame.images, predicted)
-        seen = frame.see_whole(self.size) if window is None else frame.see_window(window)
-        batch = self._take(seen)
-        if frame.blank or not bool(batch.depth.any()):
-            return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, follow = self.settings, self.settings.follow
         scale = settings.motion.noise_scale(predicted.squared_innovation)
         against = settings.jump_penalty
@@ -238,18 +235,15 @@ class Track:
                 follow, steps=steps, initial_sigma=level, proposals=3 * follow.proposals
             )
             against = max(0.0, against - 6 * math.log(scale))
-        elif window is not None:  # what it shows is the predicted belief's already
+        elif windowed:  # what it shows is the predicted belief's already
             follow = replace(follow, proposals=0)
         encoding, start = self.method.encode(batch), predicted.belief.state
         turns = [RotateTogether(one) for one in self._texture_rotations if self._texture_is_due]
         refine = self._refine(settings.quadratic_fits, turns)
         return self._filter(batch, encoding, start, follow, refine, against)
 
-    def _search(self, frame: Frame, predicted: State) -> FrameEstimate:
+    def _search(self, batch: Batch, predicted: State) -> FrameEstimate:
         """Probe the whole image for a lost object, and search where that is worth it."""
-        batch = self._take(frame.see_whole(self.size))
-        if frame.blank or not bool(batch.depth.any()):
-            return FrameEstimate(batch, None, 0.0, 0.0, None)
         settings, encoding = self.settings, self.method.encode(batch)
         start = predicted.belief.state
         probed = self._filter(batch, encoding, start, settings.probe, self._refine(0))
@@ -387,9 +381,6 @@ class Track:
             settings.window_side,
             settings.window_scale + more / self.space.radius,
         )
-
-    def _take(self, batch: Batch) -> Batch:
-        return Batch(*(x.to(self.method.device) for x in batch))
 
     def _weigh(self, batch: Batch, trace: Trace) -> FrameEstimate:
         """Return what a frame shows, and whether the object is where the estimate puts it."""

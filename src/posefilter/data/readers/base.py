@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from posefilter.data.frames import FrameRecord, Sample
+from posefilter.data.readers.plausible import check_sample, narrow
 from posefilter.data.silhouette import Geometry
 from posefilter.errors import BadData
 from posefilter.meshes.store import BUILTIN, MeshStore
@@ -54,11 +55,9 @@ class BaseReader:
 
     def visible_share(self, sample: Sample) -> float:
         """Measure the visibility of a sample, at whatever resolution; NaN where no mesh fits."""
-        return (
-            float("nan")
-            if self._geometry is None
-            else self._geometry.visible_share(self.objects[sample.object_id], sample)
-        )
+        if self._geometry is None:
+            return float("nan")
+        return self._geometry.visible_share(self.objects[sample.object_id], sample)
 
     def _files(self, record: FrameRecord) -> tuple[Path, ...]:
         """Return a record's files.
@@ -88,6 +87,25 @@ class BaseReader:
             self.notes[
                 "builtin meshes are not the objects of these photographs: visibility stays unknown"
             ] = 1
+
+    def _make_sample(
+        self,
+        i: int,
+        rgb: np.ndarray,
+        depth: np.ndarray,
+        mask: np.ndarray,
+        K: np.ndarray,
+        native_from_mesh: np.ndarray,
+        files: tuple[Path, ...],
+    ) -> Sample:
+        """Return what was read of record i, where a camera can have seen it; `files` as
+        `check_sample` takes them.
+        """
+        entry, unknown = self._entries[i], float("nan")
+        object_id = self.objects.index(entry.record.object)
+        pose = entry.camera_from_object
+        sample = Sample(rgb, depth, mask, narrow(K), narrow(pose), object_id, i, unknown)
+        return check_sample(sample, pose @ np.linalg.inv(native_from_mesh), files)
 
     def _instance(
         self,

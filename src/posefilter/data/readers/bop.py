@@ -22,7 +22,7 @@ from posefilter.data.readers.decode import (
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects, need_text
-from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
+from posefilter.data.readers.plausible import check_camera, check_units
 from posefilter.errors import BadData, UserError
 from posefilter.geometry.pose import is_rigid
 from posefilter.limits import read_json
@@ -170,11 +170,9 @@ class BopReader(BaseReader):
         expect_size(mask_path, mask, height, width, color_path.name)
         if not mask.any():
             raise NotShown(mask_path, "listed, but not in the label", entry.record.object)
-        object_id = self.objects.index(entry.record.object)
-        K, pose = narrow(entry.K), narrow(entry.camera_from_object)
-        sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
-        native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
-        return check_sample(sample, native, (camera_path, gt_path, depth_path, mask_path))
+        files = (camera_path, gt_path, depth_path, mask_path)
+        native = self._native[entry.record.object]
+        return self._make_sample(i, rgb, depth, mask, entry.K, native, files)
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""

@@ -35,7 +35,7 @@ from posefilter.data.readers.fat_settings import (
     scene_folders,
 )
 from posefilter.data.readers.naming import choose_objects, choose_several
-from posefilter.data.readers.plausible import check_camera, check_sample, narrow
+from posefilter.data.readers.plausible import check_camera
 from posefilter.errors import BadData, UserError
 from posefilter.limits import read_json
 from posefilter.meshes import ycb
@@ -134,28 +134,17 @@ class FatReader(BaseReader):
         color_path, depth_path, seg_path, json_path = self._files(record)
         camera_path = json_path.with_name("_camera_settings.json")
         check_camera(camera.K, camera_path)
-        rgb, depth, seg = (
-            read_color(color_path),
-            read_depth(depth_path, DEPTH_UNITS),
-            read_label(seg_path),
-        )
+        rgb = read_color(color_path)
+        depth = read_depth(depth_path, DEPTH_UNITS)
+        seg = read_label(seg_path)
         for path, image in zip(record.files, (rgb, depth, seg), strict=False):
             expect_size(path, image, camera.height, camera.width, "_camera_settings.json")
         if int(seg.max()) > _LARGEST_ID:
             raise BadData(seg_path, "no segment image", f"id {int(seg.max())}; is it the depth?")
         mask = self._mask(entry, seg, seg_path)
-        sample = Sample(
-            rgb,
-            depth,
-            mask,
-            narrow(camera.K),
-            narrow(entry.camera_from_object),
-            self.objects.index(record.object),
-            i,
-            float("nan"),
-        )
-        native = entry.camera_from_object @ np.linalg.inv(entry.kind.aligned_from_mesh)
-        return check_sample(sample, native, (camera_path, json_path, depth_path, seg_path))
+        files = (camera_path, json_path, depth_path, seg_path)
+        aligned = entry.kind.aligned_from_mesh
+        return self._make_sample(i, rgb, depth, mask, camera.K, aligned, files)
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""
@@ -215,11 +204,9 @@ class FatReader(BaseReader):
             try:
                 if camera not in known:
                     raise BadData(folder / "_camera_settings.json", f"no camera named '{camera}'")
-                color = (
-                    f"{stem}.png"
-                    if f"{stem}.png" in names and f"{stem}.jpg" not in names
-                    else f"{stem}.jpg"
-                )
+                color = f"{stem}.jpg"
+                if color not in names and f"{stem}.png" in names:
+                    color = f"{stem}.png"
                 files = tuple(
                     folder / x
                     for x in (color, f"{stem}.depth.png", f"{stem}.seg.png", f"{stem}.json")
@@ -242,51 +229,35 @@ class FatReader(BaseReader):
         content = read_json(check_inside(path, self.root))
         found: dict[str, list[tuple[int, np.ndarray, float]]] = {}
         for k, one in enumerate(need_list(content, "objects", path)):
-            name = mesh_name(need(one, "class", path, f"objects[{k}]."), path)
+            where = f"objects[{k}]."
+            name = mesh_name(need(one, "class", path, where), path)
             if name not in classes:
                 raise BadData(
                     path, "unknown class", f"'{name}' is not in the folder's _object_settings.json"
                 )
             if name in self.objects:
-                pose = (
-                    camera_from_aligned(one, path, f"objects[{k}].")
-                    @ classes[name].aligned_from_mesh
-                )
-                visibility = (
-                    float(numbers(one, "visibility", path, (), f"objects[{k}]."))
-                    if "visibility" in one
-                    else 1.0
-                )
+                pose = camera_from_aligned(one, path, where) @ classes[name].aligned_from_mesh
+                visibility = 1.0
+                if "visibility" in one:
+                    visibility = float(numbers(one, "visibility", path, (), where))
                 found.setdefault(name, []).append((k, pose, visibility))
         entries = []
+        # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
+        group = path.parent.name
+        scene = path.parent.relative_to(self.root).as_posix() if path.parent != self.root else group
+        image = f"{scene}/{path.name.removesuffix('.json')}"
         for name, many in found.items():
             if len(many) > 1 and self._geometry is None:
-                self.skipped["two instances of one class, and no meshes to tell them apart"] += len(
-                    many
-                )
+                why = "two instances of one class, and no meshes to tell them apart"
+                self.skipped[why] += len(many)
                 continue
             if len(many) > 1:
                 self.notes["masks split between instances of one class by geometry"] += len(many)
             twins = tuple(pose for _, pose, _ in many)
+            listed = name in ycb.CLASSES
+            number = ycb.ycbvideo_index(name) if listed else classes[name].seg_id
             for twin, (k, pose, visibility) in enumerate(many):
-                scene = (
-                    path.parent.relative_to(self.root)
-                    if path.parent != self.root
-                    else Path(path.parent.name)
-                )
-                record = FrameRecord(
-                    name=f"{scene.as_posix()}/{path.name.removesuffix('.json')}",
-                    # kitchen_0 is one place, whether in `single` or in `mixed`, left or right
-                    group=path.parent.name,
-                    scene_id=scene_id,
-                    im_id=im_id,
-                    obj_id=ycb.ycbvideo_index(name)
-                    if name in ycb.CLASSES
-                    else classes[name].seg_id,
-                    object=name,
-                    instance=k,
-                    files=files,
-                )
+                record = FrameRecord(image, group, scene_id, im_id, number, name, k, files)
                 entries.append(_Entry(record, classes[name], camera, pose, visibility, twins, twin))
         return entries
 

@@ -92,11 +92,9 @@ def object_settings(path: Path) -> dict[str, FatClass]:
                 f"'{where}fixed_model_transform' is not 100 x a rotation with its "
                 f"shift in the last row",
             )
-        size = (
-            numbers(one, "cuboid_dimensions", path, (3,), where) * CM
-            if "cuboid_dimensions" in one
-            else None
-        )
+        size = None
+        if "cuboid_dimensions" in one:
+            size = numbers(one, "cuboid_dimensions", path, (3,), where) * CM
         seg_id = int(numbers(one, "segmentation_class_id", path, (), where))
         classes[mesh_name(need(one, "class", path, where), path)] = FatClass(seg_id, aligned, size)
     return classes
@@ -117,11 +115,9 @@ def camera_settings(path: Path) -> dict[str, FatCamera]:
             int(numbers(size, key, path, (), f"{where}captured_image_size."))
             for key in ("width", "height")
         )
-        skew = (
-            float(numbers(inner, "s", path, (), f"{where}intrinsic_settings."))
-            if "s" in inner
-            else 0.0
-        )
+        skew = 0.0
+        if "s" in inner:
+            skew = float(numbers(inner, "s", path, (), f"{where}intrinsic_settings."))
         if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
             raise BadData(
                 path, "no such image size", f"{where}captured_image_size {width}x{height}"

@@ -19,7 +19,7 @@ from posefilter.data.readers.decode import (
     read_label,
 )
 from posefilter.data.readers.naming import choose_objects, choose_several, need_text
-from posefilter.data.readers.plausible import check_camera, check_sample, check_units, narrow
+from posefilter.data.readers.plausible import check_camera, check_units
 from posefilter.data.readers.ycb_video_files import (
     FRAME,
     SYNTHETIC,
@@ -124,20 +124,15 @@ class YCBVideoReader(BaseReader):
         entry = self._entries[i]
         color_path, depth_path, label_path, meta_path = self._files(entry.record)
         check_camera(entry.K, meta_path)
-        rgb, depth, label = (
-            read_color(color_path),
-            read_depth(depth_path, entry.units),
-            read_label(label_path),
-        )
+        rgb = read_color(color_path)
+        depth = read_depth(depth_path, entry.units)
+        label = read_label(label_path)
         height, width = rgb.shape[:2]
         expect_size(depth_path, depth, height, width, color_path.name)
         expect_size(label_path, label, height, width, color_path.name)
-        object_id = self.objects.index(entry.record.object)
-        K, pose = narrow(entry.K), narrow(entry.camera_from_object)
-        mask = self._mask(entry, label)
-        sample = Sample(rgb, depth, mask, K, pose, object_id, i, float("nan"))
-        native = entry.camera_from_object @ np.linalg.inv(self._native[entry.record.object])
-        return check_sample(sample, native, (meta_path, meta_path, depth_path, label_path))
+        files = (meta_path, meta_path, depth_path, label_path)
+        mask, native = self._mask(entry, label), self._native[entry.record.object]
+        return self._make_sample(i, rgb, depth, mask, entry.K, native, files)
 
     def others(self, i: int) -> np.ndarray:
         """Return the pixels of any other labeled object.  -> (H, W) bool."""

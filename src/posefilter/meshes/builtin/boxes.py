@@ -21,6 +21,7 @@ from posefilter.meshes.builtin.printing import (
 SUGAR_SIZE = (0.0927, 0.0451, 0.1763)  # width, depth, height [m]: YCB's sugar box as scanned
 GELATIN_SIZE = (0.0892, 0.0300, 0.0731)  # YCB's gelatin box, standing
 BRICK_SIZE = (0.0779, 0.0526, 0.0512)  # YCB's foam brick
+_FACES = ("front", "back", "left", "right", "top", "bottom")
 
 
 def sugar_faces() -> dict[str, np.ndarray]:
@@ -97,16 +98,10 @@ def gelatin_faces() -> dict[str, np.ndarray]:
 def brick_faces() -> dict[str, np.ndarray]:
     """Return six faces of red foam: speckle, alike on all sides.  face -> (h, w, 3) uint8 RGB."""
     width, depth, height = (1000 * s for s in BRICK_SIZE)
-    sizes = {
-        "front": (width, height),
-        "back": (width, height),
-        "left": (depth, height),
-        "right": (depth, height),
-    }
-    sizes |= {"top": (width, depth), "bottom": (width, depth)}
+    sizes = [(width, height)] * 2 + [(depth, height)] * 2 + [(width, depth)] * 2
     rng = np.random.default_rng(31)
     out = {}
-    for face, (w, h) in sizes.items():
+    for face, (w, h) in zip(_FACES, sizes, strict=True):
         foam = Canvas(w, h, (152, 44, 40)).image.astype(np.float32)
         noise = rng.standard_normal(foam.shape[:2]).astype(np.float32)
         fine, coarse = cv2.GaussianBlur(noise, (0, 0), 1.2), cv2.GaussianBlur(noise, (0, 0), 5)
@@ -115,15 +110,5 @@ def brick_faces() -> dict[str, np.ndarray]:
     return out
 
 
-def _six(
-    front: Canvas, back: Canvas, left: Canvas, right: Canvas, top: Canvas, bottom: Canvas
-) -> dict[str, np.ndarray]:
-    pages = {
-        "front": front,
-        "back": back,
-        "left": left,
-        "right": right,
-        "top": top,
-        "bottom": bottom,
-    }
-    return {face: page.image for face, page in pages.items()}
+def _six(*pages: Canvas) -> dict[str, np.ndarray]:
+    return {face: page.image for face, page in zip(_FACES, pages, strict=True)}

@@ -7,20 +7,16 @@ Color = tuple[int, int, int]  # RGB
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1 [mm], y down
 
 BLACK, WHITE, CREAM, RED = (20, 20, 22), (250, 250, 246), (246, 234, 202), (196, 24, 34)
-NAVY, BLUE, SKY, GREEN, LIME = (
-    (18, 34, 92),
-    (20, 84, 176),
-    (120, 186, 226),
-    (22, 118, 62),
-    (148, 190, 40),
-)
-YELLOW, ORANGE, BROWN, KRAFT, GREY = (
-    (250, 206, 34),
-    (238, 128, 28),
-    (110, 66, 34),
-    (176, 138, 96),
-    (150, 152, 156),
-)
+NAVY = (18, 34, 92)
+BLUE = (20, 84, 176)
+SKY = (120, 186, 226)
+GREEN = (22, 118, 62)
+LIME = (148, 190, 40)
+YELLOW = (250, 206, 34)
+ORANGE = (238, 128, 28)
+BROWN = (110, 66, 34)
+KRAFT = (176, 138, 96)
+GREY = (150, 152, 156)
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
