@@ -211,7 +211,9 @@ class Resample(Protocol):
     def __call__(
         self, particles: Particles, count: int, space: Space, generator: Generator
     ) -> Resampled:
-        """Draw `count` ancestors of each image, with the weights of the resampled particles."""
+        """Draw `count` ancestors of each image (B, count), with the normalized log weights of the
+        resampled particles.
+        """
         ...
 
 

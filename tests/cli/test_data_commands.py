@@ -58,6 +58,28 @@ def test_a_split_that_is_typed_replaces_the_checkpoints(tmp_path: Path, command:
     assert data_settings(job, own, None).split == {**DEFAULTS, "val": 0.2}
 
 
+def test_a_split_that_is_no_mapping_is_refused_in_words(tmp_path: Path) -> None:
+    asked = ["data=fat", f"data.root={tmp_path}", "data.split=half"]
+    with pytest.raises(
+        UserError, match=r"data\.split='half': must be a mapping such as .* or null"
+    ):
+        build_data(compose_job("train", CONF, asked, tmp_path).cfg.data, "json")
+
+
+@pytest.mark.parametrize("chosen", [["data=bop"], []])
+@pytest.mark.parametrize(("split", "held_out"), [("train_pbr", True), ("test", False)])
+def test_of_another_of_bops_splits_every_frame_is_tested(
+    tmp_path: Path, chosen: list[str], split: str, held_out: bool
+) -> None:
+    root = f"data.root={tmp_path}"
+    typed = ["data=bop", root, "data.options.split=train_pbr", "data.object=obj_000001"]
+    trained = compose_job("train", CONF, typed, tmp_path).cfg
+    own = {"data": {**OmegaConf.to_container(trained.data, resolve=True), "augment": {}}}
+    asked = [*chosen, f"++{root}", f"++data.options.split={split}"]
+    job = compose_job("evaluate", CONF, asked, tmp_path)
+    assert data_settings(job, own, "obj_000001").split == (DEFAULTS if held_out else {"test": 1.0})
+
+
 def test_the_next_commands_of_few_frames_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

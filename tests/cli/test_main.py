@@ -28,6 +28,7 @@ REFUSED = {
     "train resume=nowhere": "resume=nowhere: not a run's folder",
     "train seed=many": "seed=many: must be a whole number",
     "train plugins=[no_such_package]": "there is no package 'no_such_package'",
+    "train plugins=[no_such_package] loss=mine": "there is no package 'no_such_package'",
     "evaluate checkpoint=nowhere.ckpt": "checkpoint=nowhere.ckpt: no such file",
     "evaluate estimates=nowhere.csv": "estimates=nowhere.csv: no such file",
     "predict": "checkpoint: is missing",

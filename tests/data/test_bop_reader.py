@@ -124,6 +124,9 @@ def test_broken_masks_and_folders(tmp_path):
         reader.read(0)
     with pytest.raises(UserError, match="no BOP scenes"):
         BopReader(tmp_path / "000001" / "rgb")
+    bop_scene(tmp_path / "data" / "train_pbr" / "000001", [[(2, pose())]])
+    with pytest.raises(UserError, match=r"no BOP scenes.*data\.options\.split=train_pbr\)"):
+        BopReader(tmp_path / "data")
     with pytest.raises(UserError, match="unknown class 'obj_000003'"):
         BopReader(tmp_path, "obj_000003")
 

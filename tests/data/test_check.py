@@ -57,7 +57,9 @@ def test_a_true_dataset_passes(tmp_path, meshes):
     report = check_dataset(reader, meshes, out=tmp_path / "out")
     (row,) = report["objects"]
     assert set(report) == {"objects", "problems", "left_out"}
-    assert set(row) == {"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}
+    assert set(row) == {
+        "object", "frames", "silhouette_iou", "depth_error_mm", "visible_share", "empty_masks"
+    }  # fmt: skip
     assert report["problems"] == []
     assert (row["object"], row["frames"]) == (NAME, 4)
     assert row["silhouette_iou"] > 0.99
@@ -165,6 +167,15 @@ def test_lookalikes_of_rendered_scenes_are_left_out_and_named(tmp_path, meshes):
     assert report["problems"] == []
     assert [row["object"] for row in report["objects"]] == [NAME]
     assert "left out, look-alikes without a mesh: lookalike_00" in format_report(report)
+
+
+def test_empty_masks_are_counted(tmp_path, meshes):
+    folder = tmp_path / "000001"
+    bop_scene(folder, [[(2, pose())], [(2, pose())]])
+    mask = np.zeros((120, 160), np.uint8)
+    cv2.imwrite(str(folder / "mask_visib" / "000001_000000.png"), mask)
+    (row,) = check_dataset(BopReader(tmp_path, on_error="skip"), meshes)["objects"]
+    assert (row["frames"], row["empty_masks"]) == (1, 1)
 
 
 def test_broken_files_and_missing_meshes_are_reported(tmp_path, meshes):

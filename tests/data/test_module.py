@@ -2,7 +2,12 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
+import textwrap
+from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,6 +25,7 @@ from dataset_trees import (
 )
 from torch.utils.data import default_collate
 
+from posefilter.data.augmentation import RandomCrop
 from posefilter.data.dataset import EpochShuffle
 from posefilter.data.loaders import spare_cores
 from posefilter.data.module import PoseDataModule
@@ -287,6 +293,36 @@ def test_workers_that_persist_see_the_epoch_change(root):
         shades.append(batch.rgb[batch.frame_id.argsort()][:, 0, 0, 0])
     assert not torch.equal(shades[0], shades[1])
     assert torch.equal(shades[0], shades[2])
+
+
+def test_a_script_ends_that_still_refers_to_its_loaders_batches(root):
+    script = f"""
+        from posefilter.data.module import PoseDataModule
+        data = PoseDataModule("fat", r"{root / "data"}", "toy", r"{root / "meshes"}", workers=1)
+        batches = iter(data.test_dataloader())
+        next(batches)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    subprocess.run(command, check=True, timeout=180)  # it would wait for ever
+
+
+def test_images_of_several_sizes_are_taken_one_by_one(root, tmp_path):
+    frame = [(2, pose())]
+    bop_scene(tmp_path / "000001", [frame, frame])
+    for name in ("rgb", "depth", "mask_visib"):
+        for path in (tmp_path / "000001" / name).glob("000001*"):
+            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:90])
+    how = {"source": "bop", "root": tmp_path, "object": "obj_000002", "image_width": 80}
+    for split in ("train", "test"):
+        dm = PoseDataModule(**how, split={split: 1.0}, batch_size=2)
+        loader = dm.train_dataloader if split == "train" else dm.test_dataloader
+        with pytest.raises(UserError, match=r"000001/00000\d is 80x\d+ and .*data\.batch_size=1"):
+            loader()
+    dm = PoseDataModule(**how, split={"test": 1.0}, batch_size=1, workers=0)
+    assert [batch.rgb.shape[2] for batch in dm.test_dataloader()] == [60, 45]
+    cut = partial(PoseDataModule, **how, split={"train": 1.0}, augment=RandomCrop((32, 32)))
+    (batch,) = cut(batch_size=2, workers=0).train_dataloader()
+    assert batch.rgb.shape == (2, 3, 32, 32)
 
 
 def test_validation_and_test_are_not_augmented(root):

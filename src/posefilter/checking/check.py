@@ -51,10 +51,11 @@ def check_dataset(
         progress: Draw a bar.
 
     Returns:
-        `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share"}],
-        "problems": [...], "left_out": [...]}`, medians all; None stands for what could not be
-        measured. Problems are sentences that name the likely cause: of most frames of an object, or
-        of a single one. Left out are look-alikes of rendered scenes, which have no mesh file.
+        `{"objects": [{"object", "frames", "silhouette_iou", "depth_error_mm", "visible_share",
+        "empty_masks"}], "problems": [...], "left_out": [...]}`, medians all but the counts; None
+        stands for what could not be measured. Problems are sentences that name the likely cause: of
+        most frames of an object, or of a single one. Left out are look-alikes of rendered scenes,
+        which have no mesh file.
 
     Raises:
         UserError: The limit is not positive, or the reader does not keep to its protocol.
@@ -89,12 +90,15 @@ def check_dataset(
 
 def format_report(report: dict[str, Any]) -> str:
     """Return the report as a table, and its problems below."""
-    table = Table("object", "frames", "silhouette IoU", r"depth error \[mm]", "visible share")
+    table = Table(
+        "object", "frames", "silhouette IoU", r"depth error \[mm]", "visible share", "empty masks"
+    )
     for row in report["objects"]:
         numbers = (
             _text(row["silhouette_iou"], 3),
             _text(row["depth_error_mm"], 1),
             _text(row["visible_share"], 2),
+            str(row["empty_masks"]),
         )
         table.add_row(row["object"], str(row["frames"]), *numbers)
     console = Console(width=110, record=True, file=io.StringIO(), color_system=None)
@@ -117,12 +121,13 @@ def _check_object(
     mine = [i for i, record in enumerate(records) if record.object == name]
     mesh = geometry.mesh(name)
     if mesh is None:
-        return _row(name, 0, []), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
+        return _row(name, [], 0), [f"{name}: no mesh of this name in {geometry.meshes.root}"], []
     native = reader.native_from_mesh(name)
     spread = np.linspace(0, len(mine) - 1, min(limit or len(mine), len(mine)))
     chosen = [mine[k] for k in np.unique(spread.astype(int))]
     broken: Counter[str] = Counter()
     examples: dict[str, str] = {}
+    not_shown = 0
     views: list[View] = []
     fits: list[Fit] = []
     tiles: list[np.ndarray] = []
@@ -136,6 +141,7 @@ def _check_object(
                 sample, flaw = error.sample, str(error)
             view = View(sample, reader.others(i), mesh, native)
         except NotShown:
+            not_shown += 1
             continue
         except BadData as error:
             broken[error.cause] += 1
@@ -153,7 +159,7 @@ def _check_object(
         f"{examples[cause]} ({count} such of {len(chosen)} frames looked at)"
         for cause, count in broken.items()
     ]
-    row = _row(name, len(fits), fits)
+    row = _row(name, fits, not_shown)
     if not fits:
         return row, [*problems, f"{name}: no frame shows it"], tiles
     general = _judge(row, views, fits, geometry)
@@ -196,13 +202,14 @@ def _judge(
     return problems
 
 
-def _row(name: str, frames: int, fits: Sequence[Fit]) -> dict[str, Any]:
+def _row(name: str, fits: Sequence[Fit], empty_masks: int) -> dict[str, Any]:
     return {
         "object": name,
-        "frames": frames,
+        "frames": len(fits),
         "silhouette_iou": _median([fit.iou for fit in fits]),
         "depth_error_mm": _median([fit.depth_error_mm for fit in fits]),
         "visible_share": _median([fit.visible_share for fit in fits]),
+        "empty_masks": empty_masks,
     }
 
 

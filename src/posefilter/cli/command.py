@@ -40,9 +40,9 @@ from posefilter.cli.main import COMMANDS
 from posefilter.cli.ranks import STARTED
 from posefilter.cli.replaced import replace_typed
 from posefilter.cli.resume import keep_record, with_resumed
-from posefilter.cli.running import EXPECTED, run_job
+from posefilter.cli.running import EXPECTED, import_plugin, run_job
 from posefilter.cli.search_path import add_plugin_folders
-from posefilter.cli.trust import Scope, trust
+from posefilter.cli.trust import Scope, find_folders, trust
 from posefilter.cli.usage import describe_command
 from posefilter.errors import (
     FAILURE,
@@ -87,6 +87,8 @@ def run_command(name: str, home: Path | None = None, arguments: list[str] | None
         arguments = with_home(arguments)
         for package in typed_plugins(arguments):  # whose choices Hydra is to find
             trust(package)
+            if not find_folders([package]):
+                import_plugin(package)  # which says so where there is no such package
         if {"--help", "-h"} & {*arguments}:
             print(describe_command(name, conf, arguments))
             return 0

@@ -2,6 +2,7 @@
 
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from math import inf, nan
 from pathlib import Path
 from typing import Any
@@ -271,7 +272,7 @@ def data_settings(
     Without `data=` they are those that the checkpoint was trained with: its held-out test split,
     and it must lie where `check_data` lets it. With it, object and image size are the checkpoint's
     unless typed; the split is the checkpoint's where it was trained on the same folder, and else
-    every frame is tested.
+    every frame is tested, as it is of another of BOP's splits.
     """
     said = OmegaConf.to_container(job.cfg.data, resolve=False) if job.cfg.get("data") else {}
     assert isinstance(said, dict)
@@ -301,7 +302,11 @@ def data_settings(
         root = OmegaConf.create(tree).data.root
         if root is None:
             raise UserError("data.root: is missing; name the dataset's folder")
-        same = "root" in before and Path(root).resolve() == Path(before.root).resolve()
+        same = (
+            "root" in before
+            and Path(root).resolve() == Path(before.root).resolve()
+            and _bop_split(settings) == _bop_split(own)
+        )
         if not any(key.startswith("split") for key in typed):
             settings["split"] = before.split if same else {part: 1.0}
             settings["split_seed"] = before.get("split_seed", settings.get("split_seed", 0))
@@ -309,7 +314,9 @@ def data_settings(
             settings["limit_test"] = before.limit_test if same else None
         if same and "min_visibility_test" not in typed:
             settings["min_visibility_test"] = before.min_visibility_test
-    elif chosen and not any(key.startswith("split") for key in typed):
+    elif (chosen or _bop_split(settings) != _bop_split(own)) and not any(
+        key.startswith("split") for key in typed
+    ):
         settings["split"] = {part: 1.0}
     data = OmegaConf.create({**tree, "data": settings}).data
     OmegaConf.resolve(data)
@@ -320,6 +327,11 @@ def data_settings(
     if data.get("generate") and not any(key.startswith("generate") for key in typed):
         data.generate = None  # a mistyped folder must not be filled with a new dataset
     return data
+
+
+def _bop_split(data: Mapping[str, Any]) -> Any:
+    """Return which folder of a dataset in BOP's layout is read, such as train_pbr."""
+    return (data.get("options") or {}).get("split")
 
 
 def object_to_judge(data: PoseDataModule, own: ObjectModel) -> ObjectModel:

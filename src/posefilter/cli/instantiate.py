@@ -298,6 +298,10 @@ def describe(wanted: Any) -> str:
         return words[wanted]
     if get_origin(wanted) is Callable:
         return "what a _target_ builds, to be called"
+    if get_origin(wanted) is Sequence:
+        return "a list"
+    if get_origin(wanted) is Mapping:
+        return "a mapping such as '{key: value}'"
     return (
         str(wanted).replace("typing.", "")
         if get_origin(wanted)

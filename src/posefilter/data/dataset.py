@@ -2,8 +2,10 @@
 alone.
 """
 
+import atexit
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -66,6 +68,16 @@ class FrameDataset(Dataset[Batch]):
     def sample(self, i: int) -> Sample:
         """Return frame i as it is."""
         return self._cache.load(self.records[i], i)
+
+    def sizes(self) -> dict[tuple[int, ...], str]:
+        """Return the (height, width) of its images, each with the name of one that has it."""
+        kept = [self._cache.find(record) for record in self.records]
+        one_of_each: dict[tuple[int, ...], int] = {
+            one.shape: i for i, one in enumerate(kept) if one is not None
+        }
+        if len(one_of_each) > 1:  # augmentation may cut them to one size
+            one_of_each = {tuple(self[i].rgb.shape[1:]): i for i in one_of_each.values()}
+        return {size: self.records[i].name for size, i in one_of_each.items()}
 
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch whose augmentation is drawn."""
@@ -150,6 +162,7 @@ class ResumableLoader(DataLoader[Batch]):
         if isinstance(self.sampler, EpochShuffle):
             self.sampler.skip(start * int(self.batch_size or 1))
             self._given = start
+        _ITERATED.add(self)
         for batch in super().__iter__():
             self._given += 1
             yield batch
@@ -161,3 +174,17 @@ class ResumableLoader(DataLoader[Batch]):
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Go on from there; after a whole epoch, from the start of the next."""
         self._start = state["given"] % max(len(self), 1)
+
+
+_ITERATED: WeakSet[ResumableLoader] = WeakSet()
+
+
+@atexit.register
+def _end_workers() -> None:
+    """End the workers of loaders that are still referred to.
+
+    Multiprocessing would tell each once to terminate, which they leave to their parent, and wait.
+    """
+    for loader in _ITERATED:
+        if loader._iterator is not None:
+            loader._iterator._shutdown_workers()  # type: ignore[attr-defined]

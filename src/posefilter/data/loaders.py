@@ -8,6 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from posefilter.data.dataset import FrameDataset, ResumableLoader
+from posefilter.errors import UserError
 from posefilter.signals import leave_signals_to_parent
 from posefilter.types import Batch
 
@@ -38,7 +39,17 @@ def make_loader(
         batch_size: Frames of a batch.
         workers: Loader processes.
         **options: Others of `DataLoader`.
+
+    Raises:
+        UserError: Images of a batch would be of several sizes.
     """
+    sizes = list(dataset.sizes().items()) if batch_size > 1 else []
+    if len(sizes) > 1:
+        told = " and ".join(f"{name} is {width}x{height}" for (height, width), name in sizes[:2])
+        raise UserError(
+            f"{told}: images of a batch are of one size; data.batch_size=1 data.batch_size_test=1 "
+            f"take them one by one, data.split can name the scenes of one size"
+        )
     # a forked worker would wait for ever for OpenCV threads that only its parent has
     if workers > 0:
         cv2.setNumThreads(1)

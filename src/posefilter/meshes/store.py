@@ -97,9 +97,9 @@ class MeshStore:
             near = difflib.get_close_matches(name, self.names(), n=1, cutoff=0.3)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UserError(
-                f"no mesh named '{name}' in {self.root}; there are {', '.join(self.names())}; "
-                f"other meshes: data.meshes=DIR (generate, check_data, predict, track: "
-                f"meshes=DIR){hint}"
+                f"no mesh named '{name}' in {self.root}; there are {', '.join(self.names())} "
+                f"(data.object=); other meshes: data.meshes=DIR (generate, check_data, predict, "
+                f"track: meshes=DIR){hint}"
             )
         if str(self.root) == BUILTIN:
             mesh = builtin.build(name)

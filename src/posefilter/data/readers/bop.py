@@ -110,9 +110,10 @@ class BopReader(BaseReader):
         base = self.root / split if split else self.root
         folders = sorted(_scene_folders(base))
         if not folders:
+            splits = sorted({path.parts[-3] for path in base.glob("*/*/scene_gt.json")})
             raise UserError(
                 f"{base}: no BOP scenes here: no <scene>/scene_gt.json (data.root, "
-                f"data.options.split)"
+                f"data.options.split={'|'.join(splits) or '...'})"
             )
         scenes = [(folder, self._read_scene(folder)) for folder in folders]
         wanted = [objects] if isinstance(objects, str) else objects
