@@ -19,31 +19,39 @@ from posefilter.lazy import import_lazily
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from posefilter import figures as figures
-    from posefilter.api import (
-        build as build,
-    )
-    from posefilter.api import (
-        build_data as build_data,
-    )
-    from posefilter.api import (
-        compose as compose,
-    )
-    from posefilter.api import (
-        load as load,
-    )
-    from posefilter.belief import Belief as Belief
-    from posefilter.belief import Mode as Mode
-    from posefilter.belief import PoseSet as PoseSet
-    from posefilter.cli.trust import trust as trust
-    from posefilter.confidence.tolerance import PoseTolerance as PoseTolerance
-    from posefilter.confidence.verdicts import Costs as Costs
-    from posefilter.errors import UserError as UserError
-    from posefilter.estimator import Estimator as Estimator
-    from posefilter.result import Result as Result
-    from posefilter.tracking.settings import TrackerSettings as TrackerSettings
-    from posefilter.tracking.track import TrackResult as TrackResult
-    from posefilter.tracking.tracker import Tracker as Tracker
+    from posefilter import figures
+    from posefilter.api import build, build_data, compose, load
+    from posefilter.belief import Belief, Mode, PoseSet
+    from posefilter.cli.trust import trust
+    from posefilter.confidence.tolerance import PoseTolerance
+    from posefilter.confidence.verdicts import Costs
+    from posefilter.errors import UserError
+    from posefilter.estimator import Estimator
+    from posefilter.result import Result
+    from posefilter.tracking.settings import TrackerSettings
+    from posefilter.tracking.track import TrackResult
+    from posefilter.tracking.tracker import Tracker
+
+__all__ = [
+    "Belief",
+    "Costs",
+    "Estimator",
+    "Mode",
+    "PoseSet",
+    "PoseTolerance",
+    "Result",
+    "TrackResult",
+    "Tracker",
+    "TrackerSettings",
+    "UserError",
+    "__version__",
+    "build",
+    "build_data",
+    "compose",
+    "figures",
+    "load",
+    "trust",
+]
 
 _HOMES = {
     "Belief": "belief",
@@ -64,7 +72,6 @@ _HOMES = {
     "load": "api",
     "trust": "cli.trust",
 }
-__all__ = ["__version__", *_HOMES]
 __getattr__ = import_lazily(__name__, _HOMES)
 
 
