@@ -2,6 +2,7 @@
 
 import shutil
 from collections import Counter
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 from typing import Any
@@ -120,17 +121,9 @@ def _of_checkpoint(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
         files["poses"] = job.folder / "poses.csv"
         write_poses_csv(files["poses"], to_rows(records.outcomes, data.records("test"), native))
     write_beliefs(files["beliefs"], records.outcomes, data.records("test"), native)
-    tested = Job(
-        job.cfg,
-        {**checkpoint["recipe"]["choices"], **chosen(job)},
-        job.overrides,
-        job.folder,
-        job.name,
-        job.swept,
-    )
-    return record(
-        method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint)
-    ), files
+    tested = replace(job, choices={**checkpoint["recipe"]["choices"], **chosen(job)})
+    found = record(method.compute_metrics(), tested, data.describe(), Path(job.cfg.checkpoint))
+    return found, files
 
 
 def warn_of_several(data: PoseDataModule, console: str) -> None:
@@ -213,9 +206,7 @@ def _of_estimates(job: Job) -> tuple[dict[str, Any], dict[str, Path]]:
             for row in estimates
         ]
         scores, times = zip(*pairs, strict=True)
-        own_errors = [
-            (1000 * state[-1]).tolist() for state in (errors.add, errors.add_s, errors.diameter)
-        ]
+        own_errors = (1000 * errors.rows[-1]).T.tolist()
         table += make_rows(own, batch, own_errors, [nan] * len(own), scores, times)
         for i, index in enumerate(batch.object_id.tolist()):
             hull, K = errors.models[index].hull, batch.intrinsics[i : i + 1]
