@@ -6,7 +6,7 @@ Pictures are (H, W, 3) uint8; bytes are an animation, a GIF.
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -144,9 +144,7 @@ def points(o: Occasion) -> Drawn:
     """Draw slices of the likelihood of single points through the object's frame (the paper, figure
     5).
     """
-    likelihood = getattr(o.method, "likelihood", None)
-    if not isinstance(likelihood, ScoresPoints):
-        return None
+    likelihood = cast(ScoresPoints, o.method.likelihood)
     object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
     slices = [
         evaluate_point_field(
@@ -173,8 +171,7 @@ def points(o: Occasion) -> Drawn:
 @needs("object_coordinates")
 def proposals(o: Occasion) -> Drawn:
     """Draw what the proposal network says."""
-    if not isinstance(o.method, ProposesPoses):
-        return None
+    assert isinstance(o.method, ProposesPoses)
     predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.object_model)
     if predicted is None:
         return None

@@ -192,6 +192,6 @@ def draw_marked_pixel(rgb: np.ndarray, pixel: tuple[int, int]) -> np.ndarray:
     view = full_view(rgb.shape[0], rgb.shape[1], tile_width(2))
     picture = view.show(rgb)
     at = view.place(np.array([pixel]))
-    draw_dots(picture, at, np.array([[0, 0, 0]]), 7)
-    draw_dots(picture, at, np.array([TRUTH]), 5)
+    draw_dots(picture, at, (0, 0, 0), 7)
+    draw_dots(picture, at, TRUTH, 5)
     return picture

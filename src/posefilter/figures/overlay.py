@@ -160,8 +160,8 @@ def draw_axes(
     pixels = _project(camera, K)
     for axis in np.argsort(-camera[1:, 2]):
         draw_lines(picture, [pixels[[0, axis + 1]]], AXES[axis], width)
-        draw_dots(picture, pixels[[axis + 1]], np.array([[0, 0, 0]]), width + 2)
-        draw_dots(picture, pixels[[axis + 1]], np.array([color]), width + 1)
+        draw_dots(picture, pixels[[axis + 1]], (0, 0, 0), width + 2)
+        draw_dots(picture, pixels[[axis + 1]], color, width + 1)
 
 
 def outline_object(

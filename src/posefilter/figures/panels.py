@@ -65,9 +65,7 @@ def draw_heat_panel(
     size = width - LEFT - RIGHT
     plot = cv2.resize(cells[::-1], (size, size), interpolation=cv2.INTER_NEAREST)
     if dots is not None and len(dots):
-        draw_dots(
-            plot, _locate(dots, x, y, size), np.tile(np.array([SURFACE]), (len(dots), 1)), 1.2
-        )
+        draw_dots(plot, _locate(dots, x, y, size), SURFACE, 1.2)
     for mark in marks:
         at = _locate(np.array([[mark.x, mark.y]]), x, y, size)[0]
         draw_mark(plot, np.clip(at, _REACH, size - 1 - _REACH), mark.color, mark.shape)

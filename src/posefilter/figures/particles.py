@@ -15,6 +15,7 @@ from posefilter.figures.canvas import (
     arrange_grid,
     close_up,
     draw_dots,
+    draw_lines,
     full_view,
     halve,
 )
@@ -99,10 +100,8 @@ def fade(rgb: np.ndarray, share: float) -> np.ndarray:
 def draw_many_axes(picture: np.ndarray, axes: np.ndarray, opacity: float = 0.6) -> None:
     """Draw the axes of several poses, half transparent, in place.  (M, 4, 2) [px]."""
     layer = picture.copy()
-    fixed = np.round(np.clip(axes, -16_000, 16_000) * 16).astype(np.int32)
     for k, color in enumerate(AXES, start=1):
-        lines = [np.ascontiguousarray(one) for one in fixed[:, [0, k]]]
-        cv2.polylines(layer, lines, False, color, 2, cv2.LINE_AA, 4)
+        draw_lines(layer, list(axes[:, [0, k]]), color, 2, halo=False)
     cv2.addWeighted(layer, opacity, picture, 1 - opacity, 0, picture)
 
 
