@@ -113,8 +113,8 @@ class Figures(TraceCallback):
             return
         if trainer.is_global_zero:
             kept, step = self._selection.kept, trainer.global_step
-            method = _method(pl_module)
-            self.budget.draw(partial(self._draw, trainer, method, self._example, kept, step))
+            assert isinstance(pl_module, PoseEstimator)
+            self.budget.draw(partial(self._draw, trainer, pl_module, self._example, kept, step))
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the last validation, if that was put off."""
@@ -151,8 +151,3 @@ def evaluate_quietly(method: PoseEstimator) -> Iterator[None]:
     finally:
         for module, training in before:
             module.training = training
-
-
-def _method(module: LightningModule) -> PoseEstimator:
-    assert isinstance(module, PoseEstimator)
-    return module

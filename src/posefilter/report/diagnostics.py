@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
+from statistics import median_high
 from typing import Any, NamedTuple
 
 from posefilter.metrics.registry import MetricInfo, find_metric, read_number, rename_key
@@ -116,15 +118,10 @@ def collect_timings(run: Run) -> list[tuple[str, str]]:
     train = run.curves.get("train/loss")
     out = []
     if train and len(train.steps) > 1:
-        pace = sorted(
-            (b - a) / (t - s)
-            for a, b, s, t in zip(
-                train.steps, train.steps[1:], train.times, train.times[1:], strict=False
-            )
-            if t > s and b > a
-        )
+        logged = pairwise(zip(train.steps, train.times, strict=True))
+        pace = [(b - a) / (t - s) for (a, s), (b, t) in logged if t > s and b > a]
         if pace:
-            out.append(("training steps a second (median)", f"{pace[len(pace) // 2]:.2f}"))
+            out.append(("training steps a second (median)", f"{median_high(pace):.2f}"))
         out.append(
             ("training, validations included", format_duration(train.times[-1] - train.times[0]))
         )

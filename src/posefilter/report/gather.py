@@ -121,31 +121,23 @@ def is_evaluation(metrics: Mapping[str, Any], config: Mapping[str, Any]) -> bool
 
 def list_missing(folder: Path, pictures: bool, evaluation: bool) -> list[str]:
     """Return what a run's folder lacks, and what that means."""
+
+    def lacks(name: str) -> bool:
+        return not (folder / name).is_file()
+
     if evaluation:
         said = "An evaluation: how its checkpoint was trained is told by the run that wrote it."
-        lacking = not (folder / FILE).is_file()
-        return [said, *([_NO_ERRORS] if lacking else [])]
-    lacks = (
-        ("No metrics.json: the run has not been tested.", not (folder / "metrics.json").is_file()),
-        (
-            _NO_ERRORS,
-            (folder / "metrics.json").is_file() and not (folder / FILE).is_file(),
-        ),
-        (
-            "No TensorBoard events, so no curves and no timings of the training.",
-            not any(find_event_files(folder)),
-        ),
-        ("No pictures in figures/ or in the events, so no gallery.", not pictures),
-        (
-            "No .hydra folder: what was configured is not known.",
-            not (folder / ".hydra" / "config.yaml").is_file(),
-        ),
-        (
-            "No data.json: how its data were split is not known.",
-            not (folder / "data.json").is_file(),
-        ),
-    )
-    return [sentence for sentence, true in lacks if true]
+        return [said, *([_NO_ERRORS] if lacks(FILE) else [])]
+    events = any(find_event_files(folder))
+    sentences = {
+        "No metrics.json: the run has not been tested.": lacks("metrics.json"),
+        _NO_ERRORS: lacks(FILE) and not lacks("metrics.json"),
+        "No TensorBoard events, so no curves and no timings of the training.": not events,
+        "No pictures in figures/ or in the events, so no gallery.": not pictures,
+        "No .hydra folder: what was configured is not known.": lacks(".hydra/config.yaml"),
+        "No data.json: how its data were split is not known.": lacks("data.json"),
+    }
+    return [sentence for sentence, true in sentences.items() if true]
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
