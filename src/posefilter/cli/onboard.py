@@ -4,7 +4,7 @@ on.
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -160,8 +160,7 @@ class Onboarding:
         elif start is not None:
             words.append(f"warm_start='{start}'")
         words += [*map(str, self.cfg.train_overrides), *more]
-        composed = compose_job("train", find_conf(), words, folder)
-        return Job(composed.cfg, composed.choices, words, folder, "train", True)
+        return replace(compose_job("train", find_conf(), words, folder), swept=True)
 
     @cached_property
     def run(self) -> Any:

@@ -30,7 +30,7 @@ from posefilter.figures.view_data import collect_view_data
 from posefilter.images import check_images
 from posefilter.meshes.ycb import number_objects
 from posefilter.metrics.bop_results import PoseRow, choose_score, write_poses_csv
-from posefilter.result import Result, Run, collect_results
+from posefilter.result import Result, collect_results
 from posefilter.weights import expand_weights, is_several
 
 VIEW = "view.rrd"
@@ -89,7 +89,8 @@ def predict_one(job: Job) -> list[Result]:
     answer = describe(result, method.filter.score_is, cfg.checkpoint, belief_file, job)
     write_json(folder / "pose.json", answer)
     if cfg.save_rerun:
-        record_view(run, shape, folder / VIEW)
+        model, space = method.object_model, method.space
+        record(collect_view_data(run.trace, run.batch, model, space, shape), folder / VIEW)
     if cfg.console != JSON:
         print_result(result)
     files = {
@@ -166,12 +167,6 @@ def list_rows(results: Sequence[Result], objects: Sequence[str]) -> list[PoseRow
         score = choose_score(one.probability, one.score)
         rows.append(PoseRow(0, 0, number, score, one.pose, seconds))
     return rows
-
-
-def record_view(run: Run, shape: Any, path: Path) -> None:
-    """Write the interactive 3-D view."""
-    method = run.method
-    record(collect_view_data(run.trace, run.batch, method.object_model, method.space, shape), path)
 
 
 def read_costs(cfg: DictConfig) -> Costs:

@@ -41,11 +41,6 @@ def briefly(metrics: dict[str, Any]) -> str:
     )
 
 
-def is_whole(name: str) -> bool:
-    """Tell whether a metric is of a whole validation, not of a part of its images."""
-    return name.startswith("val/") and "/by_" not in name
-
-
 class Lines(Callback):
     """A line at each validation; in a training or a test a sign of life every `pause` seconds: how
     far, how long still.
@@ -105,7 +100,7 @@ class Lines(Callback):
         numbers = {
             name: float(value)
             for name, value in seen.items()
-            if name == "train/loss" or is_whole(name)
+            if name == "train/loss" or (name.startswith("val/") and "/by_" not in name)
         }
         numbers = {"step": step, "steps": steps, **numbers, "steps_per_second": rate}
         say(self.console, event, f"step {step} of {steps}: {words}", **numbers)

@@ -101,9 +101,8 @@ def track(job: Job) -> None:
     write_json(folder / "metrics.json", metrics)
     log.remove()
     files |= {"tracks": folder / "tracks.csv", "metrics": folder / "metrics.json"}
-    if cfg.console != JSON:
-        for name, figures in metrics.items():
-            show_table(name, list_figures(figures))
+    for name, figures in metrics.items():
+        show_table(cfg.console, name, list_figures(figures))
     ended(cfg.console, "tracked", files, [], metrics=metrics)
     if isinstance(broken, UserError):
         count = len({(row.video, row.frame) for row in rows})
