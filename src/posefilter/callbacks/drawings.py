@@ -93,7 +93,7 @@ def worst(o: Occasion) -> Drawn:
 def particles(o: Occasion) -> Drawn:
     """Draw the particles on the image, colored by weight."""
     title = o.title("Particles by iteration")
-    return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, 0, o.method.space, title)
+    return draw_iterations(o.one.rgb, o.one.intrinsics, o.trace, o.method.space, title)
 
 
 @needs("pose")
@@ -193,7 +193,7 @@ def objectness(o: Occasion) -> Drawn:
     if not isinstance(o.encoding, HasObjectness):
         return None
     history = [
-        (c.state[0].double().numpy(), normalize_weights(c, 0).numpy())
+        (c.state[0].double().numpy(), normalize_weights(c).numpy())
         for c in (o.trace.particles[0], o.trace.particles[-1])
     ]
     seen = o.encoding.objectness[0, 0].detach().float().cpu().numpy()

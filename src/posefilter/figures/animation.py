@@ -79,12 +79,12 @@ class Animation:
         shown = choose_steps(len(self.trace.particles), max_steps)
         between = between or (2 if len(shown) <= 8 else 1)
         for before, number in zip([shown[0], *shown], shown, strict=False):
-            weights = normalize_weights(self.trace.particles[number], 0)
+            weights = normalize_weights(self.trace.particles[number])
             few = choose_by_weight(weights, 24).unique()
             ancestors = self.ancestors(number, before)
             ends = self.drawn(number, torch.arange(len(weights)), few)
             starts = self.drawn(before, ancestors, ancestors[few])
-            noise = describe_noise(self.trace, 0, number, "mm" if self.posed else "px")
+            noise = describe_noise(self.trace, number, "mm" if self.posed else "px")
             caption = f"step {number} of {len(self.trace.particles) - 1}: {noise}"
             for k in range(between if number else 1):
                 share = (k + 1) / between

@@ -117,12 +117,12 @@ def project_axes(
 
 
 def draw_iterations(
-    rgb: np.ndarray, K: np.ndarray, trace: Trace, image: int, space: Space, title: str = ""
+    rgb: np.ndarray, K: np.ndarray, trace: Trace, space: Space, title: str = ""
 ) -> np.ndarray:
     """Draw the particles of one image at several of the filter's steps, the first and the last
     included.
 
-    rgb (H, W, 3) uint8; K (3, 3) [px]; image: which of the trace's. Particles in pixel space are
+    rgb (H, W, 3) uint8; K (3, 3) [px]; trace: of the image alone. Particles in pixel space are
     dots, at eight steps. Those in pose space are dots at the object's center, with the axes of a
     few drawn by weight, at four steps: on the whole photograph, and beside it on a close-up of the
     object, since the last particles lie too close to be seen otherwise.
@@ -133,8 +133,7 @@ def draw_iterations(
     parts: list[np.ndarray] = []
     if isinstance(space, PoseSpace):
         steps = [
-            PoseStep(K, trace, image, number, space)
-            for number in choose_steps(len(trace.particles), 4)
+            PoseStep(K, trace, number, space) for number in choose_steps(len(trace.particles), 4)
         ]
         views = (frame, close_up(steps[-1].extent(), height, wide, width, margin=0.1))
         grounds = [draw_background(rgb, view) for view in views]
@@ -146,16 +145,12 @@ def draw_iterations(
         below, tiles = draw_background(rgb, frame), []
         for number in choose_steps(len(trace.particles), 8):
             particles = trace.particles[number]
-            state, weights = (
-                particles.state[image].detach().cpu().numpy(),
-                normalize_weights(particles, image).numpy(),
-            )
+            state = particles.state[0].detach().cpu().numpy()
             off = measure_off_frame(state, height, wide)
-            note = describe_effective(trace, image, number) + (
-                f", {off:.0%} off the frame" if off else ""
-            )
-            caption = f"step {number}: {describe_noise(trace, image, number, 'px')}"
-            picture = draw_particles_on(below, state, weights, frame)
+            beyond = f", {off:.0%} off the frame" if off else ""
+            note = describe_effective(particles) + beyond
+            caption = f"step {number}: {describe_noise(trace, number, 'px')}"
+            picture = draw_particles_on(below, state, normalize_weights(particles).numpy(), frame)
             tiles.append(add_caption(picture, caption, note=note))
         parts.append(arrange_grid(tiles, 2))
     return compose_figure(title or "Particles by iteration", *parts, draw_weight_scale())
@@ -166,28 +161,28 @@ def measure_off_frame(pixels: np.ndarray, height: int, width: int) -> float:
     return float(((pixels < -0.5) | (pixels > [width - 0.5, height - 0.5])).any(1).mean())
 
 
-def describe_step(trace: Trace, image: int, number: int, unit: str) -> str:
+def describe_step(trace: Trace, number: int, unit: str) -> str:
     """Tell which step it is, its noise level, and how many particles are effective."""
-    noise = describe_noise(trace, image, number, unit)
-    return f"step {number}: {noise}, {describe_effective(trace, image, number)}"
+    noise = describe_noise(trace, number, unit)
+    return f"step {number}: {noise}, {describe_effective(trace.particles[number])}"
 
 
-def describe_noise(trace: Trace, image: int, number: int, unit: str) -> str:
+def describe_noise(trace: Trace, number: int, unit: str) -> str:
     """Tell a step's noise level, in mm of what is kept in meters, or in px."""
     sigma = trace.steps[number].sigma
-    level = float(sigma if sigma.ndim == 0 else sigma[image]) * (1000 if unit == "mm" else 1)
+    level = float(sigma.reshape(-1)[0]) * (1000 if unit == "mm" else 1)
     return f"noise {level:.3g} {unit}"
 
 
-def describe_effective(trace: Trace, image: int, number: int) -> str:
-    """Tell the effective share of a step's particles."""
-    weights = normalize_weights(trace.particles[number], image)
+def describe_effective(particles: Particles) -> str:
+    """Tell the effective share of one image's particles."""
+    weights = normalize_weights(particles)
     return f"{float(1 / weights.square().sum() / len(weights)):.0%} effective"
 
 
-def normalize_weights(particles: Particles, image: int) -> torch.Tensor:
+def normalize_weights(particles: Particles) -> torch.Tensor:
     """Return one image's weights, summing to 1.  -> (N,) float64."""
-    return torch.softmax(particles.log_weights[image].detach().cpu().double(), 0)
+    return torch.softmax(particles.log_weights[0].detach().cpu().double(), 0)
 
 
 def choose_steps(count: int, max_steps: int) -> list[int]:
@@ -200,13 +195,11 @@ def choose_steps(count: int, max_steps: int) -> list[int]:
 class PoseStep:
     """One step of a filter whose particles are poses, projected."""
 
-    def __init__(
-        self, K: np.ndarray, trace: Trace, image: int, number: int, space: PoseSpace
-    ) -> None:
+    def __init__(self, K: np.ndarray, trace: Trace, number: int, space: PoseSpace) -> None:
         camera = torch.as_tensor(np.asarray(K), dtype=torch.float64)
         center = torch.tensor(space.center, dtype=torch.float64)
-        poses = trace.outputs[number].pose[image].detach().cpu().double()
-        weights = normalize_weights(trace.particles[number], image)
+        poses = trace.outputs[number].pose[0].detach().cpu().double()
+        weights = normalize_weights(trace.particles[number])
         self.weights = weights.numpy()
         self.pixels = project(origin_of(poses, center), camera).numpy()
         self.axes = project_axes(
@@ -217,7 +210,7 @@ class PoseStep:
             * float(camera[0, 0])
             / max(float(weights @ origin_of(poses, center)[:, 2]), 0.05)
         )
-        self.caption = describe_step(trace, image, number, "mm")
+        self.caption = describe_step(trace, number, "mm")
 
     def extent(self) -> np.ndarray:
         """Return two corners that hold the object, as the mean of the particles has it.  -> (2, 2)

@@ -97,7 +97,7 @@ def draw_silhouettes(
     grounds = [fade(view.show(rgb), 0.6) for view in (frame, near)]
     parts: list[np.ndarray] = []
     for number in choose_steps(len(trace.particles), 4):
-        weights = normalize_weights(trace.particles[number], 0)
+        weights = normalize_weights(trace.particles[number])
         poses = trace.outputs[number].pose[0].detach().cpu().double()
         chosen = poses[choose_by_weight(weights, 64)]
         pixels = project_hulls(chosen, hull, K)
@@ -108,7 +108,7 @@ def draw_silhouettes(
             view.outline(picture, outline_hulls(pixels[::4]), _LINE, 1, halo=False)
             view.outline(picture, outline_hulls(true), TRUTH, 2)
             tiles.append(picture)
-        parts += [draw_text(describe_step(trace, 0, number, "mm"), CAPTION), arrange_grid(tiles, 2)]
+        parts += [draw_text(describe_step(trace, number, "mm"), CAPTION), arrange_grid(tiles, 2)]
     foot = [
         draw_legend([("truth", TRUTH), ("16 outlines", _LINE)]),
         draw_color_scale("weight: 0", "1", "plasma"),
