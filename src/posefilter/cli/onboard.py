@@ -117,7 +117,7 @@ class Onboarding:
         own = str(self.cfg.symmetries)
         own = "found" if own == "auto" else own  # as records of earlier versions have it
         if Path(own).is_file():
-            own = Path(own).read_text()
+            own = Path(own).read_text(encoding="utf-8")
         return {
             "mesh": self.mesh_digest,
             "symmetries": sha256(own.encode()).hexdigest()[:16],

@@ -39,7 +39,7 @@ class SweepSummary(Callback):
             files = {name: folder / name for name in names if (folder / name).is_file()}
             console = str(config.get("console", JSON))
             if console != JSON:
-                print((folder / "summary.md").read_text())
+                print((folder / "summary.md").read_text(encoding="utf-8"))
             ended(console, "swept", files, [typed("report", sweep=folder)], failed=failed)
         if failed:
             raise Carrier(

@@ -51,7 +51,7 @@ def read_errors(path: Path) -> list[ImageError]:
         ValueError: Where a row is malformed.
     """
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             return [parse_row(row) for row in csv.DictReader(file)]
     except csv.Error as error:
         raise ValueError(str(error)) from error

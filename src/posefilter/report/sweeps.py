@@ -138,7 +138,7 @@ def read_jobs(folder: Path, found: Sequence[Path]) -> tuple[list[str], list[Job]
 def read_jobs_from_csv(path: Path) -> tuple[list[str], list[Job]]:
     """Return the same of a summary: columns of no known figure are axes."""
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file, restval=""))
     except (csv.Error, ValueError) as error:
         raise UserError(f"{path}: is no table of runs ({error})") from error
