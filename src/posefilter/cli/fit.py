@@ -135,13 +135,10 @@ def read_attribute(module: str, name: str, attribute: str) -> tuple[str, ...] | 
     if not isinstance(kind, ast.ClassDef):
         return None
     for line in kind.body:
-        if (
-            isinstance(line, ast.AnnAssign)
-            and isinstance(line.target, ast.Name)
-            and line.target.id == attribute
-            and line.value is not None
-        ):
-            return tuple(ast.literal_eval(line.value))
+        match line:
+            case ast.AnnAssign(target=ast.Name(id=own), value=ast.expr() as value):
+                if own == attribute:
+                    return tuple(ast.literal_eval(value))
     for base in kind.bases:
         found = read_attribute(module, base.id, attribute) if isinstance(base, ast.Name) else None
         if found is not None:

@@ -77,36 +77,23 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
         for name, rows in runs.items()
         if any(math.isfinite(row.diameter_mm) for row in rows)
     }
-    cdf, by_share, by_auc = [], [], []
+    cdf, by_share, by_auc = list[Line](), list[Line](), list[Line]()
     for name, rows in runs.items():
-        for label, key in (
-            (("ADD", "add_mm"), ("ADD-S", "add_s_mm")) if len(runs) == 1 else ((name, "add_mm"),)
-        ):
-            cdf.append(Line(label, *compute_cdf([getattr(row, key) for row in rows])))
+        alone = len(runs) == 1
+        cdf.append(Line("ADD" if alone else name, *compute_cdf([row.add_mm for row in rows])))
+        if alone:
+            cdf.append(Line("ADD-S", *compute_cdf([row.add_s_mm for row in rows])))
         parts = group_by_visibility(rows)
         seen = [float(np.mean([row.visibility for row in part])) for part in parts]
         if parts:
-            by_share.append(
-                Line(
-                    name,
-                    seen,
-                    [100 * float(np.mean([is_found(row) for row in part])) for part in parts],
-                )
-            )
+            found = [100 * float(np.mean([is_found(row) for row in part])) for part in parts]
+            by_share.append(Line(name, seen, found))
             by_auc.append(Line(name, seen, [measure_auc(part) for part in parts]))
-    out = (
-        [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
-        if cdf
-        else []
-    )
+    out = [Panel("Images with an error below a threshold", "threshold [mm]", "%", cdf, PERCENT)]
     for lines, key in ((by_auc, "add/auc"), (by_share, "add/recall_01d")):
-        info = find_metric(key)
-        out += (
-            [Panel(f"{info.label} by visibility", "visible share", info.unit, lines, PERCENT)]
-            if lines
-            else []
-        )
-    return out
+        info, title = find_metric(key), f"{find_metric(key).label} by visibility"
+        out.append(Panel(title, "visible share", info.unit, lines, PERCENT))
+    return [panel for panel in out if panel.lines]
 
 
 def is_found(row: ImageError) -> bool:

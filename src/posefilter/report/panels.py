@@ -85,14 +85,8 @@ def make_training_panels(curves: Mapping[str, Curve]) -> list[Panel]:
     out = [Panel("Training loss", "training step", "", losses)] if losses else []
     for name, unit in units.items():
         line = Line(name, own[name].steps, own[name].values)
-        out.append(
-            Panel(
-                name.removesuffix(f"_{unit}").replace("_", " ").capitalize(),
-                "training step",
-                unit,
-                [line],
-            )
-        )
+        title = name.removesuffix(f"_{unit}").replace("_", " ").capitalize()
+        out.append(Panel(title, "training step", unit, [line]))
     if rate:
         newest = max((curves[tag] for tag in rate), key=lambda curve: curve.times[-1])
         line = Line("learning rate", newest.steps, newest.values)

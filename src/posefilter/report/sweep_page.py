@@ -171,16 +171,8 @@ def note_seeds(found: Sequence[Group]) -> list[Block]:
     """Return a caveat where every setting was run with one seed: two numbers are no trend."""
     if any(len(group.jobs) > 1 for group in found):
         return []
-    return [
-        Paragraph(
-            [
-                Text(
-                    "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see.",
-                    "soft",
-                )
-            ]
-        )
-    ]
+    said = "One seed each: differences may be chance. Add seed=0,1,2 to the sweep to see."
+    return [Paragraph([Text(said, "soft")])]
 
 
 def tabulate_seeds(found: Sequence[Group], infos: Sequence[MetricInfo]) -> list[Block]:
@@ -234,9 +226,5 @@ def list_jobs(sweep: Sweep, infos: Sequence[MetricInfo]) -> list[Block]:
         for job in sweep.jobs
     ]
     head = [*sweep.axes, *(info.title for info in infos)]
-    return [
-        Fold(
-            f"All {len(rows)} runs",
-            [Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")],
-        )
-    ]
+    table = Table(head, rows, range(len(sweep.axes), len(head)), form="sweep")
+    return [Fold(f"All {len(rows)} runs", [table])]
