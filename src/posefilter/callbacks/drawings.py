@@ -99,14 +99,8 @@ def particles(o: Occasion) -> Drawn:
 @needs("pose")
 def belief(o: Occasion) -> Drawn:
     """Draw the belief on SO(3) and over translation."""
-    return draw_belief(
-        o.one.rgb,
-        o.one.intrinsics,
-        o.trace.belief,
-        o.method.object_model,
-        o.one.truth,
-        o.title("Belief"),
-    )
+    known = (o.trace.belief, o.method.object_model, o.one.truth)
+    return draw_belief(o.one.rgb, o.one.intrinsics, *known, o.title("Belief"))
 
 
 @needs("pose_space")
@@ -122,21 +116,13 @@ def silhouettes(o: Occasion) -> Drawn:
 def field(o: Occasion) -> Drawn:
     """Draw slices of the score about the truth."""
     assert isinstance(o.method, ScoresPoses)
-    object_model = o.method.object_model
-    found = evaluate_pose_field(
-        o.method,
-        o.encoding,
-        o.batch.camera_from_object[0],
-        object_model,
-        choose_levels(o.trace.steps),
-    )
+    object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
+    levels = choose_levels(o.trace.steps)
+    found = evaluate_pose_field(o.method, o.encoding, truth, object_model, levels)
     center = object_model.center.cpu().double().numpy()
-    shift = (
-        (o.one.estimate[:3, :3] - o.one.truth[:3, :3]) @ center
-        + o.one.estimate[:3, 3]
-        - o.one.truth[:3, 3]
-    )
-    return draw_pose_field(found, o.title("Likelihood field"), o.one.truth[:3, :3].T @ shift)
+    R, t = o.one.truth[:3, :3], o.one.truth[:3, 3]
+    shift = (o.one.estimate[:3, :3] - R) @ center + o.one.estimate[:3, 3] - t
+    return draw_pose_field(found, o.title("Likelihood field"), R.T @ shift)
 
 
 @needs("score_points")
@@ -146,26 +132,16 @@ def points(o: Occasion) -> Drawn:
     """
     likelihood = cast(ScoresPoints, o.method.likelihood)
     object_model, truth = o.method.object_model, o.batch.camera_from_object[0]
+    of, levels = (likelihood, o.encoding.image, truth, object_model), choose_levels(o.trace.steps)
     slices = [
-        evaluate_point_field(
-            likelihood,
-            o.encoding.image,
-            truth,
-            object_model,
-            pixel,
-            on,
-            choose_levels(o.trace.steps),
-            depthwise,
-        )
+        evaluate_point_field(*of, pixel, on, levels, depthwise)
         for pixel, on in choose_pixels(o.batch, object_model)
         for depthwise in ((False, True) if on else (False,))
     ]
+    if not slices:
+        return None
     surface = (object_model.points - object_model.center).cpu().double().numpy()
-    return (
-        draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
-        if slices
-        else None
-    )
+    return draw_point_field(slices, o.one.rgb, surface, o.title("Likelihood of points"))
 
 
 @needs("object_coordinates")
@@ -175,16 +151,8 @@ def proposals(o: Occasion) -> Drawn:
     predicted = predict_proposals(o.method, o.encoding, o.batch, o.method.object_model)
     if predicted is None:
         return None
-    title = o.title("Proposals")
-    return draw_proposals(
-        predicted,
-        o.one.rgb,
-        o.one.intrinsics,
-        o.one.truth,
-        o.shape,
-        o.method.object_model.radius,
-        title,
-    )
+    image, radius = (o.one.rgb, o.one.intrinsics, o.one.truth), o.method.object_model.radius
+    return draw_proposals(predicted, *image, o.shape, radius, o.title("Proposals"))
 
 
 @needs("pixel_space")
@@ -235,24 +203,16 @@ class AnimatedScene(NamedTuple):
 def animate(method: PoseEstimator, trace: Trace, scene: AnimatedScene, title: str) -> bytes:
     """Animate the filter on one image, whose trace this is.  -> a GIF."""
     hull, K = method.object_model.hull.cpu(), scene.intrinsics
-    posed = isinstance(method.space, PoseSpace)
-    target = (
-        outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
-        if posed
-        else trace_outline(scene.mask)
-    )
-    return encode_gif(
-        list(Animation(scene.rgb, K, trace, method.space, hull, target, title).frames())
-    )
+    target = trace_outline(scene.mask)
+    if isinstance(method.space, PoseSpace):
+        target = outline_hulls(project_hulls(torch.as_tensor(scene.truth)[None], hull, K))
+    shown = Animation(scene.rgb, K, trace, method.space, hull, target, title)
+    return encode_gif(list(shown.frames()))
 
 
 def _gallery(o: Occasion, kind: str, title: str) -> Drawn:
-    images = o.kept[kind]
-    return (
-        draw_gallery(images, o.shape, "pose" in o.method.capabilities, f"{title}\n{o.when}")
-        if images
-        else None
-    )
+    images, posed = o.kept[kind], "pose" in o.method.capabilities
+    return draw_gallery(images, o.shape, posed, f"{title}\n{o.when}") if images else None
 
 
 DRAWINGS: dict[str, Drawing] = {
