@@ -88,21 +88,15 @@ def draw_belief(
         "Photograph: where the particles put the object's center, colored by weight.",
         "Below: shares of the belief. Translations are from its mean, rotations from the estimate.",
     ]
-    notes = np.concatenate(
-        [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
-    )
+    notes = [draw_legend(entries, half), *(draw_text(text, DETAIL, half) for text in words)]
+    centers = arrange_grid([draw_centers(poses, weights, marks, object_model, rgb, K, half)], 1)
     return compose_figure(
         title or f"Belief\n{object_model.name}",
         draw_text(sure, CAPTION, bold=True),
         draw_text(other, CAPTION),
         draw_rotations(poses, weights, marks, axis, tile_width(1)),
         draw_turn_scale(),
-        arrange_row(
-            [
-                arrange_grid([draw_centers(poses, weights, marks, object_model, rgb, K, half)], 1),
-                notes,
-            ]
-        ),
+        arrange_row([centers, np.concatenate(notes)]),
         draw_weight_scale(),
         *draw_marginals(poses, weights, best, true, object_model),
     )

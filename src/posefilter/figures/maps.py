@@ -67,11 +67,9 @@ def draw_proposals(
     draw_dots(drawn, fine.place(proposals.axes[:, 0]), _PROPOSED, 5)
     drawn = halve(drawn)
     draw_lines(drawn, edge, TRUTH, 2, closed=True)
-    mean = (
-        f"{1000 * proposals.error:.0f} mm off on average"
-        if np.isfinite(proposals.error)
-        else "of the object's own frame"
-    )
+    mean = "of the object's own frame"
+    if np.isfinite(proposals.error):
+        mean = f"{1000 * proposals.error:.0f} mm off on average"
     predicted = draw_point_map(proposals.coordinates, proposals.chance, view)
     true = draw_point_map(proposals.true, proposals.on.astype(float), view)
     tiles = [

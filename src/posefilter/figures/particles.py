@@ -82,12 +82,8 @@ def draw_particles_on(
     if axes is not None:
         draw_many_axes(picture, fine.place(axes))
     order = np.argsort(weights, kind="stable")
-    draw_dots(
-        picture,
-        fine.place(pixels[order]),
-        color_by_weight(weights)[order],
-        max(3.0, fine.width / 200),
-    )
+    colors, radius = color_by_weight(weights)[order], max(3.0, fine.width / 200)
+    draw_dots(picture, fine.place(pixels[order]), colors, radius)
     return halve(picture)
 
 

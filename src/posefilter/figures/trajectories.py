@@ -22,11 +22,8 @@ _NUMBER = 40  # [px] where a row's number stands
 def find_hits(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """Tell which particles stand on a mask.  (H, W) bool, (*, 2) [px] -> (*) bool."""
     places = torch.from_numpy(np.asarray(pixels, np.float32).reshape(1, -1, 2))
-    return (
-        overlaps_mask(torch.from_numpy(mask)[None, None], places)[0]
-        .numpy()
-        .reshape(pixels.shape[:-1])
-    )
+    hits = overlaps_mask(torch.from_numpy(mask)[None, None], places)[0]
+    return hits.numpy().reshape(pixels.shape[:-1])
 
 
 def draw_trajectories(
@@ -41,12 +38,9 @@ def draw_trajectories(
     H, W = mask.shape
     path = states[:, :max_particles]
     on = find_hits(mask, path[-1])
-    left = bool(((path < -0.5) | (path > [W - 0.5, H - 0.5])).any())
-    view = (
-        View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
-        if left
-        else full_view(H, W, WIDTH)
-    )
+    view = full_view(H, W, WIDTH)
+    if ((path < -0.5) | (path > [W - 0.5, H - 0.5])).any():
+        view = View(-0.5 - W / 2, -0.5 - H / 2, WIDTH / (2 * W), WIDTH, round(WIDTH * H / W))
     picture = view.show(rgb)
     view.outline(picture, trace_outline(mask), (255, 255, 255), 1)
     for end, color in ((False, OFF), (True, ON)):
