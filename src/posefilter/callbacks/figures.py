@@ -96,12 +96,8 @@ class Figures(TraceCallback):
             name = name_frame(trainer, "val", int(batch.frame_id[i]))
             self._selection.offer(error, partial(keep_image, trace, batch, method, i, error, name))
             if self._example is None:
-                one = keep_image(trace, batch, method, i, error, name)
-                self._example = (
-                    one,
-                    select_image(trace, 0),
-                    Batch(*(x[:1].clone() for x in batch)),
-                )
+                one, own = keep_image(trace, batch, method, i, error, name), select_image(trace, 0)
+                self._example = (one, own, Batch(*(x[:1].clone() for x in batch)))
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw, or put it off."""
