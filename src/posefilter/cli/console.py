@@ -42,12 +42,8 @@ def ended(
     if is_follower():
         return
     if console == JSON:
-        told = {
-            **content,
-            "files": {name: str(path) for name, path in files.items()},
-            "next": list(following),
-        }
-        say(console, event, "", **told)
+        paths = {name: str(path) for name, path in files.items()}
+        say(console, event, "", **content, files=paths, next=list(following))
         return
     out = Console(soft_wrap=True, highlight=False)  # paths and commands must survive being copied
     width = max((len(name) for name in files), default=0)

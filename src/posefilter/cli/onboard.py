@@ -342,15 +342,10 @@ def evaluate(work: Onboarding) -> None:
 
 def report(work: Onboarding) -> None:
     """Write the page."""
-    record = read_run(work.training)
-    page = make_onboarding_page(
-        record,
-        compared(record),
-        typed("onboard", mesh=work.cfg.mesh, out=work.out),
-        work.stages.values,
-        work.stages.seconds,
-        work.out / "symmetries.png",
-    )
+    record, stages = read_run(work.training), work.stages
+    command = typed("onboard", mesh=work.cfg.mesh, out=work.out)
+    found = (stages.values, stages.seconds, work.out / "symmetries.png")
+    page = make_onboarding_page(record, compared(record), command, *found)
     folder = work.out / "report"
     write_whole(folder / "report.html", page.render())
     for name, png in page.files().items():
@@ -370,14 +365,8 @@ def tell(work: Onboarding) -> None:
     shown = ", ".join(f"{name} {m:.1f}" for name, m in minutes.items())
     say(work.cfg.console, "minutes", f"minutes: {shown}", minutes=minutes)
     scores = {key: metrics[key] for key in ("add", "add_s", "mssd", "mspd")}
-    ended(
-        work.cfg.console,
-        "onboarded",
-        files,
-        [typed_prediction(work.weights)],
-        object=work.mesh.name,
-        **scores,
-    )
+    following = [typed_prediction(work.weights)]
+    ended(work.cfg.console, "onboarded", files, following, object=work.mesh.name, **scores)
 
 
 def _split(frames: int) -> str:
