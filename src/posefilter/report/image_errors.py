@@ -59,9 +59,8 @@ def group_by_visibility(rows: Sequence[ImageError]) -> list[list[ImageError]]:
     """Return the images in ranges of their visible share, about as many in each; unknown shares are
     left out.
     """
-    known = sorted(
-        (row for row in rows if math.isfinite(row.visibility)), key=lambda row: row.visibility
-    )
+    known = [row for row in rows if math.isfinite(row.visibility)]
+    known.sort(key=lambda row: row.visibility)
     count = min(MOST, len(known) // FEWEST)
     if count < 2:
         return []
@@ -72,11 +71,8 @@ def chart_errors(runs: Mapping[str, Sequence[ImageError]]) -> list[Panel]:
     """Return the charts of one run's errors, or of several, a line each; the name of a single one
     is not shown.
     """
-    runs = {
-        name: rows
-        for name, rows in runs.items()
-        if any(math.isfinite(row.diameter_mm) for row in rows)
-    }
+    posed = {n for n, rows in runs.items() if any(math.isfinite(r.diameter_mm) for r in rows)}
+    runs = {name: rows for name, rows in runs.items() if name in posed}
     cdf, by_share, by_auc = list[Line](), list[Line](), list[Line]()
     for name, rows in runs.items():
         alone = len(runs) == 1
@@ -118,10 +114,8 @@ def show_errors(rows: Sequence[ImageError]) -> list[Block]:
 def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     """Return the images with the greatest errors, by name."""
     posed = [row for row in rows if not math.isnan(row.add_mm)]
-    if posed:
-        worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
-    else:
-        worst = sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
+    worst = sorted(posed, key=lambda row: -row.add_mm)[:LISTED]
+    worst = worst or sorted(rows, key=lambda row: row.particles_on_object)[:LISTED]
     cells: list[list[Cell]] = [
         [
             Text(row.image, "code"),
@@ -135,8 +129,5 @@ def list_worst(rows: Sequence[ImageError]) -> list[Block]:
     head = ("image", "visible share", "ADD", "ADD-S", "particles on the object")
     where = Paragraph(["Every image is in", Text(FILE, "code"), "in the run's folder."])
     table = Table(head, cells, numeric=range(1, len(head)))
-    return [
-        Heading("Images"),
-        Fold(f"The {len(worst)} worst of {len(rows)} images", [table]),
-        where,
-    ]
+    fold = Fold(f"The {len(worst)} worst of {len(rows)} images", [table])
+    return [Heading("Images"), fold, where]

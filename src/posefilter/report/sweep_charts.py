@@ -5,11 +5,7 @@ from statistics import mean
 
 from posefilter.metrics.registry import MetricInfo, find_metric
 from posefilter.report.charts import Line, Panel
-from posefilter.report.sweeps import (
-    Group,
-    Sweep,
-    Value,
-)  # fmt: skip
+from posefilter.report.sweeps import Group, Sweep, Value
 
 MOST_LINES = 6  # values of a second axis that become lines, settings that get a name
 
