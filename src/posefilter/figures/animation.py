@@ -62,9 +62,8 @@ class Animation:
         self.posed = isinstance(space, PoseSpace)
         self.views = [full_view(height, wide, WIDTH // 2 if self.posed else 480)]
         if self.posed and target:
-            self.views.append(
-                close_up(np.concatenate(list(target)), height, wide, WIDTH // 2, margin=0.4)
-            )
+            places = np.concatenate(list(target))
+            self.views.append(close_up(places, height, wide, WIDTH // 2, margin=0.4))
         self.grounds = [fade(view.show(rgb), 0.5) for view in self.views]
         self.head = compose_figure(title)
         entries = [("truth", TRUTH), *([("some outlines", _LINE)] if self.posed else [])]
@@ -127,6 +126,5 @@ class Animation:
             view.outline(picture, outline_hulls(corners), _LINE, 1, halo=False)
             view.outline(picture, self.target, TRUTH, 2)
             parts.append(picture)
-        return np.concatenate(
-            [self.head, add_caption(center_part(arrange_row(parts)), caption), self.foot]
-        )
+        middle = add_caption(center_part(arrange_row(parts)), caption)
+        return np.concatenate([self.head, middle, self.foot])

@@ -206,9 +206,8 @@ def stamp_dots(picture: np.ndarray, pixels: np.ndarray, colors: np.ndarray, radi
     line = np.arange(-radius, radius + 1)
     disc = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
     disc = disc[(disc * disc).sum(1) <= radius * (radius + 0.5)]
-    at = (np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)[:, None] + disc).reshape(
-        -1, 2
-    )
+    places = np.round(np.clip(pixels, -_FARTHEST, _FARTHEST)).astype(int)
+    at = (places[:, None] + disc).reshape(-1, 2)
     seen = ((at >= 0) & (at < [picture.shape[1], picture.shape[0]])).all(1)
     picture[at[seen, 1], at[seen, 0]] = np.repeat(colors, len(disc), axis=0)[seen]
 
@@ -217,11 +216,8 @@ def halve(picture: np.ndarray) -> np.ndarray:
     """Return a picture at half its size, each pixel the mean of four: what was drawn at twice the
     size is smooth.
     """
-    return np.asarray(
-        cv2.resize(
-            picture, (picture.shape[1] // 2, picture.shape[0] // 2), interpolation=cv2.INTER_AREA
-        )
-    )
+    size = (picture.shape[1] // 2, picture.shape[0] // 2)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
 @cache

@@ -68,9 +68,8 @@ def compute_marginals(
     for kind, unit in enumerate((1000.0, 180 / math.pi)):
         for i in range(3):
             marks = [float(part[kind][i]) * unit for part in parts[1:]]
-            out[kind].append(
-                compute_histogram(parts[0][kind][:, i].numpy() * unit, weights.numpy(), marks)
-            )
+            values = parts[0][kind][:, i].numpy() * unit
+            out[kind].append(compute_histogram(values, weights.numpy(), marks))
     return out
 
 
@@ -113,16 +112,12 @@ def compute_histogram(
 ) -> Marginal:
     """Return a weighted histogram of the middle 95 % and a margin, wide enough for the marks."""
     order = np.argsort(values)
-    mass = np.cumsum(weights[order])
-    low, high = (
-        float(values[order][min(int(np.searchsorted(mass, q)), len(values) - 1)])
-        for q in (0.025, 0.975)
-    )
+    ends = np.searchsorted(np.cumsum(weights[order]), (0.025, 0.975)).clip(max=len(values) - 1)
+    low, high = (float(values[order][end]) for end in ends)
     margin = max(0.3 * (high - low), 1e-2)
     low, high = min(low - margin, *marks), max(high + margin, *marks)
     pad = 0.02 * (high - low)
-    mass, edges = np.histogram(
-        values, np.linspace(low - pad, high + pad, bins + 1), weights=weights
-    )
+    places = np.linspace(low - pad, high + pad, bins + 1)
+    mass, edges = np.histogram(values, places, weights=weights)
     beyond = float(weights[(values < low - pad) | (values > high + pad)].sum())
     return Marginal(mass, edges, (*marks,), beyond)

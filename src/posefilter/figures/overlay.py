@@ -160,9 +160,8 @@ def outline_object(
     """
     if isinstance(shape, Mesh):
         view = View(-0.5, -0.5, 1 / coarse, -(-width // coarse), -(-height // coarse))
-        found = trace_outline(
-            render_silhouette(shape, pose, view.camera(K), view.height, view.width)
-        )
+        mask = render_silhouette(shape, pose, view.camera(K), view.height, view.width)
+        found = trace_outline(mask)
         if coarse > 1:  # straight edges are no stairs
             found = [cv2.approxPolyDP(line, 0.7, closed=True)[:, 0] for line in found]
         return [(line + 0.5) * coarse - 0.5 for line in found]

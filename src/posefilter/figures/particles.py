@@ -197,15 +197,11 @@ class PoseStep:
         poses = trace.outputs[number].pose[0].detach().cpu().double()
         weights = normalize_weights(trace.particles[number])
         self.weights = weights.numpy()
-        self.pixels = project(origin_of(poses, center), camera).numpy()
-        self.axes = project_axes(
-            poses[choose_by_weight(weights, 24)], center, 0.6 * space.radius, camera
-        )
-        self.half_side = (
-            space.radius
-            * float(camera[0, 0])
-            / max(float(weights @ origin_of(poses, center)[:, 2]), 0.05)
-        )
+        centers, few = origin_of(poses, center), poses[choose_by_weight(weights, 24)]
+        self.pixels = project(centers, camera).numpy()
+        self.axes = project_axes(few, center, 0.6 * space.radius, camera)
+        away = max(float(weights @ centers[:, 2]), 0.05)
+        self.half_side = space.radius * float(camera[0, 0]) / away
         self.caption = describe_step(trace, number, "mm")
 
     def extent(self) -> np.ndarray:

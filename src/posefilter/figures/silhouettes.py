@@ -66,9 +66,8 @@ def compute_coverage(pixels: np.ndarray, weights: np.ndarray, view: View) -> np.
     total = np.zeros((view.height, view.width), np.float32)
     for one, weight in zip(pixels, weights, strict=True):
         if np.isfinite(one).all():
-            corners = cv2.convexHull(
-                np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)
-            )
+            placed = np.round(view.place(one)).clip(-16_000, 16_000).astype(np.int32)
+            corners = cv2.convexHull(placed)
             (left, top), (right, bottom) = corners.min((0, 1)).clip(0), corners.max((0, 1)) + 1
             # no more of the picture is looked at than the silhouette needs
             part = total[top:bottom, left:right]
